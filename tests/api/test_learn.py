@@ -1,7 +1,6 @@
 """`learn` makes a model of measured logs: what each step does, once, and says what it assumed."""
 
 import json
-import math
 import random
 from pathlib import Path
 
@@ -10,41 +9,22 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.ingest.mapping import Mapping, assumptions_of, load_mapping
+from tests.support import own_logs
 from tests.support.commands import Finished, run_on
 from tests.support.measured import DRIVE, SIGNALS, TIME, csv_text
 
-MAPPING = """
-name = "own"
-[time]
-column = "t"
-unit = "s"
-[drive]
-vehicle_id = { path = "{}/*" }
-vehicle_model = "own"
-day = { path = "*_{}.csv" }
-[signals]
-ax = { column = "ax", unit = "m/s^2" }
-ay = { column = "ay", unit = "m/s^2" }
-yaw_rate = { column = "r", unit = "rad/s" }
-sideslip = { column = "beta", unit = "rad" }
-"""
+MAPPING = own_logs.MAPPING.replace('{ column = "car" }', '{ path = "{}/*" }').replace(
+    "day = 2026-05-04", 'day = { path = "*_{}.csv" }'
+)
 
 
 def write_logs(folder: Path, cars: int, slip: float = -1.0) -> Path:
     rng = random.Random(5)  # noqa: S311
     (folder / "own.toml").write_text(MAPPING)
     for car in range(cars):
-        ay = [3 * math.sin(tick / 30) + rng.gauss(0, 0.05) for tick in range(500)]
-        columns = {
-            "t": [tick / 100 for tick in range(500)],
-            "ax": [rng.gauss(0, 0.3) for _ in ay],
-            "ay": ay,
-            "r": [value / 20 for value in ay],
-            "beta": [slip * value / 200 + rng.gauss(0, 0.0003) for value in ay],
-        }
         place = folder / "logs" / f"car-{car}" / "drive_2026-05-04.csv"
         place.parent.mkdir(parents=True)
-        place.write_text(csv_text(columns))
+        place.write_text(csv_text(own_logs.own_columns(rng, slip)))
     return folder / "logs"
 
 

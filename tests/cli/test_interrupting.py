@@ -26,6 +26,7 @@ from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.storage.runs import LOGGER
 from tests.support.commands import COMMAND, PATIENCE_S, run
+from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 
 
 @pytest.fixture
@@ -198,6 +199,17 @@ def test_a_command_does_not_wait_for_what_it_does_not_need(
     imported = imported_by(smoke_root, *arguments)
     assert "fleet_slip.cli.main" in imported
     assert not imported & (spared | {"pandas"})
+
+
+def test_ingest_does_without_pandas_which_takes_a_tenth_of_the_memory(tmp_path: Path) -> None:
+    columns = good_columns()
+    columns["t"][10:] = [f"{i / 100 + 0.305:.3f}" for i in range(10, 20)]  # ticks without a value
+    columns["ax"][0] = columns["beta"][1] = None
+    (tmp_path / "log.csv").write_text(csv_text(columns))
+    (tmp_path / "test.toml").write_text(MAPPING_TEXT)
+    files = (str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "test.toml"))
+    imported = imported_by(tmp_path / "data", "ingest", *files)
+    assert "polars" in imported and "pandas" not in imported
 
 
 def test_every_command_is_listed_in_its_own_words() -> None:

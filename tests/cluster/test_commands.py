@@ -16,9 +16,8 @@ from fleet_slip.errors import RefusedError, StorageError
 from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand, finish, run, start_on, until
-from tests.support.dask_processes import DaskProcesses, dask_processes
+from tests.support.dask_processes import DaskProcesses, Order, dask_processes, obey
 from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
-from tests.support.orders import Order, obey
 
 pytestmark = pytest.mark.long
 

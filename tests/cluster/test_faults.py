@@ -15,8 +15,7 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ClusterError
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import until
-from tests.support.dask_processes import DaskProcesses, dask_processes
-from tests.support.orders import Order, obey
+from tests.support.dask_processes import DaskProcesses, Order, dask_processes, obey
 
 pytestmark = pytest.mark.long
 

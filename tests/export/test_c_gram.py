@@ -28,8 +28,18 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.export.compiled import SANITIZED, can_sanitize, compile_c, needs_cc, run_compiled
-from tests.export.course import COLUMNS, Counter, build, gram_driver, learned
+from tests.export.compiled import (
+    COLUMNS,
+    SANITIZED,
+    Counter,
+    build,
+    can_sanitize,
+    compile_c,
+    gram_driver,
+    learned,
+    needs_cc,
+    run_compiled,
+)
 from tests.export.models import MODELS, model_of
 from tests.grams.rows.test_course_sums import hostile_drive
 from tests.support.counted_rows import parse_messages, rows_of_messages, write_counted

@@ -11,8 +11,7 @@ from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.registry import ModelVersion
-from tests.export.compiled import STRICT, run_compiled
-from tests.export.course import learned, write_counter
+from tests.export.compiled import STRICT, learned, run_compiled, write_counter
 from tests.export.models import MODELS, export_texts, model_of
 from tests.support.cortex_m import measure_cortex_m, run_self_test
 

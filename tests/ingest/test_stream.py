@@ -1,6 +1,5 @@
 """The same rows and drives, in whatever blocks a file is read; plain numbers as by way of text."""
 
-import sys
 import threading
 from datetime import date
 from pathlib import Path
@@ -25,7 +24,6 @@ from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import log_table
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.commands import run
 from tests.support.measured import (
     a_mapping,
     csv_text,
@@ -269,21 +267,6 @@ def test_items_are_read_ahead_in_order_and_errors_come_in_their_place() -> None:
     assert not [t for t in threading.enumerate() if t.name.startswith("read-ahead")]
 
 
-INGEST = """
-import sys
-from pathlib import Path
-from fleet_slip.storage.local import LocalFolder
-from fleet_slip.ingest.load import ingest_files
-from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.warehouse.tables import Warehouse
-root, log, mapping = sys.argv[1:]
-warehouse = Warehouse(LocalFolder(Path(root)))
-(_,) = ingest_files(warehouse, [Path(log)], Mapping.model_validate_json(mapping))
-assert "polars" in sys.modules
-assert "pandas" not in sys.modules
-"""
-
-
 def drive(name: str, rows: int) -> MeasuredDrive:
     """Return a drive whose car is called like it, with `ax` in the order of its ticks."""
     ticks = np.arange(rows, dtype=np.int32)
@@ -302,14 +285,3 @@ def test_every_row_says_what_is_known_of_its_drive(sizes: list[int]) -> None:
     assert table["tick"].to_pylist() == [tick for _, tick in rows]
     assert pa.types.is_dictionary(table["drive_id"].type)
     assert table["vx"].null_count == len(rows)
-
-
-def test_pandas_which_would_take_a_tenth_of_the_memory_is_not_loaded(tmp_path: Path) -> None:
-    columns = good_columns()
-    columns["t"][10:] = [f"{i / 100 + 0.305:.3f}" for i in range(10, 20)]  # ticks without a value
-    columns["ax"][0] = columns["beta"][1] = None
-    log = tmp_path / "log.csv"
-    log.write_text(csv_text(columns))
-    mapping = a_mapping().canonical_json()
-    done = run([sys.executable, "-c", INGEST, str(tmp_path / "data"), str(log), mapping])
-    assert not done.exit_code, done.stderr

@@ -12,8 +12,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.models.manifest import Manifest
-from tests.export.compiled import needs_cc
-from tests.export.course import START_S, build
+from tests.export.compiled import START_S, build, needs_cc
 from tests.support.counted_rows import rows_of_messages, write_counted
 
 CAMPAIGN = """

@@ -7,8 +7,10 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from distributed import Client
@@ -103,3 +105,26 @@ def _free_port() -> int:
         with contextlib.suppress(OSError), socket.socket() as probe:
             probe.bind(("127.0.0.1", port))
             return port
+
+
+@dataclass(frozen=True)
+class Order:
+    """One task: it leaves a file with the number of its process, waits, and gives its name back."""
+
+    name: str
+    folder: Path
+    seconds: float = 0.0
+    deadly: bool = False
+
+    @property
+    def started_in(self) -> list[int]:
+        """Processes that began it."""
+        return [int(f.suffix[1:]) for f in self.folder.glob(f"{self.name}.*")]
+
+
+def obey(order: Order) -> str:
+    (order.folder / f"{order.name}.{os.getpid()}").touch()
+    if order.deadly:
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(order.seconds)
+    return order.name.upper()

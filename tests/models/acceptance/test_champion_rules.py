@@ -342,15 +342,6 @@ def test_a_champion_that_people_chose_stays(
     assert registry.resolve("beta").version == 2
 
 
-def test_a_candidate_becomes_champion_by_promote_only(champion: Warehouse) -> None:
-    registry = registry_of(champion)
-    write(champion, "more", 48)
-    assert publish_from(champion, candidate=True).candidate
-    assert registry.resolve("beta").version == 1
-    registry.promote("beta", registry.resolve("beta@candidate").version, "champion")
-    assert registry.resolve("beta").version == 2
-
-
 def test_pins_are_no_steps_that_a_rollback_goes_back(champion: Warehouse) -> None:
     registry = registry_of(champion)
     write(champion, "more", 48)
