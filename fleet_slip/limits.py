@@ -9,7 +9,7 @@ from pathlib import Path
 CGROUPS = Path("/sys/fs/cgroup")
 OWN_CGROUP = Path("/proc/self/cgroup")
 
-LIBRARIES_BYTES = 3 * 2**30
+LIBRARIES_BYTES = 7 * 2**29
 """Address space that the libraries reserve, nearly all of it never used."""
 THREAD_BYTES = 2**28
 """The same for each processor: stacks and heaps of the threads that the libraries start."""
