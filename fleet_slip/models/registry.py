@@ -258,7 +258,6 @@ class ModelVersion:
 
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
-_NONE = "none yet; publish one with: fleet-slip publish NAME"
 
 
 @dataclass(frozen=True)
@@ -284,8 +283,12 @@ class Registry:
     def require(self, name: str) -> None:
         """Raise `QuestionError` if no model is called so."""
         if name not in self.names():
-            known = ", ".join(self.names()) or _NONE
-            raise QuestionError(f"no model is called {name!r}. Models: {known}.")
+            raise QuestionError(f"no model is called {name!r}. Models: {self._known}.")
+
+    @property
+    def _known(self) -> str:
+        none = f"none in {self.folder} yet; publish one with: fleet-slip publish NAME"
+        return ", ".join(self.names()) or none
 
     def versions(self, name: str) -> list[int]:
         """Return the version numbers of a model, ascending."""
@@ -316,8 +319,7 @@ class Registry:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""
         names = self.names()
         if len(names) != 1:
-            known = ", ".join(names) or _NONE
-            raise QuestionError(f"name a published model{or_else}. Models: {known}.")
+            raise QuestionError(f"name a published model{or_else}. Models: {self._known}.")
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
