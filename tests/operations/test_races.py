@@ -32,7 +32,7 @@ from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
-from fleet_slip.storage.table import Change, Snapshot
+from fleet_slip.storage.table import Change, Snapshot, Table
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.operations.test_forget import CARS, drive, fill, mentions
@@ -90,6 +90,21 @@ def test_an_erasure_that_loses_to_a_compaction_forgets_all_the_same(
     assert forget(warehouse, BETA, now=True).drives == 3
     assert cars_in(warehouse, "log") == cars_in(warehouse, "grams") == {"alfa", "gamma"}
     assert warehouse.logs.snapshot().rows == 6 * 200
+    assert not mentions(tmp_path, "beta")
+
+
+def test_a_drive_that_lands_before_the_fence_is_forgotten_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse, fence = fill(tmp_path, *CARS), Table.fence
+
+    def later(table: Table) -> None:
+        if table == warehouse.quarantine:
+            land(warehouse, "late", drive("beta", 9))
+        fence(table)
+
+    monkeypatch.setattr(Table, "fence", later)
+    assert forget(warehouse, BETA, now=True).drives == 4
     assert not mentions(tmp_path, "beta")
 
 

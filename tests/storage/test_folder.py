@@ -153,13 +153,15 @@ def test_a_locked_connection_reads_the_snapshot_and_nothing_else(root: Folder) -
     assert "new.csv" not in root.names()
 
 
-def test_a_session_says_that_a_file_is_gone(tmp_path: Path) -> None:
+def test_a_file_or_a_column_that_is_not_there_is_named(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     land(warehouse, "one", rows("a"))
     with fleet_slip.open(tmp_path).session() as session:
         with pytest.raises(QuestionError, match="disabled by configuration"):
             session.table("FROM read_parquet('/etc/passwd')")
         [file] = warehouse.logs.snapshot().files
+        with pytest.raises(StorageError, match="no column roll"):
+            warehouse.logs.read(file.path, ["tick", "roll"])
         warehouse.logs.folder.delete(file.path)
         with pytest.raises(StorageError, match=r"is gone\. If forget --now or compact deleted it"):
             session.table("SELECT sum(ay_mps2) FROM log")
