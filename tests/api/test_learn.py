@@ -9,11 +9,10 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.ingest.mapping import Mapping, assumptions_of, load_mapping
-from tests.support import own_logs
 from tests.support.commands import Finished, run_on
-from tests.support.measured import DRIVE, SIGNALS, TIME, csv_text
+from tests.support.measured import DRIVE, OWN_MAPPING, SIGNALS, TIME, csv_text, own_columns
 
-MAPPING = own_logs.MAPPING.replace('{ column = "car" }', '{ path = "{}/*" }').replace(
+MAPPING = OWN_MAPPING.replace('{ column = "car" }', '{ path = "{}/*" }').replace(
     "day = 2026-05-04", 'day = { path = "*_{}.csv" }'
 )
 
@@ -24,7 +23,7 @@ def write_logs(folder: Path, cars: int, slip: float = -1.0) -> Path:
     for car in range(cars):
         place = folder / "logs" / f"car-{car}" / "drive_2026-05-04.csv"
         place.parent.mkdir(parents=True)
-        place.write_text(csv_text(own_logs.own_columns(rng, slip)))
+        place.write_text(csv_text(own_columns(rng, slip)))
     return folder / "logs"
 
 

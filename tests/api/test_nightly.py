@@ -27,8 +27,8 @@ from tests.support.cars import counts, drive
 from tests.support.commands import Finished, run_on, start_on, until
 from tests.support.counted_rows import START_S, row_of, write_counted
 from tests.support.landing import Landing
+from tests.support.logs import state
 from tests.support.once import made_once
-from tests.support.state import state
 
 FIRST = date(2026, 10, 5)
 OPTIONS = ("--models", "table1")

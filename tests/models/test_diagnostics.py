@@ -21,8 +21,7 @@ from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven, rows_of
-from tests.support.counts import by_rows, dense_fit
+from tests.support.counts import INPUTS, LABEL, by_rows, cohort_of, dense_fit, driven, rows_of
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 

@@ -28,7 +28,7 @@ from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand, done_on, run_on
 from tests.support.counts import gram_of
 from tests.support.logs import land, log_rows
-from tests.support.own_logs import ingest_own
+from tests.support.measured import ingest_own
 from tests.support.reported import answer
 
 INPUTS = "ax,ay,yaw_rate"

@@ -26,8 +26,7 @@ from fleet_slip.models.select import select
 from fleet_slip.regression.choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.folds import cross_validate, least_squares
-from tests.support.cohorts import INPUTS, LABEL, Driven, cohort_of, driven, rows_of
-from tests.support.counts import dense_fit
+from tests.support.counts import INPUTS, LABEL, Driven, cohort_of, dense_fit, driven, rows_of
 
 STRONG_FIRST = (0.0, 0.4, 0.9, 0.0)
 """Only ay and yaw_rate say anything of the label, yaw_rate more."""

@@ -1,5 +1,6 @@
 """Sensors: noise, counts as a CAN bus has them, and imperfections against closed forms."""
 
+from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 
@@ -10,12 +11,23 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.signals import Signal, catalogue
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
-from fleet_slip.simulation.sensors import Delay, Distortion, Gps, LowPass, Pulses, Sensors, Wander
+from fleet_slip.simulation.sensors import (
+    EXACT,
+    Delay,
+    Distortion,
+    Gps,
+    LowPass,
+    Measurement,
+    Pulses,
+    Recorder,
+    Sensors,
+    Wander,
+    noisy_counts,
+)
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections
-from tests.support.measuring import measure, quantise
 
 TICKS = 200_000
 GPS = Gps(rate_hz=10, velocity_std_mps=0.05, time_between_outages_s=60, outage_duration_s=5)
@@ -282,3 +294,20 @@ def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
     pieces = Wander(3, 10.0, np.random.default_rng(6))
     parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
     np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])
+
+
+def measure(
+    truth: Mapping[str, FloatArray], sensors: Sensors, generator: np.random.Generator
+) -> Measurement:
+    """Measure one drive in one block; see `Recorder`."""
+    recorder = Recorder(sensors, generator)
+    recorder.record(truth)
+    return recorder.measurement()
+
+
+def quantise(physical: FloatArray, signal: Signal) -> tuple[NDArray[np.int16], int]:
+    """Return `physical / scale` as counts, and how many values were clipped to the valid range.
+
+    Halves round to even. NaN is clipped as well, to the lower end.
+    """
+    return noisy_counts(physical, np.zeros(len(physical), dtype=np.float32), EXACT, signal)

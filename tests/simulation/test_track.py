@@ -23,7 +23,7 @@ from fleet_slip.simulation.roads import (
     random_generator,
     speed_profile,
 )
-from tests.support.evidence import EVIDENCE
+from tests.support.counts import EVIDENCE
 
 
 def make_track(*segments: tuple[float, float, float], closed: bool = False) -> Track:

@@ -1,5 +1,6 @@
 """A flipped bit is told or makes no difference: nothing is computed from damaged bytes."""
 
+import contextlib
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,18 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.job import update_grams
-from fleet_slip.storage import checksums
+from fleet_slip.models.registry import Registry
+from fleet_slip.models.score import score
+from fleet_slip.operations.verify import verify
+from fleet_slip.storage import checksums, objects
 from fleet_slip.storage.checksums import check_local_files, checksum_in
+from fleet_slip.storage.folder import Folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
+from tests.models.acceptance.test_champion_rules import publish_from, write
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
+from tests.support.s3_server import Server, forget_clients
 
 pytestmark = pytest.mark.long
 
@@ -128,3 +135,82 @@ def test_queries_of_people_are_looked_at_too(filled: Warehouse, run_command: Run
             assert "do not match the checksum in its name" in bad.stderr
         # Files that are not opened need not be looked at.
         assert run_command("sql", "SELECT count(*) FROM grams").exit_code == 0
+
+
+def query(warehouse: Warehouse, statement: str) -> Any:
+    """Ask as `fleet-slip sql` does."""
+    with connect(warehouse.root, query=statement) as database:
+        return database.sql(statement).fetchall()
+
+
+QUESTIONS: dict[str, Callable[[Warehouse], Any]] = {
+    "load_cohort": lambda w: load_cohort(w).tables[0].products.sum(),
+    "fold sums": lambda w: load_cohort(w, folding=Folding()).rows,
+    "publish": lambda w: publish_from(w, force=True).version.version,
+    "score": lambda w: score(w, Registry(w.root / "models").resolve("beta").manifest, "true"),
+    "sql": lambda w: query(w, "SELECT sum(ay) FROM log_counts"),
+}
+
+
+@pytest.fixture
+def stored(root: Folder) -> Warehouse:
+    """Sixteen drives on the server, reduced, and a model of them."""
+    warehouse = Warehouse(root)
+    write(warehouse, "good", 16)
+    publish_from(warehouse)
+    return warehouse
+
+
+@contextlib.contextmanager
+def flipping(server: Server, path: str, share: float = 1.0) -> Iterator[None]:
+    """Let answers have flipped bits, and this process remember none of before."""
+    objects._fetched.clear()
+    forget_clients()
+    with server.misbehaving(flipping=path, flipped=share):
+        yield
+    objects._fetched.clear()
+
+
+def ask_all(warehouse: Warehouse) -> tuple[dict[str, Any], int]:
+    """Return the answers by question, and how many were refused for what is damaged."""
+    found, refused = {}, 0
+    for name, ask in QUESTIONS.items():
+        objects._fetched.clear()
+        try:
+            found[name] = ask(warehouse)
+        except StorageError:
+            refused += 1
+    return found, refused
+
+
+@pytest.mark.parametrize("path", ["/grams/[^_]", "/logs/day=", "/models/"])
+def test_an_answer_with_a_flipped_bit_is_no_answer(
+    server: Server, stored: Warehouse, path: str
+) -> None:
+    usual, none = ask_all(stored)
+    assert none == 0
+    with flipping(server, path):
+        found, refused = ask_all(stored)
+    assert refused
+    assert found == {name: usual[name] for name in found}  # these did not look there
+    assert ask_all(stored) == (usual, 0)
+
+
+def test_single_flipped_answers_among_many_change_nothing(
+    server: Server, stored: Warehouse
+) -> None:
+    usual, _ = ask_all(stored)
+    refusals = 0
+    for _ in range(4):
+        with flipping(server, "/(grams/[^_]|logs/day=|models/)", 0.2):
+            found, refused = ask_all(stored)
+        refusals += refused
+        assert found == {name: usual[name] for name in found}
+    assert refusals
+
+
+def test_gram_rows_are_not_made_of_flipped_logs(server: Server, stored: Warehouse) -> None:
+    with flipping(server, "/logs/day="), pytest.raises(StorageError, match="do not match"):
+        update_grams(stored, feature_set="motion")
+    assert load_cohort(stored).drive_count == 16
+    assert not verify(stored).damage

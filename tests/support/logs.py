@@ -1,5 +1,6 @@
 """Rows of logs made up in memory, and landed in a warehouse."""
 
+import hashlib
 from collections.abc import Collection
 from datetime import date
 from pathlib import Path
@@ -9,7 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
@@ -82,3 +85,20 @@ def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) ->
     """Commit drives as one file of the logs."""
     action = warehouse.logs.write_file(name, pa.concat_tables(drives), day)
     warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit(f"test/{name}", 1)]))
+
+
+def state(root: Path, model: str = "smoke") -> dict[str, Any]:
+    """All that a data root holds, apart from the moments at which it was written."""
+    warehouse = Warehouse(LocalFolder(root))
+    files = {
+        path: hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        for table in (warehouse.logs, warehouse.grams)
+        for path in table.snapshot().paths
+    }
+    registry = Registry(LocalFolder(root / "models"))
+    return {
+        "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
+        "versions": [registry.load(model, n).sha256 for n in registry.versions(model)],
+        "aliases": registry.history(model).aliases(),
+        "moves": [(move.command, move.version) for move in registry.history(model).moves()],
+    }

@@ -27,8 +27,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
-from tests.support.measured import csv_text
-from tests.support.own_logs import MAPPING, ingest_own
+from tests.support.measured import OWN_MAPPING, csv_text, ingest_own
 
 ROWS = 400
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
@@ -135,7 +134,7 @@ def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_p
         noise = 0.1 * generator.standard_normal(cars * rows)
         columns[name] = list((size * (of_drive + noise)).round(5))
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    (tmp_path / "noise.toml").write_text(MAPPING + MORE_SIGNALS)
+    (tmp_path / "noise.toml").write_text(OWN_MAPPING + MORE_SIGNALS)
     root = tmp_path / "data"
     done_on(root, "ingest", tmp_path / "log.csv", "--mapping", tmp_path / "noise.toml")
     done_on(root, "gram")

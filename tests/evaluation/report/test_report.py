@@ -40,7 +40,7 @@ from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import Finished, RunCommand, done_on, run
-from tests.support.own_logs import ingest_own
+from tests.support.measured import ingest_own
 from tests.support.reported import Reported, call
 
 MINUS = "\N{MINUS SIGN}"

@@ -21,8 +21,7 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse, open_tables
-from tests.support.cohorts import INPUTS, LABEL, cohort_of, driven, rows_of
-from tests.support.counts import gram_of, table_of
+from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
 from tests.support.logs import land, log_rows, random_counts
 
 ROWS = [("a", "ax,ay"), ("b", "ax,ay"), ("b", "ax,ay,yaw_rate"), ("c", "ax,ay,yaw_rate")]

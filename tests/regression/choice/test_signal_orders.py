@@ -20,8 +20,15 @@ from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import METHODS, RANKINGS, rank, stepwise_order
 from fleet_slip.regression.subsets import all_rss, best_subsets, signals_of
-from tests.support.counts import dense_fit, gram_of, greedy_order, names, random_drives, table_of
-from tests.support.evidence import evidence
+from tests.support.counts import (
+    dense_fit,
+    evidence,
+    gram_of,
+    greedy_order,
+    names,
+    random_drives,
+    table_of,
+)
 
 ORDERS = {
     "forward": "forward_order",

@@ -11,8 +11,7 @@ import pytest
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import infer_classically
 from fleet_slip.regression.least_squares import fit
-from tests.support.counts import columns_to_counts
-from tests.support.evidence import evidence
+from tests.support.counts import columns_to_counts, evidence
 
 PROBLEMS = ["norris", "noint1", "noint2", "longley", "wampler1", "wampler2", "wampler3"]
 DIGITS = 14

@@ -24,8 +24,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import LinearModel, fit
 from fleet_slip.regression.orders import backward
-from tests.support.counts import columns_to_counts
-from tests.support.evidence import EVIDENCE, evidence
+from tests.support.counts import EVIDENCE, columns_to_counts, evidence
 
 Selection = Literal["none", "m5", "greedy"]
 
