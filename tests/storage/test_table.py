@@ -65,8 +65,7 @@ def test_the_same_rows_make_the_same_bytes_by_which_their_file_is_named(
 
 
 def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
-    action = warehouse.logs.write_file("one", rows("a"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 1)]))
+    land(warehouse, "one", rows("a"))
     stale = [warehouse.logs.snapshot() for _ in range(6)]
     outcomes: list[str] = []
 
@@ -194,8 +193,7 @@ def test_a_fault_during_a_commit_is_told_as_what_it_is(
 
 
 def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
-    action = warehouse.logs.write_file("one", rows("a"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 1)]))
+    land(warehouse, "one", rows("a"))
     for entry in (path_of(warehouse.root) / "logs/_delta_log").glob("*.json"):
         entry.write_text("{ damaged")
     with pytest.raises(StorageError, match="the Delta log cannot be used"):

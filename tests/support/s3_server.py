@@ -7,6 +7,7 @@ key, since moto takes any.
 import io
 import json
 import random
+import re
 import subprocess
 import sys
 import threading
@@ -41,6 +42,8 @@ class Faults:
         slow_s: longest time by which an answer is late.
         refuse: methods that are answered by 403.
         access_key: the one that is let in.
+        flipping: one bit is flipped in some answers to GET whose path this pattern finds.
+        flipped: share of those answers.
         bytes_per_s: how fast answers to GET of objects come, if not at once.
         seen: requests that came, as METHOD PATH.
     """
@@ -49,6 +52,8 @@ class Faults:
     slow_s: float = 0.0
     refuse: tuple[str, ...] = ()
     access_key: str = ACCESS_KEY
+    flipping: str = r"(?!)"
+    flipped: float = 1.0
     bytes_per_s: float | None = None
     seen: list[str] = field(default_factory=list)
 
@@ -121,9 +126,18 @@ class Server:
             list(self._served(environ, lambda *_: None))
             return _answer(start, "500 Internal Server Error", "InternalError")
         answer = self._served(environ, start)
+        asked = method == "GET" and re.search(faults.flipping, environ["PATH_INFO"])
+        if asked and self._rng.random() < faults.flipped:
+            return [self._flip(b"".join(answer))]
         if faults.bytes_per_s and method == "GET" and not environ["QUERY_STRING"]:
             return _slowly(b"".join(answer), faults.bytes_per_s)
         return answer
+
+    def _flip(self, content: bytes) -> bytes:
+        damaged = bytearray(content)
+        if damaged:
+            damaged[self._rng.randrange(len(damaged))] ^= 1 << self._rng.randrange(8)
+        return bytes(damaged)
 
     def _served(self, environ: Environ, start: StartResponse) -> Iterable[bytes]:
         guard = self._conditional if "HTTP_IF_NONE_MATCH" in environ else nullcontext()
