@@ -323,6 +323,8 @@ class OpenDrives:
                 self.add(pl.read_ipc_stream(piece))
                 if self._in_memory > MOST_OPEN_VALUES:
                     self._put_aside(bundled=False)
+            if self._blocks:  # hundreds of small frames a part would take much memory
+                self._blocks = [pl.concat(self._blocks, rechunk=True)]
             yield from self._take(parts)
 
     def spill(self) -> None:
