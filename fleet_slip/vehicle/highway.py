@@ -182,20 +182,9 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         )
 
     @property
-    def wheel_speeds(self) -> FloatArray:
-        """Angular velocities fl, fr, rl, rr in rad/s."""
-        return np.array(self._hidden[-4:])
-
-    @property
     def sideslip(self) -> float:
         """Side-slip angle in rad."""
         return math.atan2(self.lateral_speed, self.speed)
-
-    @property
-    def specific_force(self) -> tuple[float, float]:
-        """What an accelerometer at the centre of gravity reads: ax, ay in m/s²."""
-        rates = self._rates_of(self.motion)
-        return rates.ax, rates.ay
 
     @property
     def controls(self) -> Controls:

@@ -80,8 +80,7 @@ def test_positive_steering_turns_towards_growing_y() -> None:
         car.step(0.1)
     assert car.position[1] > 0
     assert car.heading > 0
-    assert car.specific_force[1] > 0
-    assert car.wheel_speeds[1] > car.wheel_speeds[0]
+    assert car.motion.yaw_rate > 0
 
 
 def test_it_drives_among_others_on_a_road() -> None:
@@ -100,7 +99,7 @@ def test_it_drives_among_others_on_a_road() -> None:
     assert car.lane_index == ("0", "1", 1)
     assert len(car.history) == 30
     assert isinstance(car.history[0], FourWheelVehicle)
-    np.testing.assert_array_equal(car.history[0].wheel_speeds, car.wheel_speeds)
+    assert car.history[0].motion == car.motion
 
 
 def test_the_class_of_another_car_is_made_by_highway_env() -> None:
