@@ -24,7 +24,7 @@ from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
-from fleet_slip.warehouse.database import database_errors, open_database, sql_text
+from fleet_slip.warehouse.database import database_errors, open_database
 
 QUARANTINE_SCHEMA = pa.schema(
     [
@@ -341,7 +341,7 @@ def _generated_columns() -> Mapping[str, Any]:
     }
 
 
-# What every column of every view means, as comments in DuckDB and as a table of its own.
+# What every column of every view means, as a table.
 
 COMMON = "common"
 """Section of `warehouse/columns.toml` for columns of several views."""
@@ -365,7 +365,7 @@ def column_descriptions() -> dict[str, dict[str, ColumnDescription]]:
 
 
 def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
-    """Comment the views' columns, and return all columns with unit and description as a table."""
+    """Return the columns of all views with unit and description."""
     by_view, signals = column_descriptions(), catalogue()
     common = {n: ColumnDescription(description=c.description) for n, c in signals.drive.items()}
     for name, signal in signals.signals.items():
@@ -377,14 +377,10 @@ def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
         "WHERE NOT internal AND NOT starts_with(table_name, 'empty_') "
         "ORDER BY table_name, column_index"
     ).fetchall()
-    rows, comments = [], []
+    rows = []
     for view, column, data_type in found:
         described = by_view.get(view, {}).get(column) or common.get(column)
         unit, description = (described.unit, described.description) if described else ("", "")
         row = {"view": view, "column": column, "type": data_type}
         rows.append(row | {"unit": unit, "description": description})
-        if description:
-            text = f"{description} [{unit}]" if unit else description
-            comments.append(f"COMMENT ON COLUMN {view}.{column} IS {sql_text(text)}")
-    database.execute(";".join(comments))
     return pa.Table.from_pylist(rows)
