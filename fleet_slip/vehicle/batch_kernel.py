@@ -67,7 +67,7 @@ def _address(context: Any, builder: Any, array_type: Any, args: Any, index: int)
 def _read(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, kind: Any) -> Any:
     fields = kind.instance_class
     count = len(fields._fields)
-    result = types.NamedUniTuple(types.float64, count, fields)  # type: ignore[no-untyped-call]
+    result = types.NamedUniTuple(types.float64, count, fields)
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array_type = signature.args[0]

@@ -197,7 +197,7 @@ def test_an_attachment_of_a_channel_is_not_read(
 
     monkeypatch.setattr(Path, "read_bytes", noted)
     with MDF(file) as log:
-        assert log.get("video").attachment[0] == str(SECRET).encode()  # type: ignore[index]
+        assert log.get("video").attachment[0] == str(SECRET).encode()
     assert seen == ["secret"]
     mapping = a_mapping(time=OWN_CLOCK, signals={"ax": {"column": "video", "unit": "m/s^2"}})
     assert read_measured(file, mapping).counts.ticks == ROWS
