@@ -207,7 +207,7 @@ def _latest(
     return latest, np.where(heads, before, shifted)
 
 
-MOST_OPEN_VALUES = 2**22
+MOST_OPEN_VALUES = 2**21
 """Values of drives that have not ended, in memory; all others wait in a temporary file."""
 MOST_PARTS = 64
 """Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
@@ -296,7 +296,7 @@ class OpenDrives:
             found = self._let_go(some)
             for part in some:
                 self._group_of.pop(part, None)
-                put_aside = map(pl.read_ipc_stream, self._spool.read(part))
+                put_aside = map(pl.read_ipc_stream, self._spool.take(part))
                 if pieces := [*put_aside, *found[part]]:
                     yield DriveRows(_by_base(pieces))
 
@@ -319,7 +319,7 @@ class OpenDrives:
         for part in self._ended:
             bundles[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
         for bundle, parts in sorted(bundles.items()):
-            for piece in self._spool.read(("bundle", bundle)):
+            for piece in self._spool.take(("bundle", bundle)):
                 self.add(pl.read_ipc_stream(piece))
                 if self._in_memory > MOST_OPEN_VALUES:
                     self._put_aside(bundled=False)

@@ -315,7 +315,14 @@ class Spool:
 
     def read(self, key: Hashable) -> Iterator[bytes]:
         """Yield the pieces of a key."""
-        for start, size in self._pieces[key]:
+        return self._read(self._pieces.get(key, ()))
+
+    def take(self, key: Hashable) -> Iterator[bytes]:
+        """Yield the pieces of a key, and forget where they are: of thousands that takes memory."""
+        return self._read(self._pieces.pop(key, ()))
+
+    def _read(self, pieces: Iterable[tuple[int, int]]) -> Iterator[bytes]:
+        for start, size in pieces:
             self._file.seek(start)
             yield self._file.read(size)
 
