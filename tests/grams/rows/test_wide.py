@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import WEIGHT, Definition, Fact, Gate, limit_of
+from fleet_slip.catalogue.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
-from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
@@ -266,3 +266,7 @@ def test_the_label_is_no_column_to_look_back_on() -> None:
 def test_adhesion_is_no_fact() -> None:
     with pytest.raises(ValueError, match="adhesion is not a property of the car"):
         Fact(name="adhesion")
+
+
+def test_products_of_a_block_are_exact_in_binary64() -> None:
+    assert BLOCK_ROWS * (2 * limit_of(LARGEST_BITS)) ** 2 < 2**53, "changes are twice as large"
