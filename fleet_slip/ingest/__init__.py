@@ -2,7 +2,7 @@
 
 The way of a row, in the order of its stations:
 
-1. `log_files` finds the logs in folders and on object stores, and copies those that are elsewhere.
+1. `log_files` finds the logs of this machine: files, and those in folders. It refuses URLs.
 2. `formats.reading` opens a file; its format yields batches of the columns that the mapping uses.
 3. `time_bases` joins the time bases of a log; `log_rows` checks each row by itself:
    values in SI units, or the reason why it is refused.
