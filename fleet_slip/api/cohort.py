@@ -8,7 +8,7 @@ from typing_extensions import Doc
 from fleet_slip.api.calls import CarMeasures, Rooted, open_workers, takes
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.features import features as known_features
-from fleet_slip.errors import NotComputedError, UsageError
+from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import (
     CLUSTER,
@@ -16,7 +16,6 @@ from fleet_slip.models.request import (
     WHOLE_SET,
     SelectionRequest,
     inputs_of,
-    load_model_list,
 )
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.storage.runs import LOGGER
@@ -82,23 +81,15 @@ class FleetCohort(Rooted):
         list, and `DataError` if no model can be fitted.
         """
         from fleet_slip.models.line import with_line_fitted
-        from fleet_slip.models.select import answer_request
+        from fleet_slip.models.select import SelectionPlan, answer_request
 
         examined = self.examine()
-
-        def answer() -> "Selection":
-            return answer_request(self.warehouse, request, examined.cohort)
-
         with examined.explaining():
             request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
-            try:
-                found = answer()
-            except NotComputedError:  # a recipe names the list
-                if request.models != DEFAULT_MODELS or not self._make_usual(examined.cohort):
-                    raise
-                found = answer()
-            if found.remark and self._make_usual(examined.cohort):
-                found = answer()
+            plan = SelectionPlan.of(request)
+            if plan.request.models == DEFAULT_MODELS:
+                self._make_grams(plan.feature_set, examined.cohort)
+            found = answer_request(self.warehouse, request, examined.cohort)
         return replace(found, examined=str(examined))
 
     def diagnose(
@@ -145,24 +136,25 @@ class FleetCohort(Rooted):
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
 
-    def _make_usual(self, cohort: str) -> bool:
-        """Make the Gram rows of the usual list, if that takes seconds; return whether it did."""
+    def _make_grams(self, feature_set: str, cohort: str) -> None:
+        """Make the Gram rows of a feature set that a cohort's logs lack, if that takes seconds."""
         from fleet_slip.grams.gram_files import find_backlog
         from fleet_slip.grams.job import update_grams
-        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.grams.reader import open_grams
         from fleet_slip.warehouse.condition import parse_cohort
         from fleet_slip.warehouse.tables import gram_snapshots
 
-        name = load_model_list(DEFAULT_MODELS).features
         grams, logs = gram_snapshots(self.warehouse)
-        files = cohort_files(self.warehouse, parse_cohort(cohort))
-        missing = find_backlog(logs, grams, known_features().identity(name)).missing
+        missing = find_backlog(logs, grams, known_features().identity(feature_set)).missing
+        if not missing:
+            return
+        condition = parse_cohort(cohort)
+        with open_grams(self.warehouse, PLAIN, condition) as opened:
+            files = opened.files(condition)
         rows = sum(file.rows for file in missing if file.path in files)
-        if not rows or rows > ROWS_ON_THE_WAY:
-            return False
-        LOGGER.info("making the Gram rows of %s, which the list %s needs", name, DEFAULT_MODELS)
-        update_grams(self.warehouse, feature_set=name, among=files)
-        return True
+        if 0 < rows <= ROWS_ON_THE_WAY:
+            LOGGER.info("making Gram rows of %s for the list %s", feature_set, DEFAULT_MODELS)
+            update_grams(self.warehouse, feature_set=feature_set, among=files)
 
     def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort

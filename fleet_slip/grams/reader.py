@@ -263,11 +263,11 @@ def _require_complete(
 
 
 def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
-    """Return the log files that have a drive of a cohort. Raises `DataError` without a drive."""
+    """Return the log files that have a drive of a cohort. Raises `DataError` without one."""
     with open_grams(source, PLAIN, condition) as opened:
         found = opened.files(condition)
     if not found:
-        raise DataError(f"no drive satisfies {condition.shown}.")
+        raise DataError(f"no drive with a log satisfies {condition.shown}.")
     return found
 
 

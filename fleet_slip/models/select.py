@@ -396,40 +396,29 @@ GIVEN = "given"
 def answer_request(
     warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
 ) -> Selection:
-    """Select on a condition's drives. Raises `UsageError` for options that do not go together."""
-    named = request.models or request.model or request.chosen_by_inputs
-    usual = not (named or request.label)
-    find = _answer_usual if usual else _answer
-    answer = replace(find(warehouse, request, condition), request=request, asked=condition)
+    """Select on a condition's drives, without the columns of the usual list by that of signals.
+
+    Raises `UsageError` for options that do not go together.
+    """
+    plan, remark = SelectionPlan.of(request), ""
+    usual = not request.models and plan.request.models == DEFAULT_MODELS
+    try:
+        answer = _answer(warehouse, plan, condition)
+    except NotComputedError as error:
+        if not usual:
+            raise
+        remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
+        plan = SelectionPlan.of(replace(request, models=LOGGED_MODELS))
+        answer = _answer(warehouse, plan, condition)
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
-    return replace(answer, without_label=told, label_noise_deg=noise_deg)
-
-
-def usual_list(request: SelectionRequest) -> str:
-    """Return the list that a request without one stands for, where its columns are computed."""
-    logged = request.features or request.by == PARTS
-    return LOGGED_MODELS if logged else DEFAULT_MODELS
-
-
-def _answer_usual(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
-    """Select from the usual list, or from that of logged signals where it cannot be had."""
-    logged = replace(request, models=LOGGED_MODELS)
-    if usual_list(request) == LOGGED_MODELS:
-        return _answer(warehouse, logged, condition)
-    why = "Gram rows sent by cars hold logged signals only."
-    if warehouse.logs.snapshot().rows:
-        try:
-            return _answer(warehouse, replace(request, models=DEFAULT_MODELS), condition)
-        except NotComputedError as error:
-            why = str(error)
-    remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {why}"
-    return replace(_answer(warehouse, logged, condition), remark=remark)
+    known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
+    return replace(known, request=request, asked=condition)
 
 
 @dataclass(frozen=True)
 class SelectionPlan:
-    """What a request compares: its list, if any, in which folds, and of which feature set."""
+    """What a request compares: its list, which `request` names, its folds and its feature set."""
 
     request: SelectionRequest
     model_list: ModelList | None
@@ -440,10 +429,13 @@ class SelectionPlan:
     def of(cls, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-        name = request.models
-        if not (name or request.model or request.chosen_by_inputs):
-            name = COURSE if request.label else usual_list(request)
-        model_list = _given(request) or (load_model_list(name) if name else None)
+        if not (request.models or request.model or request.chosen_by_inputs):
+            logged = request.features or request.by == PARTS
+            usual = LOGGED_MODELS if logged else DEFAULT_MODELS
+            request = replace(request, models=COURSE if request.label else usual)
+        model_list = _given(request)
+        if request.models:
+            model_list = load_model_list(request.models)
         if model_list and model_list.label and not request.label:
             request = replace(request, label=model_list.label)
             request.check()
@@ -473,22 +465,21 @@ class SelectionPlan:
         return replace(found, weighed=weighed, full=full)
 
 
-def _answer(warehouse: Warehouse, request: SelectionRequest, condition: str) -> Selection:
-    asked = SelectionPlan.of(request)
-    request, folds = asked.request, asked.folds
+def _answer(warehouse: Warehouse, plan: SelectionPlan, condition: str) -> Selection:
+    request, folds = plan.request, plan.folds
     distances = bool(
-        request.nested and not request.ordered and not _searches_of(request, asked.model_list)
+        request.nested and not request.ordered and not _searches_of(request, plan.model_list)
     )
     of_drives = request.ordered or request.robust or request.half_life
     if of_drives or distances:
-        cohort = asked.load(warehouse, condition)
+        cohort = plan.load(warehouse, condition)
     else:  # the sum of each fold suffices
-        cohort = load_cohort(warehouse, condition, asked.feature_set, folds)
+        cohort = load_cohort(warehouse, condition, plan.feature_set, folds)
     if request.prior:
         from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
-        cohort = replace(cohort, prior=simulate_prior(request.prior, asked.feature_set))
-    answer = asked.choose(cohort)
+        cohort = replace(cohort, prior=simulate_prior(request.prior, plan.feature_set))
+    answer = plan.choose(cohort)
     if distances:
         inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
         told = try_distances(answer.cohort, inputs, folds, request)
@@ -608,8 +599,7 @@ def _compare_listed(
         model=(*listed, *nested),
         search=searches,
     )
-    usual = GIVEN if request.model else request.label
-    name = request.models or (usual if listed else None)
+    name = request.models or (GIVEN if request.model else None)
     label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
     selection = select(
         cohort, described.model, folds, worth, searches, inputs, intercept=request.intercept

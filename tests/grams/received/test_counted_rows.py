@@ -57,6 +57,7 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path:
         assert (row["source"], row["day"]) == ("received", date(2024, 5, 1))
     found = fleet.cohort().select(model="ax,ay")
     assert (found.cohort.rows, found.cohort.count_received_with()) == (3000, 6)
+    assert "sent Gram rows of logged signals" in fleet.cohort().select().remark
     assert not fleet.verify(full=True).findings
 
 
