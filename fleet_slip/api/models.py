@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.evaluate import Evaluation
     from fleet_slip.evaluation.report import Written
     from fleet_slip.export.stepping import Estimator
-    from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
     from fleet_slip.models.score import Score
@@ -94,11 +93,12 @@ class PublishedModels(Rooted):
         that contradict any car; `UsageError` for an invalid name, and
         what `FleetCohort.select` raises.
         """
-        from fleet_slip.models.publish import publish
+        from fleet_slip.models.publish import challenger_of, publish
 
-        registry = self.registry()
-        manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
-        return publish(registry, manifest, selection, force=force, candidate=candidate)
+        how = {"force": force, "candidate": candidate}
+        registry, selection = self.registry(), self._chosen(name, choice)
+        manifest = challenger_of(self.warehouse, registry, selection, name, **how)
+        return publish(registry, manifest, selection, **how)
 
     def would_publish(
         self,
@@ -109,54 +109,23 @@ class PublishedModels(Rooted):
         candidate: bool = False,
     ) -> "DryRun":
         """Tell what `publish` of the same would come to, a refusal too; nothing is written."""
-        from fleet_slip.models.publish import DryRun, would_publish
+        from fleet_slip.models.publish import DryRun, challenger_of, would_publish
 
+        how = {"force": force, "candidate": candidate}
         registry = self.registry()
         try:
-            manifest, selection = self._challenger(name, choice, force=force, candidate=candidate)
-            return would_publish(registry, manifest, selection, force=force, candidate=candidate)
+            selection = self._chosen(name, choice)
+            manifest = challenger_of(self.warehouse, registry, selection, name, **how)
+            return would_publish(registry, manifest, selection, **how)
         except RefusedError as error:
             return DryRun(name, False, str(error), refused=True)
 
-    def _challenger(
-        self,
-        name: str,
-        choice: "Selection | FleetCohort | None",
-        *,
-        force: bool,
-        candidate: bool,
-    ) -> "tuple[Manifest, Selection]":
-        """Return a selection's winner, whose drives and course are looked at unless forced."""
-        from fleet_slip.models.acceptance import (
-            require_in_time,
-            require_sound_course,
-            require_sound_drives,
-        )
-        from fleet_slip.models.publish import (
-            manifest_of,
-            with_assumptions,
-            with_straight_intercept,
-        )
-
-        require_model_name(name)
-        selection = self._chosen(name, choice)
-        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, name))
-        manifest = with_assumptions(self.warehouse, manifest, selection)
-        if manifest.learned_from and not force:
-            delays_s = require_in_time(self.warehouse, manifest)
-            require_sound_course(self.warehouse, manifest, delays_s)
-        if not (force or candidate):
-            registry = self.registry()
-            champion = registry.champion(name)
-            made = registry.trained_drives(champion.manifest) if champion else None
-            settled = len(champion.manifest.terms) if champion else 0
-            require_sound_drives(self.warehouse, manifest, made, settled)
-        return manifest, selection
-
     def _chosen(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
+        """Return a selection, made by the recipe of a model if none is given."""
         from fleet_slip.models.publish import recipe_for
         from fleet_slip.models.request import SelectionRequest
 
+        require_model_name(name)
         if choice is not None and not isinstance(choice, FleetCohort):
             return choice
         condition, unexamined = (choice.condition, choice.unexamined) if choice else (None, False)

@@ -15,7 +15,12 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.models.acceptance import judge
+from fleet_slip.models.acceptance import (
+    judge,
+    require_in_time,
+    require_sound_course,
+    require_sound_drives,
+)
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -154,6 +159,33 @@ def is_up_to_date(
         checksum_of_list(model_list, worth),
         package_version("fleet-slip"),
     )
+
+
+def challenger_of(
+    warehouse: Warehouse,
+    registry: Registry,
+    selection: Selection,
+    name: str,
+    *,
+    force: bool,
+    candidate: bool,
+) -> Manifest:
+    """Return the winner of a selection as the manifest that `publish` takes.
+
+    Unless forced, raises `RefusedError` for a late or false course and, unless it is to be a
+    candidate, for first measured drives that contradict any car.
+    """
+    manifest = with_straight_intercept(warehouse, manifest_of(selection, name))
+    manifest = with_assumptions(warehouse, manifest, selection)
+    if manifest.learned_from and not force:
+        delays_s = require_in_time(warehouse, manifest)
+        require_sound_course(warehouse, manifest, delays_s)
+    if not (force or candidate):
+        champion = registry.champion(name)
+        made = registry.trained_drives(champion.manifest) if champion else None
+        settled = len(champion.manifest.terms) if champion else 0
+        require_sound_drives(warehouse, manifest, made, settled)
+    return manifest
 
 
 def manifest_of(selection: Selection, name: str) -> Manifest:

@@ -143,7 +143,7 @@ def test_a_course_of_another_place_is_refused(
     """As if the receiver were known to be 200 ms late: then the place is 4 m from where it was."""
     cars = fleet.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
     late = {car: 0.2 for (car,) in cars}
-    monkeypatch.setattr("fleet_slip.models.acceptance.require_in_time", lambda *_: late)
+    monkeypatch.setattr("fleet_slip.models.publish.require_in_time", lambda *_: late)
     with pytest.raises(RefusedError, match="course of 1 of 1 car is implausible") as refused:
         without_label(fleet)
     assert "Check antenna_x_m" in str(refused.value)
