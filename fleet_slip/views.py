@@ -67,7 +67,7 @@ def open_views(
     if "runs" in wanted:
         add_runs(database, warehouse.root)
     if "models" in wanted:
-        add_table(database, "models", Registry(warehouse.root / "models").as_table())
+        add_table(database, "models", Registry.of(warehouse).as_table())
     if "dictionary" in wanted:
         add_table(database, "dictionary", describe_columns(database))
     if not unlocked:

@@ -173,7 +173,7 @@ class FleetCohort(Rooted):
                 raise UsageError("name a published model or signals (of a feature set), not both.")
             cohort = self._load(features or PLAIN)
             return cohort, inputs_of(cohort, signals or WHOLE_SET), None
-        registry = Registry(self.root / "models")
+        registry = Registry.of(self.warehouse)
         if model is None:
             model = registry.only(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)

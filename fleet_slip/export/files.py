@@ -196,7 +196,7 @@ def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
     """
     from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - it renders documents
 
-    aliases = Registry(warehouse.root / "models").history(version.manifest.name).aliases()
+    aliases = Registry.of(warehouse).history(version.manifest.name).aliases()
     return log_to_mlflow(uri, _subject(version, warehouse), aliases)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.definitions import Combination, Definition
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.lines import FittedLine, whole_line
@@ -35,11 +34,7 @@ KEPT_UNTIL = 2
 
 
 def with_line_fitted(
-    warehouse: Warehouse,
-    request: SelectionRequest,
-    asked: str,
-    condition: str,
-    progress: Progress = no_progress,
+    warehouse: Warehouse, request: SelectionRequest, asked: str, condition: str
 ) -> SelectionRequest:
     """Return a request of a set with a line, which is fitted if none is kept; others as they are.
 
@@ -65,13 +60,13 @@ def with_line_fitted(
         }
         line = _kept_line(warehouse, about, condition)
         if line is None:
-            line = fit_line(warehouse, about, condition, progress)
+            line = fit_line(warehouse, about, condition)
             warehouse.keep_line(line)
         named = f"{named}_{line.digest}"
         request = replace(request, features=named)
     if features().line_of(named):
         files = cohort_files(warehouse, parse_cohort(condition))
-        update_grams(warehouse, progress, feature_set=named, among=files)
+        update_grams(warehouse, feature_set=named, among=files)
     return request
 
 
@@ -96,16 +91,14 @@ def _unpacked(hashes: str) -> Hashes:
     return np.frombuffer(bytes.fromhex(hashes), dtype=">u8").astype(np.uint64)
 
 
-def fit_line(
-    warehouse: Warehouse, about: About, condition: str, progress: Progress = no_progress
-) -> FittedLine:
+def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
     Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
     """
     plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
     files = cohort_files(warehouse, parse_cohort(condition))
-    update_grams(warehouse, progress, feature_set=plan.feature_set, among=files)
+    update_grams(warehouse, feature_set=plan.feature_set, among=files)
     cohort = plan.load(warehouse, condition)
     signals, label = plan.choose(cohort).winner.model.signals, catalogue().label
     served = cohort.serving(signals)

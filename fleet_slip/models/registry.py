@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from fleet_slip.models.predict import Predictor
-    from fleet_slip.storage.table import Table
     from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -262,15 +261,14 @@ _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder, which are made of some Gram rows."""
+    """All models below a folder."""
 
     folder: Folder
-    grams: "Table | None" = None
 
     @classmethod
     def of(cls, warehouse: "Warehouse") -> "Registry":
         """Return the models of a data root."""
-        return cls(warehouse.root / "models", warehouse.grams)
+        return cls(warehouse.root / "models")
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
