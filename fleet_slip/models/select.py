@@ -585,27 +585,26 @@ def _compare_listed(
         if request.nested and not searches
         else ()
     )
-    if searches and not listed:
-        selection = select(cohort, (), folds, worth, searches, inputs, intercept=request.intercept)
+    candidates = (*listed, *nested)
+    if candidates:
+        described = ModelList(
+            description=model_list.description if model_list else "Nested models of an order",
+            features=cohort.feature_set,
+            folds=folds,
+            model=candidates,
+            search=searches,
+        )
+        name = request.models or (GIVEN if request.model else None)
+        label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+        compared = described.sha256
+    else:
         (search,) = searches
         content = {"inputs": list(inputs), **search.model_dump(include={"method", "most", "rule"})}
         label = f"search:{search.method} {search.most}"
-        checksum = _checksum(sha256_of(canonical_json(content)), request.worth, request.intercept)
-        return replace(selection, model_list=label, config_sha256=checksum)
-    described = ModelList(
-        description=model_list.description if model_list else "Nested models of an order",
-        features=cohort.feature_set,
-        folds=folds,
-        model=(*listed, *nested),
-        search=searches,
-    )
-    name = request.models or (GIVEN if request.model else None)
-    label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
-    selection = select(
-        cohort, described.model, folds, worth, searches, inputs, intercept=request.intercept
-    )
-    checksum = _checksum(described.sha256, request.worth, request.intercept)
-    return replace(selection, model_list=label, config_sha256=checksum)
+        compared = sha256_of(canonical_json(content))
+    found = select(cohort, candidates, folds, worth, searches, inputs, intercept=request.intercept)
+    checksum = _checksum(compared, request.worth, request.intercept)
+    return replace(found, model_list=label, config_sha256=checksum)
 
 
 def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
