@@ -7,7 +7,7 @@ interrupted and repeated runs, deletions and compaction.
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 
 import pyarrow as pa
@@ -20,7 +20,6 @@ from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
-    Backlog,
     files_to_rewrite,
     find_backlog,
     find_superseded,
@@ -144,38 +143,36 @@ def _update_once(
     logs = warehouse.logs.snapshot()
     identity = features().identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
-    if logs.version is None and backlog.stale:
+    missing, stale = backlog.missing, backlog.stale
+    if logs.version is None and stale:
         raise StorageError(
             f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
-            f"{number_of(len(backlog.stale), 'file')}. Nothing is changed: restore the folder from "
+            f"{number_of(len(stale), 'file')}. Nothing is changed: restore the folder from "
             "a backup."
         )
-    late, others = None, frozenset[str]()
+    late, again = None, frozenset[str]()
     if features().feature_set(feature_set).in_time:
         active = {file.path: file for file in logs.files}
         late = course_delays(grams, frozenset(active))
-        others = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
-        again = [active[path] for path in sorted(others)]
-        backlog = Backlog((*backlog.missing, *again), backlog.stale)
+        again = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
+        missing += tuple(active[path] for path in sorted(again))
     if among is not None:
-        others &= frozenset(among)
-        chosen = tuple(file for file in backlog.missing if file.path in among)
-        backlog = Backlog(chosen, backlog.stale)
+        again &= frozenset(among)
+        missing = tuple(file for file in missing if file.path in among)
     after, dropped = grams, 0
-    if backlog.missing or backlog.stale:
-        new_rows = compute_grams(warehouse, backlog.missing, progress, feature_set, executor, late)
-        merged = _Merged(grams, backlog.stale, identity, others)
-        add = write_rows(warehouse, merged.parts(new_rows))
-        _land(grams, logs, identity, add, merged.replaced)
+    if missing or stale:
+        new_rows = compute_grams(warehouse, missing, progress, feature_set, executor, late)
+        add, replaced, dropped = _write_merged(warehouse, grams, new_rows, stale, identity, again)
+        _land(grams, logs, identity, add, replaced)
         # Who removed a file may have found no Gram row of its drives, and so have changed none; the
         # next attempt drops those that landed.
-        require_active(logs.renewed(), backlog.missing)
-        after, dropped = warehouse.grams.snapshot(), merged.superseded
+        require_active(logs.renewed(), missing)
+        after = warehouse.grams.snapshot()
     return GramReport(
         feature_set=identity,
-        files_read=len(backlog.missing),
-        rows_read=sum(file.rows for file in backlog.missing),
-        files_dropped=len(backlog.stale),
+        files_read=len(missing),
+        rows_read=sum(file.rows for file in missing),
+        files_dropped=len(stale),
         gram_rows=after.rows,
         logs_version=logs.version,
         grams_version=after.version,
@@ -183,42 +180,45 @@ def _update_once(
     )
 
 
-@dataclass
-class _Merged:
-    """New Gram rows, and those of the files that are written again with them.
+def _write_merged(
+    warehouse: Warehouse,
+    grams: Snapshot,
+    new_rows: Iterable[pa.Table],
+    stale: frozenset[str],
+    identity: str,
+    again: frozenset[str],
+) -> tuple[list[AddAction], list[TableFile], int]:
+    """Write new Gram rows, and those that stay of the files that are written again with them.
 
-    Attributes:
-        grams, stale: what there is, and the log files that are gone.
-        identity, again: the feature set, and the log files that it is computed again for.
-        replaced: the files that are written again, once all parts were taken.
-        superseded: rows that cars had sent, of drives whose logs have come since.
+    Log files that are gone are `stale`; the feature set of an `identity` is computed `again` for
+    some. Returns what adds the new files, the files that give way to them, and how many rows left
+    that cars had sent, of drives whose logs have come since.
     """
+    looked_for = any(is_of_received(file) for file in grams.files)
+    replaced: list[TableFile] = []
+    superseded = 0
 
-    grams: Snapshot
-    stale: frozenset[str]
-    identity: str
-    again: frozenset[str]
-    replaced: list[TableFile] = field(default_factory=list)
-    superseded: int = 0
-
-    def parts(self, new_rows: Iterable[pa.Table]) -> Iterator[pa.Table]:
-        """Yield the new rows, then those that stay of the files that are written again."""
-        looked_for = any(is_of_received(file) for file in self.grams.files)
+    def merged() -> Iterator[pa.Table]:
+        nonlocal superseded
         new: list[pa.Table] = []
         for rows in new_rows:
             new += [rows] if looked_for else []
             yield rows
-        drives, paths = find_superseded(self.grams, new)
-        paths |= {file.path for file in files_to_rewrite(self.grams, self.stale | self.again)}
-        self.replaced += [file for file in self.grams.files if file.path in paths]
-        gone, again = (pa.array(sorted(some), pa.string()) for some in (drives, self.again))
-        for rows in rows_to_keep(self.grams, self.replaced, self.stale):
+        drives, paths = find_superseded(grams, new)
+        paths |= {file.path for file in files_to_rewrite(grams, stale | again)}
+        replaced.extend(file for file in grams.files if file.path in paths)
+        logged, computed = (pa.array(sorted(some), pa.string()) for some in (drives, again))
+        for rows in rows_to_keep(grams, replaced, stale):
             dropped = pc.and_(
-                pc.equal(rows["feature_set"], self.identity), pc.is_in(rows["file"], again)
+                pc.equal(rows["feature_set"], identity), pc.is_in(rows["file"], computed)
             )
-            sent = pc.and_(is_received(rows), pc.is_in(rows["drive_id"].cast(pa.string()), gone))
-            self.superseded += pc.sum(sent).as_py() or 0
+            ids = rows["drive_id"].cast(pa.string())
+            sent = pc.and_(is_received(rows), pc.is_in(ids, logged))
+            superseded += pc.sum(sent).as_py() or 0
             yield rows.filter(pc.invert(pc.or_(dropped, sent)))
+
+    added = write_rows(warehouse, merged())
+    return added, replaced, superseded
 
 
 # Lands the Gram rows of log files before the files themselves, where others are written again.
