@@ -364,7 +364,6 @@ def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
 
 _SECONDS_PER_DAY = 86_400
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_FROM_FILE = ("drive_name", "source_file", "trip_id")
 _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "column")
 
 
@@ -409,7 +408,7 @@ def to_ticks(
     Raises `InputError` for what nobody says.
     """
     start_s = rows.start_s
-    resampler = _build_resampler(rows, intervals_s, whole=COURSE in mapping.signals)
+    resampler = _resampler_of(rows, intervals_s, whole=COURSE in mapping.signals)
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
@@ -479,7 +478,7 @@ def _resample(
     return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
 
 
-def _build_resampler(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:
+def _resampler_of(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:
     """Return what says the ticks of a drive, and brings its signals there if they share times.
 
     A `whole` drive is one without missing ticks where gaps are short: a lost sample, of which some
@@ -528,7 +527,7 @@ def _metadata(
         if mapping.time.own_clock and start_s < EARLIEST_S:
             raise InputError("its clock has no date. Give it in the mapping: drive.day.")
         known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
-    known |= {key: value for key, value in of_drive.items() if key in given or key in _FROM_FILE}
+    known |= of_drive
     dated = mapping.time.is_dated and start_s >= EARLIEST_S
     return {
         **known,

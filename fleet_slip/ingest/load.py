@@ -4,10 +4,11 @@
 `commit_batch` commits these.
 """
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
@@ -228,7 +229,7 @@ def _written(
             (alone if size_of(batch[0].file) >= BATCH_BYTES else together).append(batch)
         batches = together
     yield from run_tasks(executor, write, batches, lambda batch: str(batch[0].file))
-    yield from run_tasks(None, write, alone, str)
+    yield from ((batch, write(batch)) for batch in alone)
 
 
 def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
@@ -254,7 +255,7 @@ def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> Ingest
         report.suspicions, report.drives_replaced = (), 0
         if not report.drives_forgotten and are_gone(warehouse, one.digest):
             report.drives_forgotten = report.counts.drives
-            report.counts = replace(report.counts, drives=0, ticks=0)
+            report.counts = dataclasses.replace(report.counts, drives=0, ticks=0)
     return report
 
 
@@ -382,7 +383,7 @@ class _Writer:
         if is_new:
             report.drives_forgotten, report.suspicions = len(left_out), stream.suspicions()
             drives_left = stream.counts.drives - len(left_out)
-            report.counts = replace(stream.counts, drives=drives_left, ticks=ticks)
+            report.counts = dataclasses.replace(stream.counts, drives=drives_left, ticks=ticks)
             one.fingerprints = fingerprints if ticks else {}
             is_there = asked.earlier and self._landed["logs"](FILES + asked.earlier)
             earlier = asked.earlier if is_there else None

@@ -84,6 +84,12 @@ def _number_problems(name: str, present: pl.Expr, more: tuple[pl.Expr, str]) -> 
     return find_problems((unread, "not_a_number"), (infinite, "not_finite"), more)
 
 
+def _time_problems(name: str, text: pl.Expr, *more: tuple[pl.Expr, str]) -> pl.Expr:
+    """Return what can be wrong with a day or a time of a field."""
+    unread = pl.col(name).is_null()
+    return find_problems((text.is_null(), "missing"), (unread, "not_a_time"), *more)
+
+
 def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     """Return a column as text, whole numbers without a point, null for missing."""
     raw = pl.col(RAW + column)
@@ -143,9 +149,7 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Fi
         case other:
             raise unfit_column(column, other, "a date such as 2024-05-31")
     outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
-    problem = find_problems(
-        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
-    )
+    problem = _time_problems(name, text, (outside, "out_of_range"))
     return Field(name, "key", raw, day, problem)
 
 
@@ -169,8 +173,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
             text = _dates(mapping.time.date, schema, mapping) + " " + text
         if not mapping.time.is_dated:  # the time of day
             clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
-            cases = ((text.is_null(), "missing"), (value.is_null(), "not_a_time"))
-            return Field("time", "time", raw, clock_s, find_problems(*cases))
+            return Field("time", "time", raw, clock_s, _time_problems("time", text))
         moment = as_moments(text, str(mapping.time.moment_format))
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
@@ -183,9 +186,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
         )
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
-    problem = find_problems(
-        (text.is_null(), "missing"), (value.is_null(), "not_a_time"), (outside, "out_of_range")
-    )
+    problem = _time_problems("time", text, (outside, "out_of_range"))
     return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
 
 

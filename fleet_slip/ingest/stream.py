@@ -193,13 +193,9 @@ class MeasuredStream:
         if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
             trip_id = name
         self._trips[group] = trip_id, rows.end_s
-        in_file = self.checker.keys.metadata[group]
-        known = {
-            **in_file,
-            "drive_name": in_file.get("drive", self._stem),
-            "source_file": self.name,
-            "trip_id": trip_id,
-        }
+        known = dict(self.checker.keys.metadata[group])
+        known["drive_name"] = known.pop("drive", self._stem)
+        known |= {"source_file": self.name, "trip_id": trip_id}
         for base in rows.bases.keys() - intervals_s.keys():
             steps_s = np.diff(rows.bases[base]["time"].head(RATE_ROWS).to_numpy())
             intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
