@@ -132,7 +132,7 @@ class FleetCohort(Rooted):
         from fleet_slip.evaluation.identify import identify_held_out, measured_car
 
         car = measured_car(name, measured)
-        chosen = TuningDrives.of(self.warehouse, self._load("signals"), weighed=False)
+        chosen = TuningDrives.of(self.warehouse, self._load(PLAIN), weighed=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
 

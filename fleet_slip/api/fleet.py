@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from datetime import date
 from functools import partial
@@ -321,8 +322,7 @@ class Fleet(HealthAndUpkeep):
         model_name = require_model_name(name or chosen.name)
         parse_worth(worth)  # before anything is written
         condition = f"campaign = '{chosen.name}'"
-        waiting = partial(LOGGER.info, "%s: waiting for another run", chosen.name)
-        with self.root.exclusive(f".run-{chosen.name}.lock", waiting):
+        with self._alone("run", chosen.name):
             with open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
                     chosen,
@@ -376,11 +376,7 @@ class Fleet(HealthAndUpkeep):
         training = Training.on_mapping(require_model_name(name), plan)
         reports: list[IngestReport] = []
         failure = None
-        waiting = partial(LOGGER.info, "%s: waiting for another run", name)
-        with (
-            self.root.exclusive(f".learn-{name}.lock", waiting),
-            open_workers(self.root, workers) as executor,
-        ):
+        with self._alone("learn", name), open_workers(self.root, workers) as executor:
             try:
                 self.ingest(
                     logs,
@@ -431,9 +427,13 @@ class Fleet(HealthAndUpkeep):
 
         parse_worth(request.worth)
         require_model_name(request.name)
-        waiting = partial(LOGGER.info, "%s: waiting for another night", request.name)
-        with self.root.exclusive(f".nightly-{request.name}.lock", waiting):
+        with self._alone("nightly", request.name):
             return Night(self, request).run()
+
+    def _alone(self, job: str, name: str) -> AbstractContextManager[None]:
+        """Wait while another process of this machine does the same, and say so."""
+        waiting = partial(LOGGER.info, "%s: waiting for another fleet-slip %s", name, job)
+        return self.root.exclusive(f".{job}-{name}.lock", waiting)
 
 
 def _chosen_logs(

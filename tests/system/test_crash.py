@@ -304,7 +304,7 @@ def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
         running = [start_on(root, *job) for _ in range(2)]
         for process in running:
             assert process.stderr
-            assert process.stderr.readline() == "smoke: waiting for another run\n"
+            assert process.stderr.readline() == "smoke: waiting for another fleet-slip run\n"
     done = finish(*running)
     assert [one.exit_code for one in done] == [0, 0]
     assert sum("nothing to do, smoke@1 is up to date" in one.stderr for one in done) == 1
