@@ -42,7 +42,8 @@ from fleet_slip.storage.runs import LOGGER, step
 if TYPE_CHECKING:
     import duckdb
 
-    from fleet_slip.api.session import LearnReport, RunReport, Session
+    from fleet_slip.api.session import Session
+    from fleet_slip.api.training import LearnReport, RunReport
     from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.on_board import CountedReport
@@ -313,7 +314,7 @@ class Fleet(HealthAndUpkeep):
         is worse than the champion is no error: the report says so. Progress is in rows of each
         step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
-        from fleet_slip.api.session import RunReport, Training
+        from fleet_slip.api.training import RunReport, Training
         from fleet_slip.models.request import parse_worth
         from fleet_slip.simulation.campaign import load_campaign
 
@@ -367,7 +368,7 @@ class Fleet(HealthAndUpkeep):
         Raises `ConfigError` for an invalid mapping or one that has neither label, and what
         `ingest`, `gram` and `FleetCohort.select` raise.
         """
-        from fleet_slip.api.session import LearnReport, Training
+        from fleet_slip.api.training import LearnReport, Training
         from fleet_slip.errors import InputError
         from fleet_slip.ingest.mapping import load_mapping
 

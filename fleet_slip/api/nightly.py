@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import NightRequest, of_step
-from fleet_slip.api.session import Training
+from fleet_slip.api.training import Training
 from fleet_slip.base import date_of, number_of
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs

@@ -11,7 +11,7 @@ import typer
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.session import LearnReport, RunReport
+from fleet_slip.api.training import LearnReport, RunReport
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say

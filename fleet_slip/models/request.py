@@ -33,8 +33,8 @@ LOGGED_MODELS = "table1"
 Label = Literal["course"]
 """What may stand for the label of a reference sensor."""
 
-COURSE = "course"
-"""Also the name of the feature set, and of the model list, that are taken for it."""
+COURSE_MODELS = COURSE_FEATURES = "course"
+"""The model list, and the feature set, that are taken for it."""
 
 DEFAULT_MOST = 24
 

@@ -26,7 +26,8 @@ from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
 from fleet_slip.models.request import (
-    COURSE,
+    COURSE_FEATURES,
+    COURSE_MODELS,
     DEFAULT_MODELS,
     LOGGED_MODELS,
     WHOLE_SET,
@@ -432,7 +433,7 @@ class SelectionPlan:
         if not (request.models or request.model or request.chosen_by_inputs):
             logged = request.features or request.by == PARTS
             usual = LOGGED_MODELS if logged else DEFAULT_MODELS
-            request = replace(request, models=COURSE if request.label else usual)
+            request = replace(request, models=COURSE_MODELS if request.label else usual)
         model_list = _given(request)
         if request.models:
             model_list = load_model_list(request.models)
@@ -542,7 +543,7 @@ def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[st
 def _given(request: SelectionRequest) -> ModelList | None:
     if request.model is None:
         return None
-    feature_set = request.features or (COURSE if request.label else PLAIN)
+    feature_set = request.features or (COURSE_FEATURES if request.label else PLAIN)
     signals = require_inputs(request.model.split(","), feature_set)
     model = CandidateModel(name=GIVEN, signals=signals)
     return ModelList(description="One model", features=feature_set, model=(model,))
@@ -554,7 +555,7 @@ def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
-    usual = COURSE if request.label else PLAIN
+    usual = COURSE_FEATURES if request.label else PLAIN
     named = request.features or (model_list.features if model_list else usual)
     if request.label and not features().feature_set(named).change_ticks:
         known = ", ".join(name for name, one in features().sets.items() if one.change_ticks)
