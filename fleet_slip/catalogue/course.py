@@ -29,7 +29,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
 
-COURSE, YAW_RATE = "course", "yaw_rate"
+COURSE, YAW_RATE, SATELLITE_SPEED = "course", "yaw_rate", "satellite_speed"
 TURNED = "turned"
 """Column of a Gram row: J over `COARSER`, which a scale error of the gyroscope goes with."""
 STRAIGHT, STRAIGHT_COURSE = "straight", "straight_course"

@@ -18,11 +18,10 @@ import pint
 import polars as pl
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.catalogue.course import COURSE
+from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
-from fleet_slip.ingest.suspicion import SPEED
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
@@ -80,7 +79,7 @@ def measures(unit: str, si_unit: str) -> bool:
 
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
 OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
-WHEELS = "wheel_"
+WHEEL_PREFIX = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
 CHOOSE = "choose"
@@ -144,7 +143,7 @@ class SignalColumn(Config):
         """Raise `ValueError` if the column cannot be this signal."""
         if self.unit == CHOOSE:
             raise ValueError("has no unit in the file: write the right one")
-        is_wheel = signal.startswith(WHEELS)
+        is_wheel = signal.startswith(WHEEL_PREFIX)
         if self.radius_m is not None and not is_wheel:
             raise ValueError("has radius_m, which is for wheel speeds only")
         if self.radius_m is None and is_wheel and measures(self.unit, VELOCITY):
@@ -172,13 +171,13 @@ def split_components(signals: Any) -> Any:
         return signals
     if missing := [key for key in ("north", "east") if key not in course]:
         raise ValueError(f"course: {missing[0]} is missing: it needs both velocities")
-    if SPEED in signals or "column" in course:
+    if SATELLITE_SPEED in signals or "column" in course:
         raise ValueError("course: north and east give the speed too: leave the other columns out")
     shared = {key: value for key, value in course.items() if key not in {"north", "east"}}
     return {
         **signals,
         COURSE: {**shared, "column": course["north"], "component": "north"},
-        SPEED: {**shared, "column": course["east"], "component": "east"},
+        SATELLITE_SPEED: {**shared, "column": course["east"], "component": "east"},
     }
 
 
@@ -186,7 +185,7 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
     """Raise `ValueError` unless the course, if there is one, comes with all that it needs."""
     for name, one in signals.items():
         keys = (one.clockwise_from_north, one.antenna_x_m, one.antenna_y_m, one.component)
-        if name not in {COURSE, SPEED} and any(key is not None for key in keys):
+        if name not in {COURSE, SATELLITE_SPEED} and any(key is not None for key in keys):
             raise ValueError(f"signals.{name}: antenna and direction are keys of the course")
     course = signals.get(COURSE)
     if course is None:
@@ -201,10 +200,10 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
             "signals.course: set antenna_x_m (forward of the centre of gravity) and antenna_y_m "
             "(left of it). A 1 m error costs about 1° in bends"
         )
-    for needed in (SPEED, "yaw_rate"):
+    for needed in (SATELLITE_SPEED, "yaw_rate"):
         if needed not in signals:
             raise ValueError(f"signals.course: needs {needed}, too")
-    speed = signals[SPEED]
+    speed = signals[SATELLITE_SPEED]
     if (course.time, course.delay_s) != (speed.time, speed.delay_s):
         raise ValueError(
             "signals.course: give satellite_speed the same time and delay_s: it is one receiver"
@@ -214,7 +213,7 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
 def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
     """Return the signal as which a column is checked, a course in any turn, and its counts."""
     if column.component:
-        speed = catalogue()[SPEED]
+        speed = catalogue()[SATELLITE_SPEED]
         return speed, -speed.max_count, speed.max_count
     signal = catalogue()[name]
     if name == COURSE:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import shown
-from fleet_slip.catalogue.course import COURSE
+from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
@@ -27,7 +27,6 @@ from fleet_slip.ingest.guess import (
     headings,
 )
 from fleet_slip.ingest.profile import FileProfile
-from fleet_slip.ingest.suspicion import SPEED
 
 _MOST_REFUSED = 20
 
@@ -64,8 +63,8 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
 
     guesses = {name: _doubted(guess, guesses) for name, guess in guesses.items()}
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
-    if COURSE in guesses and asked_for & {COURSE, SPEED, "yaw_rate"}:
-        asked_for |= {COURSE, SPEED}  # which stand together
+    if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
+        asked_for |= {COURSE, SATELLITE_SPEED}  # which stand together
     sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
     left = {name: guess for name, guess in guesses.items() if name in asked_for}
     notes = (*_notes(profile, guesses), *_refused(profile))
@@ -115,7 +114,7 @@ def signal_keys(guess: Guess) -> dict[str, Any]:
     """Return the keys of a signal in a mapping, those that are not usual."""
     keys = {"column": guess.column, **guess.keys}
     rate_hz = guess.profile.rate_hz
-    if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SPEED}:
+    if rate_hz is not None and rate_hz < 20 and guess.signal not in {COURSE, SATELLITE_SPEED}:
         keys["longest_gap_s"] = round(2 / rate_hz, 2)
     return keys
 
@@ -205,7 +204,7 @@ def _choices(guess: Guess) -> str:
 def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
     keys = signal_keys(guess)
     if guess.component:
-        east = guesses[SPEED].column
+        east = guesses[SATELLITE_SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
     text = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
     return f"{name} = {{ {text} }}"

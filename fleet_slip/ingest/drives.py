@@ -14,7 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.course import COURSE
+from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.facts import MEASURED
 from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
 from fleet_slip.errors import InputError
@@ -34,7 +34,6 @@ from fleet_slip.ingest.resampling import (
     physical,
     place_label,
 )
-from fleet_slip.ingest.suspicion import SPEED
 
 LONGEST_DRIVE_S = 2**19 * STEP_S
 """A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
@@ -412,7 +411,7 @@ def to_ticks(
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
-        if signal in {COURSE, SPEED} and COURSE in mapping.signals:
+        if signal in {COURSE, SATELLITE_SPEED} and COURSE in mapping.signals:
             continue
         if method == "snap" and source.interpolate and not source.delay_s:
             values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
@@ -452,16 +451,16 @@ def _fixes(
     counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
-    both = rows.samples(COURSE), rows.samples(SPEED)
+    both = rows.samples(COURSE), rows.samples(SATELLITE_SPEED)
     samples = both[0].join(both[1], on="time", how="inner", maintain_order="left")
     fixes = fixes_on_ticks(
         mapping.signals[COURSE],
-        (samples[COURSE].to_numpy(), samples[SPEED].to_numpy()),
+        (samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()),
         _on_own_times(rows, COURSE, samples, resampler, intervals_s),
         physical(counts, "yaw_rate"),
         physical(counts, "ay") if "ay" in counts else None,
     )
-    of = zip((COURSE, SPEED), fixes, strict=True)
+    of = zip((COURSE, SATELLITE_SPEED), fixes, strict=True)
     return {name: round_chunks([values], catalogue()[name]) for name, values in of}
 
 

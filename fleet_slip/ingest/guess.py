@@ -14,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course import COURSE
+from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.columns import (
     CHOOSE,
@@ -25,7 +25,7 @@ from fleet_slip.ingest.columns import (
     reads_clock,
 )
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import RADIUS_M, SPEED, TURNING, WHEELS
+from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS
 from fleet_slip.ingest.vocabulary import (
     best_words,
     fits_any,
@@ -140,16 +140,17 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     """Return the guesses with the course as a mapping has it, or without it."""
     found = dict(guesses)
     north, east = found.pop("north", None), found.pop("east", None)
-    course, speed = found.get(COURSE), found.get(SPEED)
+    course, speed = found.get(COURSE), found.get(SATELLITE_SPEED)
     if north and east and north.keys == east.keys:
         found[COURSE] = replace(north, signal=COURSE, keys={**north.keys, "component": "north"})
-        found[SPEED] = replace(east, signal=SPEED, keys={**east.keys, "component": "east"})
+        keys = {**east.keys, "component": "east"}
+        found[SATELLITE_SPEED] = replace(east, signal=SATELLITE_SPEED, keys=keys)
     elif course and speed:
         reason = "clockwise from north, as receivers give it"
         found[COURSE] = course.because(reason, clockwise_from_north=True)
-    if "yaw_rate" not in found or not {COURSE, SPEED} <= set(found):
+    if "yaw_rate" not in found or not {COURSE, SATELLITE_SPEED} <= set(found):
         found.pop(COURSE, None)
-        alone = found.pop(SPEED, None)
+        alone = found.pop(SATELLITE_SPEED, None)
         if alone and not alone.component:
             found.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
     return found

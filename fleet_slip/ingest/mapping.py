@@ -30,7 +30,7 @@ from fleet_slip.config import (
 )
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
-    WHEELS,
+    WHEEL_PREFIX,
     OffsetM,
     RowCondition,
     SignalColumn,
@@ -47,7 +47,7 @@ from fleet_slip.resources import find_config
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
-SPEEDS = ("vx", "vehicle_speed")
+OWN_SPEEDS = ("vx", "vehicle_speed")
 FRONT_WHEELS = ("steer_fl", "steer_fr")
 
 
@@ -80,8 +80,8 @@ class LabelSensor(Config):
         for name in needed:
             if name not in signals:
                 raise ValueError(f"label: it needs the signal {name}")
-        wheels = all(f"{WHEELS}{corner}" in signals for corner in ("fl", "fr", "rl", "rr"))
-        if self.is_elsewhere and not wheels and not any(name in signals for name in SPEEDS):
+        wheels = all(f"{WHEEL_PREFIX}{corner}" in signals for corner in ("fl", "fr", "rl", "rr"))
+        if self.is_elsewhere and not wheels and not any(name in signals for name in OWN_SPEEDS):
             raise ValueError("label: moving it needs a speed: vx, vehicle_speed or four wheels")
 
 
@@ -312,7 +312,7 @@ ASSUMPTIONS = "assumptions"
 def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return what stands for whatever a mapping does not say, each with the key that says it."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
-    wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEELS)}
+    wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEEL_PREFIX)}
     label, course = signals.get(catalogue().label), signals.get(COURSE)
     labelled = catalogue().label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere

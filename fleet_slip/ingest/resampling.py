@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks
-from fleet_slip.ingest.columns import SignalColumn
-from fleet_slip.ingest.mapping import SPEEDS, LabelSensor, Mapping
+from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
+from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, SECOND, wrapped
 
 # Which fixes of a satellite receiver show where the car goes, and at which ticks.
@@ -371,9 +371,9 @@ def _angle(
 
 def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
     """Return the car's speed: as it is logged, or that of its wheels."""
-    for name in SPEEDS:
+    for name in OWN_SPEEDS:
         if name in counts:
             return np.abs(physical(counts, name))
-    wheels = [name for name in counts if name.startswith("wheel_")]
+    wheels = [name for name in counts if name.startswith(WHEEL_PREFIX)]
     speeds = [physical(counts, n) * (mapping.signals[n].radius_m or RADIUS_M) for n in wheels]
     return np.asarray(np.median(speeds, axis=0), dtype=np.float64)

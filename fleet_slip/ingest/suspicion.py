@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import COURSE, LARGEST_RAD, CourseRelation, relate
+from fleet_slip.catalogue.course import (
+    COURSE,
+    LARGEST_RAD,
+    SATELLITE_SPEED,
+    CourseRelation,
+    relate,
+)
 from fleet_slip.catalogue.faults import (
     WITNESSES,
     Fault,
@@ -72,8 +78,6 @@ SOUND = (0.8, 1.25)
 LEAST_OF_THEIR_OWN = 0.9
 MOST_SCALE_ERROR = 0.02
 LEAST_SPEED_MPS = 3.0
-SPEED = "satellite_speed"
-"""The signal of the speed over ground, which comes with a course."""
 
 
 def _course(signals: "Signals") -> Iterator[Fault]:
@@ -93,7 +97,7 @@ def _course(signals: "Signals") -> Iterator[Fault]:
             yield Fault("values", (COURSE,), figure, "Is it a course over ground, and of this car?")
         elif not SOUND[0] <= slope <= SOUND[1]:
             yield Fault("scaled", (COURSE,), figure, "Check its unit, and that of the yaw rate.")
-    fast = signals[SPEED] > LEAST_SPEED_MPS if SPEED in signals else np.zeros(0, dtype=np.bool_)
+    fast = signals.get(SATELLITE_SPEED, np.zeros(0)) > LEAST_SPEED_MPS
     own = float(np.isfinite(course[fast]).mean()) if fast.any() else 1.0
     if own < LEAST_OF_THEIR_OWN:
         figure = f"{1 - own:.0%} of its fixes repeat the last in a turn, or are from reversing"
@@ -110,9 +114,9 @@ def _course(signals: "Signals") -> Iterator[Fault]:
 
 def _relation(signals: "Signals", turned: FloatArray) -> CourseRelation | None:
     """Return what changes over some seconds come to, by the receiver's own speed."""
-    if not {"ay", "satellite_speed"} <= set(signals):
+    if not {"ay", SATELLITE_SPEED} <= set(signals):
         return None
-    yaw_rate, speed = signals["yaw_rate"], signals["satellite_speed"]
+    yaw_rate, speed = signals["yaw_rate"], signals[SATELLITE_SPEED]
     fast = np.where(speed > LEAST_SPEED_MPS, speed, np.nan)
     series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
     changes = series[:, APART:] - series[:, :-APART]
@@ -192,7 +196,7 @@ ROAD_WHEELS = ("steer_fl", "steer")
 LEAST_CORRELATION = 0.6
 _SOUND_RATIOS = {
     **dict.fromkeys((*WHEELS, "vx", "vehicle_speed"), (0.7, 1.4)),
-    SPEED: SOUND,
+    SATELLITE_SPEED: SOUND,
 }
 """Of a speed to that of the wheels; other quantities are known to a factor of 2.5."""
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
@@ -224,7 +228,7 @@ def find_suspicions(signals: Signals) -> list[Fault]:
             label = list(_label(usual, speed))  # which is judged by them
     if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
         label = [sideslip]
-    if not any(SPEED in one.signals for one in found):
+    if not any(SATELLITE_SPEED in one.signals for one in found):
         label += itertools.islice(_course(usual), 1)
     return [*found, *label]
 
@@ -275,7 +279,7 @@ Comparison: TypeAlias = tuple[tuple[str, ...], str, float, float]
 def _compared(signals: Signals, speed: FloatArray) -> Iterator[Comparison]:
     """Yield what the signals of a moving car have to do with one another."""
     rows = moving(speed)
-    for name in (*WHEELS, "vx", "vehicle_speed", SPEED):
+    for name in (*WHEELS, "vx", "vehicle_speed", SATELLITE_SPEED):
         if name in signals:
             own = signals[name] * (RADIUS_M if name in WHEELS else 1.0)
             both = rows & np.isfinite(own) & np.isfinite(speed)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.signals import HALF_TURN, catalogue
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name
@@ -15,7 +16,7 @@ from fleet_slip.simulation.sensors import Delay, Gps, Measurement, Outages, Wand
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.tyre import arctan2
 
-SATELLITE_SIGNALS = ("course", "satellite_speed")
+SATELLITE_SIGNALS = (COURSE, SATELLITE_SPEED)
 
 Place = tuple[float, float]
 
@@ -86,7 +87,7 @@ class ReceiverLog:
         fix = self._outages.fixes(self._ticks, ticks)
         fix[: max(0, int(np.ceil(receiver.delay_s / SAMPLE_S)) - self._ticks)] = False
         scales = [float(catalogue()[name].scale) for name in SATELLITE_SIGNALS]
-        fastest = catalogue()["satellite_speed"].max_count
+        fastest = catalogue()[SATELLITE_SPEED].max_count
         course, speed = _counts(east, north, fix, (scales[0], scales[1]), fastest)
         self._blocks.append((course, speed, fix))
         self._ticks += ticks
