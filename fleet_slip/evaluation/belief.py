@@ -3,7 +3,6 @@
 Functions change a belief in place: a filter takes millions of steps, and allocates nothing in them.
 """
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -132,14 +131,6 @@ TUNABLE = (
 """What is worth tuning of an estimator's `yaw_rate: YawRateNoise`."""
 
 
-@dataclass(frozen=True)
-class YawRateEstimate:
-    """Yaw rate and bias of the gyroscope at every row."""
-
-    yaw_rate_rad_s: FloatArray
-    gyro_bias_rad_s: FloatArray
-
-
 @kernel
 def _filter(
     gyro: FloatArray,
@@ -161,16 +152,17 @@ def _filter(
     return estimates
 
 
-def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -> YawRateEstimate:
-    """Estimate the yaw rate at every row from what was measured up to it; gaps are bridged.
+def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -> FloatArray:
+    """Estimate yaw rate and bias of the gyroscope in rad/s at every row, shape (2, rows).
 
-    One speed in the place of both wheels tells of no turn but where the car stands still.
+    It is of what was measured up to it; gaps are bridged. One speed in the place of both wheels
+    tells of no turn but where the car stands still.
     """
     axle = undriven_axle(drive, car)
     rolling = drive.ax_mps2 > BRAKING_MPS2
     if np.array_equal(axle.left_mps, axle.right_mps, equal_nan=True):
         rolling &= axle.left_mps == 0
-    yaw_rate, bias = _filter(
+    return _filter(
         drive.yaw_rate_rad_s,
         np.where(rolling, axle.yaw_rate_rad_s, np.nan),
         noise.gyro_bias_std_rad_s**2,
@@ -178,4 +170,3 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise) -
         noise.wheel_yaw_rate_std_rad_s**2,
         (STEP_S * noise.yaw_acceleration_std_rad_s2) ** 2,
     )
-    return YawRateEstimate(yaw_rate, bias)

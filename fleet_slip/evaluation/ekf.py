@@ -228,7 +228,7 @@ class Inputs(NamedTuple):
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
     """Return what the filter reads of a drive, gaps bridged. Raises `DataError`."""
     drive = noise.sensors.corrected(drive, car)
-    turning = belief.estimate(drive, car, noise.yaw_rate).yaw_rate_rad_s
+    turning, _ = belief.estimate(drive, car, noise.yaw_rate)
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
     return Inputs(

@@ -5,7 +5,6 @@ biases a_x,bias and a_y,bias of the accelerometers. The paper's (6b) prints the 
 plus; (5b), from which it follows, and the mechanics ask for a minus, which stands here.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -121,26 +120,17 @@ def _filter(
     return means
 
 
-@dataclass(frozen=True)
-class KalmanEstimate:
-    """The filter's mean at every row; NaN before the first fix."""
+def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> FloatArray:
+    """Return vx in m/s, the bias of ax in m/s², vy and the bias of ay, shape (4, rows).
 
-    vx_mps: FloatArray
-    ax_bias_mps2: FloatArray
-    vy_mps: FloatArray
-    ay_bias_mps2: FloatArray
-
-
-def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> KalmanEstimate:
-    """Run the filter over a drive with a yaw rate that is known.
-
-    It begins at the first GPS fix, predicts at every row and updates at every fix. Gaps of the
-    accelerometers are bridged by the value before. Raises `DataError` if the drive has no fix.
+    The yaw rate is known. The filter begins at the first GPS fix, NaN before it, predicts at every
+    row and updates at every fix. Gaps of the accelerometers are bridged by the value before. Raises
+    `DataError` if the drive has no fix.
     """
     fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
     if not len(fixes):
         raise DataError("no GPS fix, which the Kalman filter starts from. Choose drives with GPS.")
-    means = _filter(
+    return _filter(
         hold_last(drive.ax_mps2, "ax"),
         hold_last(drive.ay_mps2, "ay"),
         yaw_rate_rad_s,
@@ -150,7 +140,6 @@ def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) ->
         STEP_S,
         covariances(noise),
     )
-    return KalmanEstimate(*means)
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
@@ -160,6 +149,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) ->
     compiled and releases the interpreter's lock: many drives run on threads, as in
     `executor.map(partial(estimate, car=car, noise=noise), drives)`.
     """
-    turning = belief.estimate(drive, car, noise.yaw_rate)
-    motion = fuse(drive, turning.yaw_rate_rad_s, noise)
-    return sideslip_angle(motion.vx_mps, motion.vy_mps)
+    yaw_rate_rad_s, _ = belief.estimate(drive, car, noise.yaw_rate)
+    vx_mps, _, vy_mps, _ = fuse(drive, yaw_rate_rad_s, noise)
+    return sideslip_angle(vx_mps, vy_mps)

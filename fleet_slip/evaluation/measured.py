@@ -384,5 +384,5 @@ def _judged(drive: LabelledDrive, car: Measured) -> LabelledDrive:
 
 def _rolling(vehicle: VehicleParameters, signals: DriveSignals) -> FloatArray:
     """Return side-slip in rad where the rear wheels roll without slip, arctan(b r / vx)."""
-    turning = estimate_yaw_rate(signals, vehicle, YawRateNoise()).yaw_rate_rad_s
+    turning: FloatArray = estimate_yaw_rate(signals, vehicle, YawRateNoise())[0]
     return np.arctan2(vehicle.body.rear_axle_m * turning, measured_speed_mps(signals, vehicle))
