@@ -263,6 +263,7 @@ FIGURES = (
 )
 SPEEDS = ("figure-2", "figure-6")
 OUTAGES = {"nominal": "Nominal drive", "gps_tunnel": "A tunnel of 20 s"}
+DRAWN_SCENARIOS = frozenset(OUTAGES).union(*(one.drives for one in FIGURES))
 
 
 def draw_pictures(data: ReportData) -> Iterator[Picture]:

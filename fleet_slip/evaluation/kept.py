@@ -11,27 +11,15 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.evaluate import evaluations_of
-from fleet_slip.evaluation.filters import (
-    LinearEstimate,
-    TrainedModels,
-    rebuild,
-    train_models,
-)
-from fleet_slip.evaluation.judge import (
-    ErrorFigures,
-    Estimate,
-    EvaluatedScenario,
-    evaluate_drive,
-)
+from fleet_slip.evaluation.filters import TrainedModels
+from fleet_slip.evaluation.judge import ErrorFigures, EvaluatedScenario
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import best_subsets
-from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document
 from fleet_slip.warehouse.tables import Warehouse
@@ -208,16 +196,6 @@ def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
 
 
 DRAWN_FILTERS = ("kalman", "kalman_tuned")
-DRAWN_SCENARIOS = (
-    "nominal",
-    "noise_doubled",
-    "mass_1000",
-    "mass_1740",
-    "adhesion_0_7",
-    "adhesion_0_4",
-    "melbourne",
-    "gps_tunnel",
-)
 
 
 @dataclass(frozen=True)
@@ -252,44 +230,3 @@ class ReportData:
         """Its number in Table I; of the last that the training drives have the signals for."""
         names = list(self.evaluated.models)
         return THE_PAPERS_CHOICE if THE_PAPERS_CHOICE in names else names[-1]
-
-
-def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
-    """Gather a report about a model version.
-
-    Raises `DataError` if the version has not been evaluated, or if its cohort or a drive of a
-    scenario has changed since: all numbers of a report must be of the same data.
-    """
-    evaluated = latest_of(warehouse, version)
-    trained = train_models(warehouse, version)
-    evaluated.require_models(trained)
-    shipped = shipped_scenarios()
-    drawn = [one for one in shipped if one.name in evaluated.scenarios]
-    drawn = [one for one in drawn if one.name in DRAWN_SCENARIOS]
-    estimators = _drawn(evaluated)
-    runs = {one.scenario.name: evaluate_drive(one, estimators) for one in simulate_drives(drawn)}
-    evaluated.require_figures(runs)
-    cohort, models = trained.selection.cohort, trained.selection.models
-    signals = tuple(dict.fromkeys(models[-1].signals))
-    measured = evaluations_of(warehouse, "measured")
-    documents = (measured.read(number).content for number in reversed(measured.numbers()))
-    return ReportData(
-        version=version,
-        evaluated=evaluated,
-        trained=trained,
-        runs=runs,
-        ordering=compare_orders(cohort, signals),
-        on_measured=next((one for one in documents if one["model"] == version.reference), None),
-        shipped=tuple(one.name for one in shipped),
-    )
-
-
-def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
-    """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
-    about, car = evaluated.estimators, load_scenario("nominal").car
-    models = {
-        name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
-        for name in evaluated.models.values()
-    }
-    filters = {name: rebuild(name, about[name], car) for name in DRAWN_FILTERS if name in about}
-    return {**models, **filters}

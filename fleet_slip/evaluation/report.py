@@ -6,10 +6,20 @@ from dataclasses import dataclass
 
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import MEASURED
-from fleet_slip.evaluation.charts import draw_pictures
+from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import Status, judge_claims
-from fleet_slip.evaluation.judge import LEAST_COVERAGE
-from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, gather
+from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.evaluate import evaluations_of
+from fleet_slip.evaluation.filters import LinearEstimate, rebuild, train_models
+from fleet_slip.evaluation.judge import LEAST_COVERAGE, Estimate, evaluate_drive
+from fleet_slip.evaluation.kept import (
+    DRAWN_FILTERS,
+    PAPER_TABLE_TWO,
+    Evaluated,
+    ReportData,
+    compare_orders,
+    latest_of,
+)
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Drawn, draw
 from fleet_slip.pages.page import (
@@ -22,11 +32,53 @@ from fleet_slip.pages.page import (
     number,
     percent,
 )
+from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
 
 PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
 """Cross-validated correlations, Table I."""
+
+
+def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
+    """Gather a report about a model version.
+
+    Raises `DataError` if the version has not been evaluated, or if its cohort or a drive of a
+    scenario has changed since: all numbers of a report must be of the same data.
+    """
+    evaluated = latest_of(warehouse, version)
+    trained = train_models(warehouse, version)
+    evaluated.require_models(trained)
+    shipped = shipped_scenarios()
+    wanted = DRAWN_SCENARIOS.intersection(evaluated.scenarios)
+    drawn = [one for one in shipped if one.name in wanted]
+    estimators = _drawn(evaluated)
+    runs = {one.scenario.name: evaluate_drive(one, estimators) for one in simulate_drives(drawn)}
+    evaluated.require_figures(runs)
+    cohort, models = trained.selection.cohort, trained.selection.models
+    signals = tuple(dict.fromkeys(models[-1].signals))
+    measured = evaluations_of(warehouse, "measured")
+    documents = (measured.read(number).content for number in reversed(measured.numbers()))
+    return ReportData(
+        version=version,
+        evaluated=evaluated,
+        trained=trained,
+        runs=runs,
+        ordering=compare_orders(cohort, signals),
+        on_measured=next((one for one in documents if one["model"] == version.reference), None),
+        shipped=tuple(one.name for one in shipped),
+    )
+
+
+def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
+    """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
+    about, car = evaluated.estimators, load_scenario("nominal").car
+    models = {
+        name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
+        for name in evaluated.models.values()
+    }
+    filters = {name: rebuild(name, about[name], car) for name in DRAWN_FILTERS if name in about}
+    return {**models, **filters}
 
 
 def _marked(text: str, good: bool, miss: bool = False) -> Cell:
