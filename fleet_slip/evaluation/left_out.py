@@ -131,13 +131,13 @@ class Learner:
     """A model that is learned anew from what is left in, by its own recipe.
 
     Attributes:
-        asked: its recipe.
+        plan: its recipe.
         cohort: the Gram rows of all drives.
         drives: their rows as logged, with the label.
         warehouse: what tells the intercept of a model that changes taught.
     """
 
-    asked: SelectionPlan
+    plan: SelectionPlan
     cohort: Cohort
     drives: Sequence[HeldOutDrive]
     warehouse: Warehouse
@@ -154,13 +154,13 @@ class Learner:
 
         Raises as `load_cohort`.
         """
-        asked = SelectionPlan.of(request)
-        return cls(asked, asked.load(warehouse, condition), drives, warehouse)
+        plan = SelectionPlan.of(request)
+        return cls(plan, plan.load(warehouse, condition), drives, warehouse)
 
     @cached_property
     def divided(self) -> Cohort:
         """The Gram rows of each quarter by itself, as if it were a drive."""
-        name = self.asked.feature_set
+        name = self.plan.feature_set
         if features().feature_set(name).change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
         workspace = Workspace(ColumnPlan.of_set(features(), name))
@@ -184,15 +184,15 @@ class Learner:
         seen = [unit for unit in every if unit not in left_out]
         names = {self.drives[i].drive.drive_id for i, _ in seen}
         divided = len(seen) < QUARTERS * len(names) or len(names) < 2
-        cohort, asked = self.cohort, self.asked
+        cohort, plan = self.cohort, self.plan
         if divided:
             cohort = self.divided
             names = {_quarter_of(self.drives[i].drive.drive_id, quarter) for i, quarter in seen}
         cohort = cohort.part(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
-        values = cohort.drives[FOLD_KEYS[asked.folds.by]].unique()
+        values = cohort.drives[FOLD_KEYS[plan.folds.by]].unique()
         if len(values) < 2:
-            asked = replace(asked, folds=Folding(by="drive", count=asked.folds.count))
-        return asked.choose(replace(cohort, prior=prior) if prior else cohort)
+            plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
+        return plan.choose(replace(cohort, prior=prior) if prior else cohort)
 
     def estimate(
         self, left_out: LeftOut, cars: CarCounts, prior: Cohort | None = None

@@ -200,7 +200,7 @@ class Competition:
             for name, request in recipes.items()
         }
         numbered = any(one.plan.numbers for one in published.values()) or any(
-            features().feature_set(one.asked.feature_set).calibrated for one in learners.values()
+            features().feature_set(one.plan.feature_set).calibrated for one in learners.values()
         )
         vehicle = car if isinstance(car, VehicleParameters) else None
         measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
@@ -260,7 +260,7 @@ class Competition:
 
     def _prior(self, learner: Learner, left_out: LeftOut) -> Cohort | None:
         """Return a learner's prior, in a car identified on what is left in if it was identified."""
-        name, feature_set = learner.asked.request.prior, learner.asked.feature_set
+        name, feature_set = learner.plan.request.prior, learner.plan.feature_set
         if name is None:
             return None
         campaign = load_campaign(name)

@@ -212,7 +212,7 @@ def worth() -> Worth:
     return Worth(math.radians(floor().worth_deg))
 
 
-def contest(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
+def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
     """Return how a selection's winner meets published versions, over drives with all signals.
 
     Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
@@ -240,9 +240,9 @@ def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Compari
 
     Raises `DataError` or `QuestionError` if no drive has the signals of all, and as `contest`.
     """
-    asked = contest(selection, incumbents)
-    groups = asked.serving(selection.cohort.folds(asked.by, GROUPS))
-    return asked.on(groups, groups)
+    contest = contest_of(selection, incumbents)
+    groups = contest.serving(selection.cohort.folds(contest.by, GROUPS))
+    return contest.on(groups, groups)
 
 
 def compare_unseen(
@@ -256,11 +256,11 @@ def compare_unseen(
     if (divided := _divide(registry, selection, incumbents)) is None:
         return None
     cohort, known = divided
-    asked = contest(selection, incumbents)
-    groups, new = (asked.part(cohort, mask) for mask in (np.ones_like(known), ~known))
+    contest = contest_of(selection, incumbents)
+    groups, new = (contest.part(cohort, mask) for mask in (np.ones_like(known), ~known))
     if len(new.names) < LEAST_VEHICLES:
         return None
-    return replace(asked.on(groups, new), unseen=True)
+    return replace(contest.on(groups, new), unseen=True)
 
 
 MOST_DRIVES = 20_000
@@ -471,13 +471,13 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
     if (divided := _divide(registry, selection, [champion])) is None:
         return None
     cohort, known = divided
-    asked = contest(selection, [champion])
-    groups, old, new = (asked.part(cohort, mask) for mask in (np.ones_like(known), known, ~known))
-    (model,) = asked.incumbents.items()
+    contest = contest_of(selection, [champion])
+    groups, old, new = (contest.part(cohort, mask) for mask in (np.ones_like(known), known, ~known))
+    (model,) = contest.incumbents.items()
     on_old, on_new = (as_it_is(*model, folds).pooled for folds in (old, new))
     if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
-    found = asked.on(groups, old)
+    found = contest.on(groups, old)
     (shortfall,) = found.shortfalls
     if shortfall.negligible:
         return None

@@ -67,8 +67,8 @@ def asked_of(selection: Selection) -> dict[str, Any] | None:
     fell_back = not asked and selection.model_list == LOGGED_MODELS
     if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
         return None
-    whole = selection.asked == selection.cohort.condition.text
-    return asked if whole else {**asked, COHORT: selection.asked}
+    whole = selection.asked_condition == selection.cohort.condition.text
+    return asked if whole else {**asked, COHORT: selection.asked_condition}
 
 
 def recipe_for(

@@ -214,7 +214,7 @@ class Selection(Answer):
         full: how many times a row of full weight counts.
         without_label: how good the winner is, if changes of the course alone trained it.
         label_noise_deg: of the label, which every error has in it; None where it is not known.
-        request, asked: what was asked for, and of which drives.
+        request, asked_condition: what was asked for, and of which drives.
         remark: why another list than the usual one was compared.
         examined: which drives were left out for faulty sensors, as a sentence.
     """
@@ -235,7 +235,7 @@ class Selection(Answer):
     without_label: WithoutLabel | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
-    asked: str = TRAINING_DRIVES
+    asked_condition: str = TRAINING_DRIVES
     remark: str = ""
     examined: str = ""
 
@@ -414,7 +414,7 @@ def answer_request(
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
     known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
-    return replace(known, request=request, asked=condition)
+    return replace(known, request=request, asked_condition=condition)
 
 
 @dataclass(frozen=True)
@@ -492,7 +492,7 @@ PRIOR_SHARE = Fraction(1, 8)
 """Weight of all rows of a prior together, where those of the cohort have 1 (docs/measured.md)."""
 
 
-def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Selection:
+def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection:
     """Fit the columns of a list's first search to the cohort and its prior, or choose without it.
 
     With a prior nothing is searched for: simulated drives tell what real ones leave open, so all
@@ -500,15 +500,15 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
     few of them: of n drives the choice without the prior must be better by more than 1/n.
     """
     alone = replace(cohort, prior=None)
-    first = _compare_listed(alone, asked.request, asked.model_list, asked.folds)
+    first = _compare_listed(alone, plan.request, plan.model_list, plan.folds)
     winner, label = first.winner.model, catalogue().label
-    searches = _searches_of(asked.request, asked.model_list)
+    searches = _searches_of(plan.request, plan.model_list)
     named = next((one.inputs for one in searches if one.inputs), ())
     signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
     weighed = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighed.folds(asked.folds.by, asked.folds.count).serving(signals, label, sparse=True)
-    choose = least_squares(signals, label, intercept=asked.request.intercept)
+    folds = weighed.folds(plan.folds.by, plan.folds.count).serving(signals, label, sparse=True)
+    choose = least_squares(signals, label, intercept=plan.request.intercept)
     joined = cross_validate("prior", folds, choose, input_scales())
     told = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
@@ -525,9 +525,9 @@ def weigh_prior(cohort: Cohort, prior: Cohort, asked: "SelectionPlan") -> Select
     return replace(first, cohort=weighed, models=models, winner=chosen)
 
 
-def _weigh_drives(cohort: Cohort, asked: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
+def _weigh_drives(cohort: Cohort, plan: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
     """Return a cohort whose lost drives count less, by a model of all compared inputs."""
-    request, model_list = asked.request, asked.model_list
+    request, model_list = plan.request, plan.model_list
     inputs = inputs_of(cohort, request.nested or WHOLE_SET)
     if model_list and model_list.model and not (request.nested or request.search):
         listed = {name for one in model_list.model for name in one.signals}
