@@ -279,7 +279,7 @@ def as_arrow(numbers: NDArray[Any], absent: BoolArray | None = None) -> pa.Array
     return pa.Array.from_buffers(kind, numbers.size, [valid, pa.py_buffer(numbers)])
 
 
-def digest_drive(
+def digest_counts(
     vehicle_id: str, day: str, ticks: NDArray[np.int32], counts: Mapping[str, pa.Array]
 ) -> str:
     """Return 16 characters that tell a drive by its counts, whatever its file or car is called.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalogue.facts import MEASURED
-from fleet_slip.catalogue.signals import catalogue, digest_drive, round_chunks
+from fleet_slip.catalogue.signals import catalogue, digest_counts, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.formats.source import EARLIEST_S, Spool
@@ -385,7 +385,7 @@ class MeasuredDrive:
     def counts_digest(self) -> str:
         """Fingerprint of its counts."""
         car, day = str(self.metadata["vehicle_id"]), str(self.metadata["day"])
-        return digest_drive(car, day, self.ticks, self.counts)
+        return digest_counts(car, day, self.ticks, self.counts)
 
 
 def drive_id(prefix: str, group: int, stretch: int = 1) -> str:

@@ -48,7 +48,7 @@ REASONS = (
 
 
 @dataclass(frozen=True)
-class Field:
+class RowField:
     """One thing to take from a row, or a condition on it.
 
     `value` is made of raw columns; `problem`, null where all is well, may also use the value under
@@ -135,7 +135,7 @@ def unfit_column(column: str, kind: pl.DataType, needed: str) -> InputError:
 _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 
-def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     """Return the field of a day. Raises `InputError` for a column that is none."""
     raw, value = pl.col(RAW + column), pl.col(name)
     text = raw
@@ -150,10 +150,10 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Fi
             raise unfit_column(column, other, "a date such as 2024-05-31")
     outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
     problem = _time_problems(name, text, (outside, "out_of_range"))
-    return Field(name, "key", raw, day, problem)
+    return RowField(name, "key", raw, day, problem)
 
 
-def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     """Return the field of the time in s, since 1970 for timestamps. Raises `InputError`."""
     unit = "s" if mapping.time.own_clock else mapping.time.unit
     if unit is None:
@@ -161,10 +161,10 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     number, present = as_number(column, schema, mapping)
     problem = _number_problems("time", present, (pl.col("time").is_null(), "missing"))
     time_s = number * conversion_factor(unit, "s")
-    return Field("time", "time", pl.col(RAW + column), time_s, problem)
+    return RowField("time", "time", pl.col(RAW + column), time_s, problem)
 
 
-def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     raw, value = pl.col(RAW + column), pl.col("time")
     kind = schema[RAW + column]
     if kind == pl.String and mapping.time.format is not None:
@@ -173,7 +173,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
             text = _dates(mapping.time.date, schema, mapping) + " " + text
         if not mapping.time.is_dated:  # the time of day
             clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
-            return Field("time", "time", raw, clock_s, _time_problems("time", text))
+            return RowField("time", "time", raw, clock_s, _time_problems("time", text))
         moment = as_moments(text, str(mapping.time.moment_format))
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
@@ -187,7 +187,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> Field:
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
     problem = _time_problems("time", text, (outside, "out_of_range"))
-    return Field("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
+    return RowField("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
 
 
 def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
@@ -203,12 +203,12 @@ LONGEST_TEXT = 200
 """Characters of metadata that are accepted, and of offending values that are kept."""
 
 
-def fields_of(mapping: Mapping, schema: pl.Schema) -> list[Field]:
+def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
     """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
 
     Raises `InputError` if a column's type cannot be what the mapping says it is.
     """
-    fields: list[Field] = []
+    fields: list[RowField] = []
     if mapping.drive.column is not None:
         fields.append(_text("drive", find_held(mapping.drive.column, schema), schema, mapping))
     for name, make in _METADATA.items():
@@ -252,11 +252,11 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     return met
 
 
-def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> Field:
-    return Field(name, "condition", raw, raw, find_problems(*cases))
+def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> RowField:
+    return RowField(name, "condition", raw, raw, find_problems(*cases))
 
 
-def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     """A signal in SI units. Its range is checked on the count that it will become."""
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
@@ -265,7 +265,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> Field:
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = _number_problems(name, present, (outside, "out_of_range"))
-    return Field(name, "signal", raw, _si_value(name, source, number), problem)
+    return RowField(name, "signal", raw, _si_value(name, source, number), problem)
 
 
 def _signed(
@@ -287,19 +287,19 @@ def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
     return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
 
 
-def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     number, present = as_number(column, schema, mapping)
     problem = _number_problems(name, present, (pl.col(name) <= 0, "out_of_range"))
-    return Field(name, "key", pl.col(RAW + column), number, problem)
+    return RowField(name, "key", pl.col(RAW + column), number, problem)
 
 
-def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Field:
+def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
     problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
-    return Field(name, "key", pl.col(RAW + column), as_text(column, schema, mapping), problem)
+    return RowField(name, "key", pl.col(RAW + column), as_text(column, schema, mapping), problem)
 
 
-_METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], Field]] = {
+_METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {
     "vehicle_id": _text,
     "vehicle_model": _text,
     "track": _text,
@@ -384,7 +384,7 @@ class RowChecker:
 @lru_cache(maxsize=64)
 def _understand(
     mapping: Mapping, columns: tuple[tuple[str, pl.DataType], ...]
-) -> tuple[list[Field], pl.Expr | None]:
+) -> tuple[list[RowField], pl.Expr | None]:
     """Return the fields of batches with these columns: the same for all files of a folder."""
     schema = pl.Schema(columns)
     fields = fields_of(mapping, schema)
@@ -400,7 +400,7 @@ class DriveKeys:
         self.metadata: list[dict[str, Any]] = []
         """What each number stands for."""
 
-    def number(self, batch: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
+    def number(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
         """Add `group` to a batch with values: the row's number, null where its key is faulty.
 
         A key are the fields of the kind `key`; without any, the whole file is number 0.
@@ -421,7 +421,7 @@ class DriveKeys:
         return joined.with_columns(pl.when(sound).then("group").alias("group"))
 
 
-def _split(batch: pl.DataFrame, fields: list[Field]) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _split(batch: pl.DataFrame, fields: list[RowField]) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split a batch into good rows, in SI units, and bad ones, by the first problem of each."""
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
     kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
@@ -456,7 +456,7 @@ def no_rows() -> pl.DataFrame:
     return pl.DataFrame(schema={**names, "signal": pl.String, "value": pl.String})
 
 
-def _explain(bad: pl.DataFrame, fields: list[Field]) -> pl.DataFrame:
+def _explain(bad: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
     """Describe rows that all have the same problem."""
     index, reason = divmod(bad[_PROBLEM][0], len(REASONS))
     field = fields[index]

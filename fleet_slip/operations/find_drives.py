@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue, digest_drive
+from fleet_slip.catalogue.signals import catalogue, digest_counts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.rendering import Remark
@@ -217,4 +217,4 @@ def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
             [batch] = mine.to_batches()
             counts = {signal: batch[signal] for signal in signals}
             car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
-            yield digest_drive(car, str(file.day), ticks, counts)
+            yield digest_counts(car, str(file.day), ticks, counts)
