@@ -15,8 +15,9 @@ from fleet_slip.warehouse.condition import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.grams.weights import Weighed
+    from fleet_slip.models.label_quality import WithoutLabel
     from fleet_slip.models.search import SearchChoice
-    from fleet_slip.models.select import Selection, WithoutLabel
+    from fleet_slip.models.select import Selection
 
 TELLING = 0.01
 """Part of a cohort's rows without the label or a signal that is worth a remark."""

@@ -13,10 +13,10 @@ import pytest
 from fleet_slip import open as open_fleet
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.models import select as uncertainty
+from fleet_slip.models import label_quality as uncertainty
 from fleet_slip.models.diagnose import diagnose
+from fleet_slip.models.label_quality import label_noise_deg
 from fleet_slip.models.publish import manifest_of
-from fleet_slip.models.select import label_noise_deg
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
