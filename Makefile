@@ -13,8 +13,11 @@ ROOT ?= data
 # Tests start the program hundreds of times: its compiled modules are kept, whatever the environment says.
 export PYTHONDONTWRITEBYTECODE :=
 
-# uv installs in seconds where it is there; pip comes with Python.
-INSTALL := $(if $(shell command -v uv),uv pip install --python $(BIN)/python,$(BIN)/python -m pip install)
+# uv installs in seconds; pip, which comes with Python, installs the same where uv cannot be had or cannot reach the registry.
+define INSTALL
+$(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt $(1) || \
+	  $(BIN)/python -m pip install --constraint constraints.txt $(1)
+endef
 
 .PHONY: run report gated test tests test-all lint docs setup bench clean
 
@@ -62,16 +65,16 @@ setup: $(VENV)/.installed
 # What running needs, what the checks need, and what the pages need.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip
-	$(INSTALL) --constraint constraints.txt --editable .
+	-$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip uv
+	$(call INSTALL,--editable .)
 	touch $@
 
 $(VENV)/.dev-installed: $(VENV)/.installed
-	$(INSTALL) --constraint constraints.txt --editable . --group dev
+	$(call INSTALL,--editable . --group dev)
 	touch $@
 
 $(VENV)/.docs-installed: $(VENV)/.dev-installed
-	$(INSTALL) --constraint constraints.txt --group docs
+	$(call INSTALL,--group docs)
 	touch $@
 
 clean:

@@ -59,7 +59,7 @@ def required(*requirements: str) -> dict[str, str | None]:
 
 def everything() -> dict[str, str | None]:
     """What users and developers install."""
-    return required("pip", *SHIPPED, *chain(*GROUPS.values()))
+    return required("pip", "uv", *SHIPPED, *chain(*GROUPS.values()))
 
 
 def test_what_is_installed_is_what_was_pinned() -> None:
