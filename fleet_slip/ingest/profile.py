@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.csv import (
-    VBO_BEGINS,
-    CsvFormat,
-    Encoding,
-    decompressed,
-    first_lines,
-)
+from fleet_slip.ingest.formats.csv import CsvFormat, Encoding, decompressed, first_lines
 from fleet_slip.ingest.formats.reading import (
     FileFormats,
     file_errors,
@@ -29,6 +23,7 @@ from fleet_slip.ingest.formats.reading import (
     require_unchanged_log,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
+from fleet_slip.ingest.formats.vbo import VBO_BEGINS
 from fleet_slip.ingest.vocabulary import unit_called, vocabulary
 
 # Guesses how a text file is written: encoding, separator, and where header, units and data are.

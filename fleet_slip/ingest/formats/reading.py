@@ -31,15 +31,10 @@ from fleet_slip.base import shown
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Job
-from fleet_slip.ingest.formats.csv import (
-    VBO_BEGINS,
-    CsvFormat,
-    CsvSource,
-    PlainNumbers,
-    VboSource,
-)
+from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
 from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
+from fleet_slip.ingest.formats.vbo import VBO_BEGINS, VboSource
 from fleet_slip.ingest.log_files import StrayLink
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512

@@ -1,0 +1,125 @@
+"""Reads VBO files of Racelogic: sections of text, and in `[data]` rows of numbers between blanks.
+
+https://en.racelogic.support/VBOX_Automotive/Knowledge_Base/VBO_File_Format. Times are of the day
+in UTC and go on over midnight; the first line has the date.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime
+from itertools import takewhile
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import shown
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers, first_lines
+from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel
+from fleet_slip.ingest.vocabulary import unit_called
+
+VBO_BEGINS = re.compile(rb"(\xef\xbb\xbf)?\s*(file created on|\[header\])", re.IGNORECASE)
+_MOST_HEAD_LINES = 1000
+"""Lines above the data."""
+_CREATED = re.compile(r"(\d+/\d+/\d{4})(?:\D+(\d+):(\d+))?")
+_TIME, _TIME_OF_DAY = "time", r"^(\d\d)([0-5]\d)([0-5]\d(?:[.,]\d+)?)$"
+_DAY_S = 86_400
+_KNOWN = {
+    "lat": ("latitude", "deg"), "long": ("longitude", "deg"), "velocity": ("gnss speed", "km/h"),
+    "heading": ("course", "deg"), "height": ("height", "m"),
+}  # fmt: skip
+"""What columns of these names are, and their units unless the file names others."""
+_DEGREES = {"lat": 1 / 60, "long": -1 / 60}
+"""Of a count of minutes, west positive; degrees are positive to the east."""
+_FLAGS = 64
+"""To the number of satellites 64 is added while the brake is pressed, and 128 by a correction."""
+
+
+class VboSource(CsvSource):
+    """A VBO file: columns of text or plain numbers, as of CSV, and the times of its clock."""
+
+    has_clock = True
+
+    def __init__(self, budget: Budget, numbers: PlainNumbers) -> None:
+        """Take a file, and read what stands above its data. Raises `InputError`."""
+        lines = first_lines(budget.file, CsvFormat(), _MOST_HEAD_LINES)
+        self._places = {line.strip().lower(): number for number, line in enumerate(lines, 1)}
+        for section in ("[column names]", "[data]"):
+            if section not in self._places:
+                raise InputError(
+                    f"{shown(budget.file)}: a VBO file without the section {section}. Is it "
+                    "complete? Copy it again."
+                )
+        names, data = self._places["[column names]"] + 1, self._places["[data]"] + 1
+        comma = "," in "".join(lines[data - 1 : data])
+        layout = CsvFormat(
+            separator=" ", decimal_comma=comma, header_line=names, data_line=max(data, names + 1)
+        )
+        super().__init__(budget, layout, replace(numbers, columns=numbers.columns - {_TIME}))
+        self._lines, self._created = lines, _CREATED.search(lines[0])
+
+    def _section(self, name: str) -> list[str]:
+        """Return the lines of a section up to an empty one, none where there is no such section."""
+        begin = self._places.get(name, len(self._lines))
+        return [*takewhile(bool, map(str.strip, self._lines[begin:]))]
+
+    def channels(self) -> list[Channel]:
+        """Return the columns but the time, with the units behind titles and those of modules."""
+        titles, of_modules = self._section("[header]"), self._section("[channel units]")
+        units = {name: unit for name, (_, unit) in _KNOWN.items()}
+        if len(titles) == len(self._names):
+            called = (unit_called(title.rpartition(" ")[2]) for title in titles)
+            units |= {n: unit for n, unit in zip(self._names, called, strict=True) if unit}
+        units |= zip(self._names[::-1], of_modules[::-1], strict=False)  # the last columns
+        return [
+            Channel(one.name, units.get(one.name, ""), title=_KNOWN.get(one.name, ("",))[0])
+            for one in super().channels()
+            if one.name not in {"", _TIME}
+        ]
+
+    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield the columns as CSV does, with their times. Raises `InputError`."""
+        _, place = self.find(_TIME)
+        start_s, last_s = None, np.nan
+        for rows in super().read(base, found | {_TIME: place}):
+            times_s = _seconds(rows[_TIME])
+            known = np.isfinite(times_s)
+            if known.any():
+                if start_s is None:
+                    last_s = times_s[known][0]
+                    start_s = self._start_s(last_s)
+                whole = np.unwrap(np.append(last_s, times_s[known]), period=_DAY_S)[1:]
+                times_s[known], last_s = whole + start_s, whole[-1]
+            yield rows.select(pl.exclude({_TIME} - found.keys())).with_columns(
+                *(_number(name) * factor for name, factor in _DEGREES.items() if name in found),
+                *(_number(name) % _FLAGS for name in found if name == "sats"),
+                pl.Series(OWN_TIME, times_s).fill_nan(None),
+            )
+
+    def _start_s(self, first_s: float) -> float:
+        """Return the midnight in s since 1970 that makes the first time next to the file's date."""
+        if self._created is None:
+            return 0.0  # then the mapping needs a day
+        day, hour, minute = self._created.groups()
+        try:
+            midnight = datetime.strptime(day, "%d/%m/%Y").replace(tzinfo=UTC)
+        except ValueError:
+            return 0.0
+        clock_s = first_s if hour is None else 3600 * int(hour) + 60 * int(minute)
+        return midnight.timestamp() + _DAY_S * round((clock_s - first_s) / _DAY_S)
+
+
+def _seconds(times: pl.Series) -> FloatArray:
+    """Return times of the day in s from texts such as 091430.01, NaN for others."""
+    plain = times.str.replace(",", ".", literal=True)
+    parts = (plain.str.extract(_TIME_OF_DAY, n).cast(pl.Float64) for n in (1, 2, 3))
+    hours, minutes, seconds = parts
+    return (3600 * hours + 60 * minutes + seconds).fill_null(np.nan).to_numpy(writable=True)
+
+
+def _number(name: str) -> pl.Expr:
+    text = pl.col(name).cast(pl.String).str.replace(",", ".", literal=True)
+    return text.cast(pl.Float64, strict=False)
