@@ -14,7 +14,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
-from fleet_slip.grams.gram_files import Hashes, hash_numbers
+from fleet_slip.grams.gram_files import hash_numbers
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.request import SelectionRequest, load_model_list
@@ -77,18 +77,13 @@ def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine
     """
     kept = [line for digest in warehouse.lines.names() if (line := warehouse.line(digest))]
     there = load_cohort(warehouse, condition).hash_drives_with(())
-    fitting = [
-        line
-        for line in kept
-        if about.items() <= vars(line).items()
-        and np.isin(_unpacked(line.drive_hashes), there).all()
-    ]
-    best = max(fitting, key=lambda line: (line.drives, line.digest), default=None)
+
+    def fits(line: FittedLine) -> bool:
+        drives = np.frombuffer(bytes.fromhex(line.drive_hashes), dtype=">u8").astype(np.uint64)
+        return about.items() <= vars(line).items() and bool(np.isin(drives, there).all())
+
+    best = max(filter(fits, kept), key=lambda line: (line.drives, line.digest), default=None)
     return best if best and len(there) < KEPT_UNTIL * best.drives else None
-
-
-def _unpacked(hashes: str) -> Hashes:
-    return np.frombuffer(bytes.fromhex(hashes), dtype=">u8").astype(np.uint64)
 
 
 def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:

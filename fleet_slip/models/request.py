@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, field_serializer, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_serializer, field_validator, model_validator
 from typing_extensions import Doc
 
 from fleet_slip.base import canonical_json, sha256_of
@@ -165,11 +165,6 @@ class SelectionRequest:
         """Whether inputs are ranked or searched, rather than given models compared."""
         return bool(self.rank or self.criterion or self.all_subsets)
 
-    @property
-    def chosen_by_inputs(self) -> bool:
-        """Whether models are made of an order or a search of inputs, and not of a list alone."""
-        return bool(self.nested or self.ordered or self.search)
-
     def check(self) -> None:
         """Raise `UsageError` for options that do not go together."""
         parse_worth(self.worth)
@@ -233,16 +228,15 @@ def expand_families(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(member for name in names for member in features().members(name))
 
 
+Members = Annotated[tuple[Identifier, ...], AfterValidator(expand_families)]
+"""Names of inputs; families stand for their members."""
+
+
 class CandidateModel(Config):
     """A named set of signals or features; a family of windows or gates stands for its members."""
 
     name: str = Field(min_length=1, max_length=60)
-    signals: tuple[Identifier, ...] = Field(min_length=1)
-
-    @field_validator("signals")
-    @classmethod
-    def _families_are_their_members(cls, signals: tuple[str, ...]) -> tuple[str, ...]:
-        return expand_families(signals)
+    signals: Annotated[Members, Field(min_length=1)]
 
     @model_validator(mode="after")
     def _signals_are_inputs(self) -> "CandidateModel":
@@ -267,7 +261,7 @@ class Search(Config):
 
     name: str | None = Field(default=None, min_length=1, max_length=40)
     """Of its models, before the number of columns. Default: the method."""
-    inputs: tuple[Identifier, ...] | None = None
+    inputs: Members | None = None
     """What to search among, families by their members. Default: all of the feature set."""
     method: Literal["forward", "backward", "exchange"] = "forward"
     most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
@@ -276,11 +270,6 @@ class Search(Config):
     """Of fewer drives nothing is searched for."""
     columns_per_drive: int | None = Field(default=None, ge=1)
     """At most so many columns for each drive, where whole drives are the folds."""
-
-    @field_validator("inputs")
-    @classmethod
-    def _families_are_their_members(cls, inputs: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        return None if inputs is None else expand_families(inputs)
 
     def among(self, inputs: Sequence[str]) -> tuple[str, ...]:
         """Return which of a cohort's inputs are searched."""

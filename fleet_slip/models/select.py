@@ -299,7 +299,8 @@ class SelectionPlan:
     def of(cls, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-        if not (request.models or request.model or request.chosen_by_inputs):
+        by_inputs = request.nested or request.ordered or request.search
+        if not (request.models or request.model or by_inputs):
             logged = request.features or request.by == PARTS
             usual = LOGGED_MODELS if logged else DEFAULT_MODELS
             request = replace(request, models=COURSE_MODELS if request.label else usual)
@@ -309,7 +310,8 @@ class SelectionPlan:
         if model_list and model_list.label and not request.label:
             request = replace(request, label=model_list.label)
             request.check()
-        folds = _folding(request, model_list)
+        listed = model_list.folds if model_list else Folding()
+        folds = make_folding(request.by or listed.by, request.folds, listed.count)
         return cls(request, model_list, folds, _feature_set(request, model_list))
 
     def load(self, warehouse: Warehouse, condition: str) -> Cohort:
@@ -416,11 +418,6 @@ def _given(request: SelectionRequest) -> ModelList | None:
     signals = require_inputs(request.model.split(","), feature_set)
     model = CandidateModel(name=GIVEN, signals=signals)
     return ModelList(description="One model", features=feature_set, model=(model,))
-
-
-def _folding(request: SelectionRequest, model_list: ModelList | None) -> Folding:
-    listed = model_list.folds if model_list else Folding()
-    return make_folding(request.by or listed.by, request.folds, listed.count)
 
 
 def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
