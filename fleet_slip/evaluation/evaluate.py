@@ -11,11 +11,7 @@ import numpy as np
 
 from fleet_slip.base import number_of
 from fleet_slip.evaluation.blind import judge_blindly
-from fleet_slip.evaluation.drives import (
-    EvaluatedDrive,
-    find_stretches,
-    simulate_drives,
-)
+from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches, simulate_drives
 from fleet_slip.evaluation.filters import (
     Bank,
     TrainedModels,
@@ -23,12 +19,7 @@ from fleet_slip.evaluation.filters import (
     filter_bank,
     train_models,
 )
-from fleet_slip.evaluation.judge import (
-    EvaluatedScenario,
-    compare_models,
-    evaluate_drive,
-    rank,
-)
+from fleet_slip.evaluation.judge import EvaluatedScenario, compare_models, evaluate_drive, rank
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Answer, Part, Remark, TextTable

@@ -45,12 +45,7 @@ from fleet_slip.grams.reader import (
     collect_sums,
     open_grams,
 )
-from fleet_slip.grams.receiver_delay import (
-    LASTING_S,
-    NO_RECEIVERS,
-    ReceiverDelays,
-    receiver_delays,
-)
+from fleet_slip.grams.receiver_delay import LASTING_S, NO_RECEIVERS, ReceiverDelays, receiver_delays
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence

@@ -35,12 +35,7 @@ from fleet_slip.ingest.drives import (
 from fleet_slip.ingest.formats.reading import file_errors, open_source, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
-from fleet_slip.ingest.log_rows import (
-    CheckedBlock,
-    RowChecker,
-    describe_refused,
-    no_rows,
-)
+from fleet_slip.ingest.log_rows import CheckedBlock, RowChecker, describe_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary

@@ -12,9 +12,7 @@ from fleet_slip.grams.weights import Weighed
 from fleet_slip.models.select import lost_drives
 from fleet_slip.models.summary import lost_remarks
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drives import (
-    ClusterUnit,
-)
+from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.inference import (
     INTERCEPT,
     Evidence,

@@ -33,12 +33,7 @@ from fleet_slip.simulation.plan import (
     TrialPlan,
 )
 from fleet_slip.simulation.receivers import Receiver, Receivers
-from fleet_slip.simulation.roads import (
-    SpeedProfile,
-    random_generator,
-    speed_profile,
-    surface,
-)
+from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors
 from fleet_slip.vehicle.batch import Surface
 

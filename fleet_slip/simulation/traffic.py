@@ -20,12 +20,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.simulation.roads import (
-    LINE_STEP_M,
-    SLOWEST_MPS,
-    SpeedLimits,
-    SpeedProfile,
-)
+from fleet_slip.simulation.roads import LINE_STEP_M, SLOWEST_MPS, SpeedLimits, SpeedProfile
 
 if TYPE_CHECKING:
     from fleet_slip.simulation.plan import Traffic
