@@ -14,7 +14,7 @@ from nptdms import ChannelObject
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats import reading
+from fleet_slip.ingest.formats import confined
 from fleet_slip.ingest.formats import source as budget
 from tests.ingest.test_tdms import own_clock, wave, write
 from tests.support.commands import until
@@ -56,13 +56,13 @@ def fake_server(tmp_path_factory: pytest.TempPathFactory) -> Any:
     (folder / "nptdms" / "__init__.py").write_text(FAKE)
     with pytest.MonkeyPatch.context() as patched:
         patched.syspath_prepend(str(folder))
-        return reading._server.__wrapped__(0)
+        return confined._server.__wrapped__(0)
 
 
 @pytest.fixture
 def fake_reader(fake_server: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Write a file that has its reader do something."""
-    monkeypatch.setattr(reading, "_server", lambda _: fake_server)
+    monkeypatch.setattr(confined, "_server", lambda _: fake_server)
 
     def write_it(text: str) -> Path:
         file = tmp_path / "log.tdms"
@@ -176,7 +176,7 @@ def test_a_file_that_never_ends_holds_no_night_up(
 
 def test_readers_go_with_who_asks_them_and_others_come(tmp_path: Path) -> None:
     file = nested(tmp_path / "a.tdms")
-    server, _ = reading._server(os.getpid())
+    server, _ = confined._server(os.getpid())
     with ThreadPoolExecutor(1) as thread:
         failed = thread.submit(failure, file, own_clock())
         children = Path(f"/proc/{server.pid}/task/{server.pid}/children")
@@ -187,5 +187,5 @@ def test_readers_go_with_who_asks_them_and_others_come(tmp_path: Path) -> None:
     until(lambda: not reader.exists())
     good = scaled(tmp_path / "b.tdms", {})
     assert read_measured(good, own_clock()).counts.ticks == 100
-    reading._server(os.getpid())[0].kill()  # it may be dying when the next file comes
+    confined._server(os.getpid())[0].kill()  # it may be dying when the next file comes
     assert read_measured(good, own_clock()).counts.ticks == 100

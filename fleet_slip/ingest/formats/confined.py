@@ -1,0 +1,191 @@
+"""A file that another process reads, which is trusted with nothing.
+
+The process that forks readers (`confined_reader`) is started once, and ends with this one.
+"""
+
+import atexit
+import json
+import os
+import pickle
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any
+
+import polars as pl
+import pyarrow as pa
+
+from fleet_slip import errors
+from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.formats.confined_reader import SIZES, Job
+from fleet_slip.ingest.formats.source import Budget, Channel, Source
+
+_SERVE = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from fleet_slip.ingest.formats.confined_reader import serve; serve(int(sys.argv[1]))"
+)
+_ENVIRONMENT = {
+    "POLARS_MAX_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_MMAP_THRESHOLD_": "1000000000",
+    "MALLOC_TRIM_THRESHOLD_": "1000000000",
+}
+"""Else libraries reserve memory for threads that a reader does not need."""
+_KEPT = ("TZ", "LD_LIBRARY_PATH")
+_LARGEST_TEXT = 2**26
+_ONE_AT_A_TIME = Lock()
+
+
+@cache
+def _server(_pid: int) -> tuple["subprocess.Popen[bytes]", socket.socket]:
+    """Start what forks readers, for this process and not for one that it was forked from."""
+    ours, theirs = socket.socketpair()
+    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    with theirs:
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter
+            [sys.executable, "-I", "-X", "utf8", "-c", _SERVE, str(theirs.fileno())]
+            + [str(Path(place).absolute()) for place in sys.path],
+            env=_ENVIRONMENT | kept,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    atexit.register(_end, process, ours)
+    return process, ours
+
+
+def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
+    control.close()
+    process.kill()
+    process.wait()
+
+
+def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
+    """Return what a reader is asked through, and a handle by which it is ended."""
+    ours, theirs = socket.socketpair()
+    handles: list[int] = []
+    with _ONE_AT_A_TIME, theirs:
+        for _ in range(2):  # the server may have ended since the last file: then another forks
+            process, control = _server(os.getpid())
+            with suppress(OSError):
+                socket.send_fds(control, [name.encode()], [theirs.fileno()])
+                _, handles, *_ = socket.recv_fds(control, 1, 1)
+            if handles:
+                break
+            _server.cache_clear()
+            _end(process, control)
+    if not handles:
+        ours.close()
+        raise budget.crashed()
+    return ours, handles[0]
+
+
+class ConfinedSource(Source):
+    """A file that another process reads. It is trusted with nothing: its answers are checked."""
+
+    def __init__(self, channel: socket.socket, budget: Budget) -> None:
+        """Take what a reader is asked through, and what its answers may become."""
+        self._channel, self._budget = channel, budget
+        self.has_clock = bool(self._receive()[0])
+
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+        return [Channel(*map(str, one)) for one in self._ask("channels")[0]]
+
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each time base that has one of the columns. Raises `InputError`."""
+        return [self._read(number) for number in self._ask("bases", list(columns))[0]]
+
+    def _read(self, base: int) -> Iterator[pl.DataFrame]:
+        while True:
+            names, content = self._ask("rows", base)
+            if names is None:
+                return
+            try:
+                table = pa.ipc.open_stream(content).read_all()
+                table.validate(full=True)
+                frame = pl.DataFrame(table)
+                frame.columns = [str(name) for name in names]
+            except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError):
+                raise self._budget.crashed() from None
+            yield frame
+
+    def _ask(self, *question: Any) -> tuple[Any, bytearray]:
+        """Return what the reader answers, and rows. Raises `InputError`."""
+        with suppress(OSError):  # then nothing comes back
+            self._channel.sendall(json.dumps(question).encode() + b"\n")
+        return self._receive()
+
+    def _receive(self) -> tuple[Any, bytearray]:
+        """Return what the reader says, and rows."""
+        until_s = time.monotonic() + self._budget.seconds
+        text, size = SIZES.unpack(self._take(SIZES.size, until_s))
+        if text > _LARGEST_TEXT or size > self._budget.memory:
+            raise self._budget.crashed()
+        try:
+            said = json.loads(self._take(text, until_s))
+        except (ValueError, RecursionError):
+            raise self._budget.crashed() from None
+        return self._found(said), self._take(size, until_s)
+
+    def _found(self, said: Any) -> Any:
+        if not isinstance(said, dict) or not {"found", "error"} & said.keys():
+            raise self._budget.crashed()
+        if "found" in said:
+            return said["found"]
+        if said["error"] == "MemoryError":
+            raise self._budget.over_memory()
+        kind = getattr(errors, str(said["error"]), InputError)
+        is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
+        raise (kind if is_ours else InputError)(str(said.get("text")))
+
+    def _take(self, size: int, until_s: float) -> bytearray:
+        """Receive so many bytes. Raises `InputError` if they do not come in time."""
+        taken = bytearray(size)
+        left = memoryview(taken)
+        while left:
+            self._channel.settimeout(max(until_s - time.monotonic(), 1e-3))
+            try:
+                came = self._channel.recv_into(left)
+            except TimeoutError:
+                raise self._budget.over_time() from None
+            except OSError:
+                came = 0
+            if not came:
+                raise self._budget.crashed()
+            left = left[came:]
+        return taken
+
+
+@contextmanager
+def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[Source]:
+    """Open a file of a format for reading by another process. Raises `InputError`."""
+    with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
+        channel, handle = _fork_reader(name, budget)
+        try:
+            job = Job(
+                *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
+                limits=(budget.memory, budget.unfolded, int(10 * budget.seconds) + 1),
+            )
+            channel.sendall(pickle.dumps(job))
+            yield ConfinedSource(channel, budget)
+        finally:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(handle, signal.SIGKILL)
+            select.select([handle], [], [])  # until it is gone, and its locks
+            os.close(handle)
+            channel.close()
