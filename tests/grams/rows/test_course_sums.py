@@ -16,7 +16,8 @@ from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.grams.compute import Fixes, aggregate, counts_of, wide_grams
+from fleet_slip.grams.changes import Fixes
+from fleet_slip.grams.compute import aggregate, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.counts import nearest
