@@ -6,8 +6,8 @@ The way of a row, in the order of its stations:
 2. `formats.reading` opens a file; its format yields batches of the columns that the mapping uses.
 3. `time_bases` joins the time bases of a log; `log_rows` checks each row by itself:
    values in SI units, or the reason why it is refused.
-4. `drives` checks the order of time, cuts rows into drives, and brings each to ticks by
-   `resampling`, and to counts.
+4. `drives` checks the order of time and cuts rows into drives, which wait in `open_drives` until
+   they end; it brings each to ticks by `resampling`, and to counts.
 5. `stream` goes through 2 to 4 for one log: it yields ended drives, keeps refused rows, refuses a
    log of which nothing is usable, and says what looks wrong in it as a whole, `suspicion` in a
    drive.

@@ -25,9 +25,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
     LONGEST_DRIVE_S,
     DriveCutter,
-    DriveRows,
     MeasuredDrive,
-    OpenDrives,
     drive_id,
     sample_intervals_s,
     to_ticks,
@@ -37,6 +35,7 @@ from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.log_rows import CheckedBlock, RowChecker, describe_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
+from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import drives as open_drives
-from fleet_slip.ingest import load, stream
+from fleet_slip.ingest import load, open_drives, stream
 from fleet_slip.ingest.drives import DriveCutter, MeasuredDrive
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers

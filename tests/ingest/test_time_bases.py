@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import drives, stream, time_bases
+from fleet_slip.ingest import open_drives, stream, time_bases
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate
 from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
@@ -144,10 +144,10 @@ def read_in(
         patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(drives, "MOST_PARTS", 1 + batch % 3))
-        patched.enter_context(mock.patch.object(drives, "MOST_OPEN_VALUES", 40 * window))
-        patched.enter_context(mock.patch.object(drives, "MOST_PIECES", batch % 5))
-        patched.enter_context(mock.patch.object(drives, "BUNDLED_GROUPS", 1 + batch % 2))
+        patched.enter_context(mock.patch.object(open_drives, "MOST_PARTS", 1 + batch % 3))
+        patched.enter_context(mock.patch.object(open_drives, "MOST_OPEN_VALUES", 40 * window))
+        patched.enter_context(mock.patch.object(open_drives, "MOST_PIECES", batch % 5))
+        patched.enter_context(mock.patch.object(open_drives, "BUNDLED_GROUPS", 1 + batch % 2))
         patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
         patched.enter_context(mock.patch.object(stream, "FEWEST_STEPS", 20))
         patched.enter_context(mock.patch.object(stream, "LONGEST_DRIVE_S", 0.8))

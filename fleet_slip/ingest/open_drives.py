@@ -1,0 +1,166 @@
+"""Keeps the rows of drives that have not ended, few of them in memory."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
+
+import numpy as np
+import polars as pl
+
+from fleet_slip.ingest.formats.source import Spool
+
+MOST_OPEN_VALUES = 2**21
+"""Values of drives that have not ended, in memory; all others wait in a temporary file."""
+MOST_PARTS = 64
+"""Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
+MOST_PIECES, BUNDLED_GROUPS = 512, 128
+"""Parts whose rows are put aside one by one; of more, those of so many groups stand together."""
+
+
+@dataclass(frozen=True)
+class DriveRows:
+    """The rows of one drive, by number of their time base, in chunks that are not copied together.
+
+    Of several bases, each has the signals that have a value there.
+    """
+
+    bases: dict[int, pl.DataFrame]
+
+    @cached_property
+    def height(self) -> int:
+        """Number of rows."""
+        return sum(rows.height for rows in self.bases.values())
+
+    @cached_property
+    def start_s(self) -> float:
+        """The first time."""
+        return min(float(rows["time"][0]) for rows in self.bases.values())
+
+    @cached_property
+    def end_s(self) -> float:
+        """The last time."""
+        return max(float(rows["time"][-1]) for rows in self.bases.values())
+
+    @cached_property
+    def frame(self) -> pl.DataFrame:
+        """All rows in one frame."""
+        return pl.concat(self.bases.values(), how="diagonal")
+
+    def column(self, name: str) -> pl.Series:
+        """Return a column of the only base."""
+        (rows,) = self.bases.values()
+        return rows[name] if name in rows.columns else pl.repeat(np.nan, rows.height, eager=True)
+
+    def samples(self, name: str) -> pl.DataFrame:
+        """Return `time` and a signal where it has a value, by time."""
+        some = [rows.select("time", name) for rows in self.bases.values() if name in rows.columns]
+        if not some:
+            return pl.DataFrame(schema={"time": pl.Float64, name: pl.Float64})
+        found = pl.concat(some).drop_nulls(name)
+        return found if found["time"].is_sorted() else found.sort("time", maintain_order=True)
+
+
+class OpenDrives:
+    """Rows by part, as long as the part has not ended, few of them in memory.
+
+    Where hundreds of parts are open at once, their rows are put aside by bundles of groups, and
+    no part is yielded before the last.
+    """
+
+    def __init__(self) -> None:
+        """Begin without rows."""
+        self._blocks: list[pl.DataFrame] = []
+        self._in_memory = 0
+        self._spool = Spool()
+        self._bundled = False
+        self._ended: list[int] = []
+        self._group_of: dict[int, int] = {}
+        """Of each part that has rows in the file."""
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Keep rows with their part."""
+        if rows.height:
+            self._blocks.append(rows)
+            self._in_memory += rows.height * rows.width
+
+    def take(self, parts: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
+        """Yield the rows of parts that have any, and let go of them; the last are all."""
+        if not self._bundled:
+            yield from self._take(parts)
+            return
+        self._ended += parts
+        if last:
+            yield from self._unbundled()
+
+    def _take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
+        for start in range(0, len(parts), MOST_PARTS):
+            some = parts[start : start + MOST_PARTS]
+            found = self._let_go(some)
+            for part in some:
+                self._group_of.pop(part, None)
+                put_aside = map(pl.read_ipc_stream, self._spool.take(part))
+                if pieces := [*put_aside, *found[part]]:
+                    yield DriveRows(_by_base(pieces))
+
+    def _let_go(self, parts: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
+        """Take the rows of parts out of memory."""
+        found = defaultdict[int, list[pl.DataFrame]](list)
+        mine = pl.col("part").is_in(parts)
+        for _ in range(len(self._blocks)):
+            rows = self._blocks.pop(0)
+            for run in rows.filter(mine).partition_by("part", maintain_order=True):
+                found[run["part"][0]].append(run)
+            self._in_memory -= rows.height * rows.width
+            self.add(rows.filter(~mine))
+        return found
+
+    def _unbundled(self) -> Iterator[DriveRows]:
+        """Yield the rows of all parts, bundle by bundle, and in each as the parts ended."""
+        self._put_aside(bundled=True)
+        bundles = defaultdict[int, list[int]](list)
+        for part in self._ended:
+            bundles[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
+        for bundle, parts in sorted(bundles.items()):
+            for piece in self._spool.take(("bundle", bundle)):
+                self.add(pl.read_ipc_stream(piece))
+                if self._in_memory > MOST_OPEN_VALUES:
+                    self._put_aside(bundled=False)
+            if self._blocks:  # hundreds of small frames a part would take much memory
+                self._blocks = [pl.concat(self._blocks, rechunk=True)]
+            yield from self._take(parts)
+
+    def spill(self) -> None:
+        """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
+        if self._in_memory > MOST_OPEN_VALUES:
+            parts = pl.concat([rows["part"] for rows in self._blocks]).n_unique()
+            self._bundled |= parts > MOST_PIECES
+            self._put_aside(bundled=self._bundled)
+
+    def _put_aside(self, *, bundled: bool) -> None:
+        """Put all rows aside, by bundles or by parts."""
+        if not self._blocks:
+            return
+        rows = pl.concat(self._blocks)
+        self._blocks, self._in_memory = [], 0
+        heads = rows.select("part", "group").unique("part")
+        self._group_of.update(zip(heads["part"], heads["group"], strict=True))
+        key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("part")).alias("key")
+        pieces = rows.with_columns(key).partition_by("key", as_dict=True, include_key=False)
+        for (number,), piece in pieces.items():
+            content = BytesIO()
+            piece.write_ipc_stream(content, compression="lz4")
+            self._spool.add(("bundle", number) if bundled else number, content.getvalue())
+
+
+def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
+    """Return the rows of each time base, with those columns that have a value there."""
+    if "base" not in pieces[0].columns:
+        return {0: pl.concat(pieces)}
+    bases = defaultdict[int, list[pl.DataFrame]](list)
+    for piece in pieces:
+        for rows in piece.drop("part").partition_by("base", maintain_order=True):
+            some = rows.select(column for column in rows if column.null_count() < rows.height)
+            bases[rows["base"][0]].append(some)
+    return {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
