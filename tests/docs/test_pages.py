@@ -64,6 +64,10 @@ def test_the_architecture_names_what_exists() -> None:
     for name in named:
         places = (HERE, PACKAGE, HERE / "configs/scenarios")
         assert any(list(place.glob(name.rstrip("/"))) for place in places), name
+    for _, where, functions, _ in rows_of(page, "step"):
+        text = "".join((PACKAGE / name).read_text() for name in re.findall("`(.+?)`", where))
+        for name in re.findall(r"`(?:\w+\.)?(\w+)`", functions):
+            assert re.search(rf"def {name}\(", text), name
 
 
 def test_folder_and_section_agree_in_both_directions() -> None:
