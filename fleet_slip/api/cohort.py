@@ -18,7 +18,6 @@ from fleet_slip.models.request import (
     inputs_of,
 )
 from fleet_slip.regression.drives import ClusterUnit
-from fleet_slip.storage.runs import LOGGER
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -36,10 +35,6 @@ SIGNALS = Doc(
     "Instead of a published model: signals to fit, separated by commas; 'catalogue' is all inputs."
 )
 OF_SIGNALS = Doc("Feature set that `signals` are of. Default: the logged signals.")
-
-
-ROWS_ON_THE_WAY = 4_000_000
-"""Rows of logs whose columns over time are computed before models are compared: seconds."""
 
 
 class FleetCohort(Rooted):
@@ -80,6 +75,7 @@ class FleetCohort(Rooted):
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
+        from fleet_slip.grams.job import update_if_quick
         from fleet_slip.models.line import with_line_fitted
         from fleet_slip.models.select import SelectionPlan, answer_request
 
@@ -88,7 +84,7 @@ class FleetCohort(Rooted):
             request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
             plan = SelectionPlan.of(request)
             if plan.request.models == DEFAULT_MODELS:
-                self._make_grams(plan.feature_set, examined.cohort)
+                update_if_quick(self.warehouse, plan.feature_set, examined.cohort)
             found = answer_request(self.warehouse, request, examined.cohort)
         return replace(found, examined=str(examined))
 
@@ -136,30 +132,10 @@ class FleetCohort(Rooted):
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.read(), executor)
 
-    def _make_grams(self, feature_set: str, cohort: str) -> None:
-        """Make the Gram rows of a feature set that a cohort's logs lack, if that takes seconds."""
-        from fleet_slip.grams.gram_files import find_backlog
-        from fleet_slip.grams.job import update_grams
-        from fleet_slip.grams.reader import open_grams
-        from fleet_slip.warehouse.condition import parse_cohort
-        from fleet_slip.warehouse.tables import gram_snapshots
-
-        grams, logs = gram_snapshots(self.warehouse)
-        missing = find_backlog(logs, grams, known_features().identity(feature_set)).missing
-        if not missing:
-            return
-        condition = parse_cohort(cohort)
-        with open_grams(self.warehouse, PLAIN, condition) as opened:
-            files = opened.files(condition)
-        rows = sum(file.rows for file in missing if file.path in files)
-        if 0 < rows <= ROWS_ON_THE_WAY:
-            LOGGER.info("making Gram rows of %s for the list %s", feature_set, DEFAULT_MODELS)
-            update_grams(self.warehouse, feature_set=feature_set, among=files)
-
-    def _load(self, feature_set: str, condition: str | None = None) -> "Cohort":
+    def _load(self, feature_set: str) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort
 
-        return load_cohort(self.warehouse, condition or self.condition, feature_set)
+        return load_cohort(self.warehouse, self.condition, feature_set)
 
     def _opened(
         self, model: str | ModelVersion | None, signals: str | None, features: str | None

@@ -31,10 +31,13 @@ from fleet_slip.grams.gram_files import (
     rows_to_keep,
     write_rows,
 )
+from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.storage.runs import LOGGER
 from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retrying
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.condition import parse_cohort
+from fleet_slip.warehouse.tables import Warehouse, gram_snapshots
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,25 @@ def update_grams(
     if features().feature_set(feature_set).in_time and DELAY in features().sets:
         update_grams(warehouse, progress, DELAY, executor, among)
     return _update_once(warehouse, progress, feature_set, executor, among)
+
+
+ROWS_ON_THE_WAY = 4_000_000
+"""Rows of logs whose columns over time are computed before models are compared: seconds."""
+
+
+def update_if_quick(warehouse: Warehouse, feature_set: str, cohort: str) -> None:
+    """Make the Gram rows of a feature set that a cohort's logs lack, if that takes seconds."""
+    grams, logs = gram_snapshots(warehouse)
+    missing = find_backlog(logs, grams, features().identity(feature_set)).missing
+    if not missing:
+        return
+    condition = parse_cohort(cohort)
+    with open_grams(warehouse, PLAIN, condition) as opened:
+        files = opened.files(condition)
+    rows = sum(file.rows for file in missing if file.path in files)
+    if 0 < rows <= ROWS_ON_THE_WAY:
+        LOGGER.info("making the Gram rows of %s that are missing", feature_set)
+        update_grams(warehouse, feature_set=feature_set, among=files)
 
 
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
