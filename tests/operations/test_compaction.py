@@ -21,6 +21,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, ask, land, log_rows, path_of, random_counts
+from tests.support.once import filled_once
 
 ALL_LOGS = "SELECT * FROM log_counts ORDER BY ALL"
 ALL_GRAMS = "SELECT * EXCLUDE file FROM grams ORDER BY ALL"
@@ -31,13 +32,13 @@ def answers(warehouse: Warehouse) -> list[object]:
 
 
 @pytest.fixture
-def six(warehouse: Warehouse) -> Warehouse:
+@filled_once
+def six(warehouse: Warehouse) -> None:
     """A warehouse of six files of one drive each, with Gram rows."""
     rng = np.random.default_rng(0)
     for name in "fbdaec":
         land(warehouse, name, log_rows(name, random_counts(rng, 100), vehicle_id=f"car-{name}"))
     update_grams(warehouse)
-    return warehouse
 
 
 def grow_old(warehouse: Warehouse) -> None:

@@ -28,17 +28,18 @@ from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
+from tests.support.once import filled_once
 
 
 @pytest.fixture
-def filled(warehouse: Warehouse) -> Warehouse:
+@filled_once
+def filled(warehouse: Warehouse) -> None:
     """Two log files, their Gram rows, and a document."""
     rng = np.random.default_rng(0)
     for name in "ab":
         land(warehouse, name, log_rows(name, random_counts(rng, 300)))
     update_grams(warehouse)
     DocumentFolder(warehouse.root / "evaluations").append({"drive": "ä", "values": [1, 2.5]})
-    return warehouse
 
 
 def flip(file: Path, bit: int) -> None:
@@ -213,14 +214,14 @@ def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:
 
 
 @pytest.fixture
-def three(warehouse: Warehouse) -> Warehouse:
+@filled_once
+def three(warehouse: Warehouse) -> None:
     """Three log files of two cars."""
     rng = np.random.default_rng(0)
     for number in range(3):
         drive = log_rows(f"d{number}", random_counts(rng, 30), vehicle_id=f"car-{number % 2}")
         land(warehouse, f"f{number}", drive)
     update_grams(warehouse)
-    return warehouse
 
 
 def compact_and_vacuum(warehouse: Warehouse) -> None:
@@ -230,6 +231,11 @@ def compact_and_vacuum(warehouse: Warehouse) -> None:
 
 def forget_now(warehouse: Warehouse) -> None:
     forget(warehouse, Forgettable("vehicle", "car-1"), now=True)
+
+
+JOBS = pytest.mark.parametrize(
+    "job", [forget_now, pytest.param(compact_and_vacuum, marks=pytest.mark.long)]
+)
 
 
 @pytest.fixture
@@ -250,13 +256,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return patch
 
 
-@pytest.mark.parametrize(
-    "job",
-    [
-        forget_now,
-        *(pytest.param(job, marks=pytest.mark.long) for job in (compact, compact_and_vacuum)),
-    ],
-)
+@JOBS
 @pytest.mark.parametrize("moment", ["find_gram_files", "by_sql", "stored_grams", "wide_grams"])
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],
@@ -268,9 +268,7 @@ def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     assert check_grams(three, 3).drives >= 2
 
 
-@pytest.mark.parametrize(
-    "job", [forget_now, pytest.param(compact_and_vacuum, marks=pytest.mark.long)]
-)
+@JOBS
 @pytest.mark.parametrize("moment", ["verify_files", "verify_rows", "verify_grams"])
 def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any],

@@ -16,19 +16,20 @@ from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.commits import find_commit_faults
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
-from tests.support.logs import DAY, land, log_rows, path_of
+from tests.support.logs import DAY, land, log_rows
+from tests.support.once import filled_once
 
 COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
 
 
 @pytest.fixture
-def root(warehouse: Warehouse) -> Warehouse:
+@filled_once
+def root(warehouse: Warehouse) -> None:
     """Logs that were made, appended to twice and compacted."""
     for name in ("one", "two"):
         land(warehouse, name, log_rows(name, COUNTS))
     update_grams(warehouse)
     compact(warehouse)
-    return warehouse
 
 
 def logs_of(warehouse: Warehouse) -> Path:
@@ -125,49 +126,48 @@ LATEST = "logs/_delta_log/_last_checkpoint"
 
 
 @pytest.fixture
-def log(warehouse: Warehouse) -> Path:
-    """The log folder of a table with a unit that its checkpoint does not know."""
+@filled_once
+def later(warehouse: Warehouse) -> None:
+    """A table with a unit that its checkpoint does not know."""
     land(warehouse, "one", log_rows("one", COUNTS))
-    log = path_of(warehouse.root) / "logs" / "_delta_log"
-    commit = log / f"{1:020}.json"
+    commit = commits(warehouse)[1]
     content = commit.read_bytes()
     commit.write_bytes(content.replace(b'"appId":"test/one"', b'"appId":"test/ome"'))
-    DeltaTable(str(log.parent)).create_checkpoint()
+    DeltaTable(str(logs_of(warehouse))).create_checkpoint()
     commit.write_bytes(content)
     warehouse.logs.snapshot().commit(Change(units=[Unit("later", 1)]))
-    return log
 
 
 def damage(warehouse: Warehouse) -> set[str]:
     return {finding.path for finding in verify(warehouse).damage}
 
 
-def test_a_checkpoint_is_written_again_from_the_commits(warehouse: Warehouse, log: Path) -> None:
-    assert warehouse.logs.snapshot().landed("test/one") is None
-    (finding,) = verify(warehouse).damage
+def test_a_checkpoint_is_written_again_from_the_commits(later: Warehouse) -> None:
+    assert later.logs.snapshot().landed("test/one") is None
+    (finding,) = verify(later).damage
     assert finding.path == LATEST
     assert finding.problem == "does not know what has landed: test/one"
-    assert repair(warehouse, verify(warehouse)) == [LATEST]
-    assert not damage(warehouse)
-    for commit in log.glob("*.json"):
+    assert repair(later, verify(later)) == [LATEST]
+    assert not damage(later)
+    for commit in commits(later):
         commit.unlink()  # as Delta does after 30 days
-    assert warehouse.logs.snapshot().landed("test/one") is not None
+    assert later.logs.snapshot().landed("test/one") is not None
 
 
-def test_a_checkpoint_that_cannot_be_read_is_written_again(warehouse: Warehouse, log: Path) -> None:
-    (checkpoint,) = log.glob("*.checkpoint.parquet")
+def test_a_checkpoint_that_cannot_be_read_is_written_again(later: Warehouse) -> None:
+    (checkpoint,) = logs_of(later).glob("_delta_log/*.checkpoint.parquet")
     checkpoint.write_bytes(b"PAR1" + bytes(100) + b"PAR1")
-    assert damage(warehouse) == {"logs"}
-    assert repair(warehouse, verify(warehouse)) == ["logs"]
-    assert not damage(warehouse)
-    assert warehouse.logs.snapshot().rows == 5
+    assert damage(later) == {"logs"}
+    assert repair(later, verify(later)) == ["logs"]
+    assert not damage(later)
+    assert later.logs.snapshot().rows == 5
 
 
-def test_a_checkpoint_stays_where_its_commits_are_damaged(warehouse: Warehouse, log: Path) -> None:
-    (log / f"{1:020}.json").unlink()
-    (checkpoint,) = log.glob("*.checkpoint.parquet")
+def test_a_checkpoint_stays_where_its_commits_are_damaged(later: Warehouse) -> None:
+    commits(later)[1].unlink()
+    (checkpoint,) = logs_of(later).glob("_delta_log/*.checkpoint.parquet")
     checkpoint.write_bytes(b"PAR1" + bytes(100) + b"PAR1")
-    assert damage(warehouse) == {"logs"}
+    assert damage(later) == {"logs"}
     with pytest.raises(StorageError, match="logs"):
-        repair(warehouse, verify(warehouse))
+        repair(later, verify(later))
     assert checkpoint.exists()

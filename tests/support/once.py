@@ -3,7 +3,9 @@
 import os
 import shutil
 from collections.abc import Callable, Iterable
+from functools import cache, wraps
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -13,6 +15,7 @@ from numba.core.dispatcher import Dispatcher
 
 from fleet_slip import compiling
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
 
 _made: dict[Path, frozenset[Path]] = {}
 """What is committed and published in each."""
@@ -30,6 +33,23 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             begun.rename(made)
     _made.setdefault(made, _landed(made))
     return made
+
+
+def filled_once(fill: Callable[[Warehouse], object]) -> Callable[[Warehouse], Warehouse]:
+    """Fill a warehouse once in each process; every one that is asked for is a copy."""
+
+    @cache
+    def kept() -> TemporaryDirectory[str]:
+        folder = TemporaryDirectory()
+        fill(Warehouse(LocalFolder(Path(folder.name))))
+        return folder
+
+    @wraps(fill)
+    def copy(warehouse: Warehouse) -> Warehouse:
+        shutil.copytree(kept().name, str(warehouse.root), dirs_exist_ok=True)
+        return warehouse
+
+    return copy
 
 
 def compile_once() -> None:
