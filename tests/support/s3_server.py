@@ -23,7 +23,7 @@ from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_ba
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
 from fleet_slip.storage.objects import client
-from tests.support.commands import COMMAND, PATIENCE_S, Finished, run, run_on, start
+from tests.support.commands import PATIENCE_S, Finished, run_on, start
 
 ACCESS_KEY = "AKIDFORTESTS"
 SECRET_KEY = "s3cr3t/of+tests"  # noqa: S105 - for a server of our own
@@ -151,9 +151,9 @@ import json, sys
 from tests.support.s3_server import Faults, Server
 server = Server()
 print(json.dumps(server.environment), flush=True)
-for asked in sys.stdin:
-    answer = server.bucket() if asked == "bucket\\n" else server.faults.seen
-    server.faults = Faults()
+for asked in map(json.loads, sys.stdin):
+    answer = server.bucket() if asked == "bucket" else server.faults.seen
+    server.faults = Faults(**(asked if isinstance(asked, dict) else {}))
     print(json.dumps(answer), flush=True)
 """
 
@@ -171,30 +171,36 @@ class ServerApart:
 
     def bucket(self) -> str:
         """Make a bucket and return its URL."""
-        return str(self._answer("bucket\n"))
+        return str(self._answer("bucket"))
 
     def seen(self) -> list[str]:
         """Return the requests that came since this was asked, or a bucket made."""
-        return list(self._answer("seen\n"))
+        return list(self._answer("seen"))
+
+    @contextmanager
+    def misbehaving(self, **faults: Any) -> Iterator[None]:
+        """Misbehave for a while."""
+        self._answer(faults)
+        try:
+            yield
+        finally:
+            self._answer({})
 
     def stop(self) -> None:
         self._process.kill()
         self._process.communicate()
 
-    def _answer(self, asked: str = "") -> Any:
+    def _answer(self, asked: object = None) -> Any:
         assert self._process.stdin and self._process.stdout
-        self._process.stdin.write(asked)
-        self._process.stdin.flush()
+        if asked is not None:
+            self._process.stdin.write(f"{json.dumps(asked)}\n")
+            self._process.stdin.flush()
         return json.loads(self._process.stdout.readline())
 
 
-def command_on(root: object, *arguments: str, apart: bool = False) -> Finished:
-    """Run a command as a user would, and look for keys in what it prints.
-
-    In a process of its own, unless the server has one: see `ServerApart`.
-    """
-    done = run_on(root, *arguments) if apart else run([COMMAND, "--root", str(root), *arguments])
-    assert "Traceback" not in done.stderr, done.stderr
+def command_on(root: object, *arguments: str) -> Finished:
+    """Run a command as a user would, on a `ServerApart`, and look for keys in what it prints."""
+    done = run_on(root, *arguments)
     for text in (done.stdout, done.stderr):
         assert not [secret for secret in (ACCESS_KEY, SECRET_KEY) if secret in text]
     return done
