@@ -158,6 +158,12 @@ def smoke_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "smoke", make)
 
 
+@pytest.fixture
+def smoke_copy(tmp_path: Path, smoke_root: Path) -> Path:
+    """A copy of it for one test, where `run_command` runs."""
+    return shutil.copytree(smoke_root, tmp_path / "data")
+
+
 @pytest.fixture(scope="session")
 def root_to_fail_in(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     """A copy of it in which commands may fail: `status` tells of them from then on."""

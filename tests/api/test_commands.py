@@ -185,10 +185,8 @@ def _measured(folder: Path) -> tuple[list[Path], str]:
     return files, str(mapping)
 
 
-def test_two_threads_publish_one_model(tmp_path: Path) -> None:
-    fleet = fleet_slip.open(tmp_path / "data")
-    fleet.simulate("smoke", days=1)
-    fleet.gram()
+def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
+    fleet = fleet_slip.open(smoke_copy)
     selection = fleet.cohort().select(models="table1")
     made: list[object] = []
     threads = [

@@ -1,7 +1,6 @@
 """A fleet in Python: what a notebook asks of it."""
 
 import gc
-import shutil
 import sys
 import threading
 from pathlib import Path
@@ -138,9 +137,8 @@ def test_threads_share_a_fleet_and_a_model(fleet: Fleet) -> None:
 COUNT = "SELECT count(*) FROM drives"
 
 
-def test_all_queries_of_a_session_see_the_same_commits(smoke_root: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(smoke_root, tmp_path / "data")
-    fleet = fleet_slip.open(root)
+def test_all_queries_of_a_session_see_the_same_commits(smoke_copy: Path) -> None:
+    fleet = fleet_slip.open(smoke_copy)
     with fleet.session() as session:
         before = session.sql(COUNT).fetchall()
         fleet.forget(drive="smoke-2024-05-01-0000")
@@ -172,16 +170,15 @@ def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) 
     assert (tmp_path / "out.csv").exists()
 
 
-def test_an_answer_from_a_damaged_file_is_none(smoke_root: Path, tmp_path: Path) -> None:
+def test_an_answer_from_a_damaged_file_is_none(smoke_copy: Path) -> None:
     """A flipped bit of a count is a well-formed count."""
-    root = shutil.copytree(smoke_root, tmp_path / "data")
-    file = next((root / "logs").rglob("*.parquet"))
+    file = next((smoke_copy / "logs").rglob("*.parquet"))
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.chmod(0o644)
     file.write_bytes(content)
     with (
-        fleet_slip.open(root).session() as session,
+        fleet_slip.open(smoke_copy).session() as session,
         pytest.raises(StorageError, match=r"damaged|checksum"),
     ):
         session.table("SELECT sum(ax) FROM log_counts")

@@ -38,10 +38,8 @@ def own(tmp_path: Path) -> Path:
 
 
 def test_own_features_and_lists_are_used_without_touching_the_package(
-    run_command: RunCommand, own: Path
+    run_command: RunCommand, own: Path, smoke_copy: Path
 ) -> None:
-    run_command("simulate", "smoke")
-    run_command("gram")
     own_first = ("--config", str(own))
     missing = run_command(*own_first, "select", "--models", "few")
     assert missing.exit_code == 5
@@ -89,11 +87,12 @@ def test_what_is_no_config_is_said_and_changes_nothing(
     assert message in done.stderr
 
 
-def test_the_query_of_a_column_runs_as_it_is_printed(run_command: RunCommand) -> None:
-    run_command("simulate", "smoke", "--days", "1")
-    run_command("gram")
+def test_the_query_of_a_column_runs_as_it_is_printed(
+    run_command: RunCommand, smoke_root: Path
+) -> None:
     for name in ("ay_bias", "ay_mean_16_mass", "ay_excess"):
         query = run_command("features", "--sql", name).stdout
-        rows = run_command("sql", f"SELECT count({name}) AS n FROM ({query})", "--json").json
+        asked = ("sql", f"SELECT count({name}) AS n FROM ({query})", "--json")
+        rows = run_command(*asked, root=smoke_root).json
         assert rows[0]["n"] > 1000, name
     assert run_command("features", "--sql", "mood").exit_code == 5

@@ -248,10 +248,10 @@ def test_a_model_through_the_origin_is_published_as_one(
 
 
 def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
-    run_command: RunCommand, tmp_path: Path
+    run_command: RunCommand, smoke_root: Path, tmp_path: Path
 ) -> None:
-    root = tmp_path / "data"
-    assert run_command("simulate", "smoke", root=root).exit_code == 0
+    ignored = shutil.ignore_patterns("grams")
+    root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
     assert run_command("gram", "--features", "motion", root=root).exit_code == 0
     asked = ("select", "--features", "windows", "--nested", "ax,ay", "--cohort")
     refused = run_command(*asked, "campaign = 'smoke'", root=root)
@@ -261,12 +261,10 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
 
 
 def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
-    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+    run_command: RunCommand, root_to_fail_in: Path
 ) -> None:
-    root = tmp_path / "copy"
-    shutil.copytree(smoke_root, root)
     asked = ("publish", "none", "--features", "gated", "--model", "beta")
-    refused = run_command(*asked, root=root)
+    refused = run_command(*asked, root=root_to_fail_in)
     assert "beta is not an input" in refused.stderr
     assert " ay_mean," in refused.stderr
     assert "ay_mean_16," not in refused.stderr

@@ -3,7 +3,6 @@
 import os
 import resource
 import shlex
-import shutil
 from pathlib import Path
 
 import pytest
@@ -107,12 +106,11 @@ def run_in_shell(root: Path, arguments: str, redirection: str) -> Finished:
     ],
 )
 def test_a_job_is_done_whatever_its_streams_are(
-    smoke_root: Path, tmp_path: Path, redirection: str, exit_code: int
+    smoke_copy: Path, redirection: str, exit_code: int
 ) -> None:
-    root = shutil.copytree(smoke_root, tmp_path / "data")
-    done = run_in_shell(root, "publish other --models table1", redirection)
+    done = run_in_shell(smoke_copy, "publish other --models table1", redirection)
     assert done.exit_code == exit_code
-    assert (root / "models/other/versions/1.json").exists()
+    assert (smoke_copy / "models/other/versions/1.json").exists()
     if exit_code:
         assert "error: standard output:" in done.stderr
 

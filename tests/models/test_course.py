@@ -187,10 +187,8 @@ def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:
         fleet.cohort("true").select(label="course", features="windows", model="ay_mean_16")
 
 
-def test_a_fleet_without_receivers_is_told_so(tmp_path: Path) -> None:
-    plain = fleet_slip.open(tmp_path / "data")
-    plain.simulate("smoke", days=1)
-    plain.gram()
+def test_a_fleet_without_receivers_is_told_so(smoke_copy: Path) -> None:
+    plain = fleet_slip.open(smoke_copy)
     plain.gram("course")
     assert plain.gram("course").rows_read == 0, "nothing is left to do"
     cohort = plain.cohort("true")

@@ -1,7 +1,6 @@
 """A model's fit examined against the rows, and how much of its error is noise of the label."""
 
 import math
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
@@ -100,8 +99,6 @@ def test_a_selection_and_its_manifest_tell_it(smoke_root: Path) -> None:
 def test_nobody_knows_the_noise_of_a_campaign_that_is_not_there(
     smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = tmp_path / "data"
-    shutil.copytree(smoke_root, root)
     monkeypatch.setattr(uncertainty, "find_config", lambda *_: tmp_path / "none.toml")
-    warehouse = Warehouse(LocalFolder(root))
+    warehouse = Warehouse(LocalFolder(smoke_root))
     assert label_noise_deg(warehouse, load_cohort(warehouse)) is None

@@ -95,14 +95,12 @@ def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_p
     assert asked_of(answer_request(warehouse, SelectionRequest(models="table1"), "true")) is None
 
 
-def test_publishing_computes_the_columns_of_the_usual_list(
-    tmp_path: Path, smoke_root: Path
-) -> None:
-    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
-    shutil.rmtree(tmp_path / "data/grams")
-    shutil.rmtree(tmp_path / "data/models")
+def test_publishing_computes_the_columns_of_the_usual_list(smoke_copy: Path) -> None:
+    fleet = fleet_slip.open(smoke_copy)
+    for made_of_logs in ("grams", "models"):
+        shutil.rmtree(smoke_copy / made_of_logs)
     fleet.gram()
-    made = answer(tmp_path / "data", "publish", "m")
+    made = answer(smoke_copy, "publish", "m")
     chosen = fleet.model("m").manifest
     assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
     by_hand = fleet.cohort().select()

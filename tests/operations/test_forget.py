@@ -261,9 +261,8 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
 
 
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
-    run_command: RunCommand, smoke_root: Path, tmp_path: Path
+    run_command: RunCommand, smoke_copy: Path
 ) -> None:
-    shutil.copytree(smoke_root, tmp_path / "data")
     few = "day = '2024-05-02'"
     short = ("--models", "table1")
     run_command("publish", "other", "--cohort", few, *short, "--force")  # of few drives

@@ -242,6 +242,7 @@ def test_impossible_adhesion_is_refused() -> None:
         simulate_drives([dataclasses.replace(usable, adhesion=0.0)])
 
 
+@pytest.mark.long
 def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> None:
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
 

@@ -1,6 +1,5 @@
 """`fleet-slip evaluate --cohort`: measured drives judge what was not fitted to them."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -180,9 +179,8 @@ def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...])
 
 
 def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
-    smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    smoke_copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = Path(shutil.copytree(smoke_root, tmp_path / "data"))
     judged: list[float] = []
 
     def untuned(_: object, start: Any, *rest: Any) -> Tuned[Any]:
@@ -196,7 +194,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
         lambda measured, *_: Identified(measured.car(Fitted()), ekf.EkfNoise(), 0.0),
     )
     one = "drive_id = 'smoke-2024-05-01-0001'"
-    found = fleet_slip.open(root).evaluate_measured("smoke", one).content
+    found = fleet_slip.open(smoke_copy).evaluate_measured("smoke", one).content
     assert (found["vehicle"], found["parts_of"]) == ("d_class_sedan", "time")
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
     assert {"kinematic", "ekf_tuned", "ekf_identified", "kalman_identified"} <= {*errors}

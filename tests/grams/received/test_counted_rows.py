@@ -156,8 +156,8 @@ def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:
     return row_of(gram, drive_id=name, **same), stored["drive_id"]
 
 
-def test_a_drive_with_a_log_is_refused(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(shutil.copytree(smoke_root, tmp_path / "data"))
+def test_a_drive_with_a_log_is_refused(smoke_copy: Path, tmp_path: Path) -> None:
+    fleet = fleet_slip.open(smoke_copy)
     same, _ = renamed(fleet, "other")
     path = write_counted(tmp_path / "rows", [same])
     with pytest.raises(RepeatedError, match="is there already"):

@@ -93,25 +93,33 @@ def copy(root: Path, folder: Path) -> Warehouse:
 
 
 @pytest.fixture(scope="module")
-def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A root with 48 drives, and one with a champion of all of them too. Copy them."""
+def roots(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
+    """A root with 48 drives, one with a champion of them, too, and then 48 more. Copy them."""
     folder = tmp_path_factory.mktemp("roots")
     write(Warehouse(LocalFolder(folder / "data")), "good", 48)
     warehouse = copy(folder / "data", folder / "champion")
     assert publish_from(warehouse).version.version == 1
-    return folder / "data", folder / "champion" / "data"
+    more = copy(folder / "champion" / "data", folder / "more")
+    write(more, "more", 48)
+    return folder / "data", Path(str(warehouse.root)), Path(str(more.root))
 
 
 @pytest.fixture
-def drives(roots: tuple[Path, Path], tmp_path: Path) -> Warehouse:
+def drives(roots: tuple[Path, ...], tmp_path: Path) -> Warehouse:
     """A warehouse of 48 drives."""
     return copy(roots[0], tmp_path)
 
 
 @pytest.fixture
-def champion(roots: tuple[Path, Path], tmp_path: Path) -> Warehouse:
+def champion(roots: tuple[Path, ...], tmp_path: Path) -> Warehouse:
     """A warehouse of 48 drives, and a champion of all of them."""
     return copy(roots[1], tmp_path)
+
+
+@pytest.fixture
+def more(roots: tuple[Path, ...], tmp_path: Path) -> Warehouse:
+    """The same with as many drives that are new to the champion."""
+    return copy(roots[2], tmp_path)
 
 
 def test_a_reversed_label_is_no_champion(champion: Warehouse) -> None:
@@ -168,20 +176,18 @@ def test_few_drives_are_no_reason_to_replace_a_champion_of_many(champion: Wareho
 
 
 def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
-    champion: Warehouse,
+    more: Warehouse,
 ) -> None:
-    write(champion, "more", 48)
-    done = publish_from(champion)
+    done = publish_from(more)
     assert done.version.version == 2
     assert "On the same 19,200 rows of 96 drives, held out in 8 groups by vehicle" in done.reason
     assert "beta@1 as published has" in done.reason
 
 
-def test_the_champion_is_compared_as_it_is_not_fitted_anew(champion: Warehouse) -> None:
-    write(champion, "more", 48)
-    version = registry_of(champion).load("beta", 1)
+def test_the_champion_is_compared_as_it_is_not_fitted_anew(more: Warehouse) -> None:
+    version = registry_of(more).load("beta", 1)
     request = SelectionRequest(nested="ay,yaw_rate")
-    answer = answer_request(champion, request, "drive_id LIKE 'more%'")
+    answer = answer_request(more, request, "drive_id LIKE 'more%'")
     comparison = champion_rules.compare(answer, [version])
     (as_it_is,) = comparison.incumbents
     assert as_it_is.counts.coefficients == version.manifest.counts_model().coefficients
@@ -300,16 +306,15 @@ def test_a_person_sets_the_floor(
 
 
 def test_a_floor_that_cannot_be_read_lets_nothing_pass(
-    champion: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    more: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write(champion, "more", 48)
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "publish.toml").write_text("min_drives = 49\n")
     monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path / "own"))
     champion_rules.floor.cache_clear()
     try:
         with pytest.raises(ConfigError, match=r"publish\.toml"):
-            publish_from(champion, force=True)
+            publish_from(more, force=True)
     finally:
         champion_rules.floor.cache_clear()
 
@@ -325,20 +330,19 @@ def hold_by_pin(registry: Registry) -> None:
 
 @pytest.mark.parametrize("hold", [hold_by_rollback, hold_by_pin])
 def test_a_champion_that_people_chose_stays(
-    champion: Warehouse, hold: Callable[[Registry], None]
+    more: Warehouse, hold: Callable[[Registry], None]
 ) -> None:
-    registry = registry_of(champion)
-    write(champion, "more", 48)
-    assert publish_from(champion).version.version == 2
+    registry = registry_of(more)
+    assert publish_from(more).version.version == 2
     hold(registry)
     for _ in range(2):  # every night
-        done = publish_from(champion)
+        done = publish_from(more)
         assert (done.version.version, done.candidate) == (2, True)
         assert "stays champion" in done.reason
     assert registry.resolve("beta").version == 1
     assert registry.resolve(f"beta@{CANDIDATE}").version == 2
     registry.hold("beta", "champion", "unpin")
-    assert not publish_from(champion).candidate
+    assert not publish_from(more).candidate
     assert registry.resolve("beta").version == 2
     registry.hold("beta", "champion", "pin")
     registry.hold("beta", "champion", "unpin")
