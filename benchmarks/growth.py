@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from benchmarks.billion import PROGRAM
 from benchmarks.usage import Usage, measured
@@ -102,10 +101,10 @@ def command(root: Path, arguments: Sequence[str]) -> Usage:
     return measured([*PROGRAM, "--root", str(root), *arguments, "--json"], answers=(0, 10))
 
 
-def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
+def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, list[Usage]]:
     """Measure every command of a part at every size."""
     part = PARTS[name]
-    found: dict[str, list[dict[str, float]]] = {}
+    found: dict[str, list[Usage]] = {}
     for size in sizes:
         root = folder / f"{name}-{size}" / "data"
         root.mkdir(parents=True)
@@ -116,30 +115,23 @@ def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, Any]:
             text = " ".join(arguments)
             seen[text] = seen.get(text, 0) + 1
             text += " (again)" * (seen[text] - 1)
-            found.setdefault(text, []).append(
-                {
-                    "seconds": usage.seconds,
-                    "cpu_s": usage.cpu_s,
-                    "peak_bytes": usage.peak_bytes,
-                }
-            )
+            found.setdefault(text, []).append(usage)
             print(f"{name} {size:>9,}  {text:<70} {usage.cpu_s:8.2f} CPU-s", file=sys.stderr)
         shutil.rmtree(root.parent)
-    return {"sizes": list(sizes), "commands": found}
+    return found
 
 
-def markdown(name: str, part: dict[str, Any]) -> str:
+def markdown(name: str, sizes: Sequence[int], found: dict[str, list[Usage]]) -> str:
     """Return a part's figures as a Markdown table."""
-    sizes = part["sizes"]
     head = [f"{name}: processor seconds", *(f"{n:,}" for n in sizes), "slope", "peak MiB"]
     lines = [" | ".join(head), " | ".join(["---", *["---:"] * (len(head) - 1)])]
-    for text, figures in part["commands"].items():
-        times = [figure["cpu_s"] for figure in figures]
+    for text, usages in found.items():
+        times = [usage.cpu_s for usage in usages]
         cells = [f"`{text}`", *(f"{s:.2f}" for s in times)]
         rise = math.nan
         if len(sizes) > 1:
             rise = math.log(times[-1] / times[-2]) / math.log(sizes[-1] / sizes[-2])
-        cells += [f"{rise:.2f}", f"{figures[-1]['peak_bytes'] / 2**20:,.0f}"]
+        cells += [f"{rise:.2f}", f"{usages[-1].peak_bytes / 2**20:,.0f}"]
         lines.append(" | ".join(cells))
     return "\n".join(f"| {line} |" for line in lines)
 
@@ -152,7 +144,7 @@ def main() -> None:
     options = parser.parse_args()
     for name in options.part:
         sizes = [round(s) for s in options.sizes] if options.sizes else PARTS[name].sizes
-        print(markdown(name, grow(name, sizes, options.root)) + "\n", flush=True)
+        print(markdown(name, sizes, grow(name, sizes, options.root)) + "\n", flush=True)
 
 
 if __name__ == "__main__":
