@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.flips_root import write_short_lists
 from fleet_slip.resources import find_config
 from fleet_slip.storage.commits import CHECKSUM_KEY, NOTE, checksum_of_actions
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
@@ -44,8 +45,7 @@ sideslip = { column = "beta", unit = "rad" }
 class Command:
     """A command to kill.
 
-    `arrange` changes the root after the commands before; `damaged` says that it leaves damage;
-    `done` is its exit code if it had been done already.
+    `arrange` changes the root after the commands before; `damaged` says that it leaves damage.
     """
 
     name: str
@@ -53,11 +53,11 @@ class Command:
     arguments: tuple[str, ...]
     arrange: Callable[[Path], None] | None = None
     damaged: bool = False
-    done: int = 0
 
 
 def prepare_inputs(folder: Path) -> dict[str, str]:
-    """Write a campaign of eight very short drives, and a measured log with rows to refuse."""
+    """Write a campaign of eight very short drives, a log with rows to refuse, and short lists."""
+    write_short_lists(folder / "configs")
     text = find_config("campaigns", "smoke").read_text(encoding="utf-8")
     text = text.replace("laps = 0.5", "laps = 0.04").replace("15_000", "1_500")
     names = ("smoke.toml", "m.toml", "corrected.toml", "log.csv")
@@ -128,12 +128,6 @@ COMMANDS = (
     Command("forget a drive", MODEL, ("forget", "--drive", "smoke-2024-05-01-0001")),
     Command("compact", MODEL, ("compact",)),
     Command("vacuum", (*MODEL, ("compact",)), ("compact",), let_time_pass),
-    Command(
-        "repair",
-        MODEL,
-        ("verify", "--full", "--repair"),
-        damage_files,
-        damaged=True,
-    ),
+    Command("repair", MODEL, ("verify", "--full", "--repair"), damage_files, damaged=True),
     Command("run", (), ("run", "--campaign", "{campaign}", "--threads", "1")),
 )

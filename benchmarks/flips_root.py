@@ -148,9 +148,13 @@ def campaign(root: Path) -> Path:
 
 def write_configs(root: Path) -> None:
     """Write a campaign of short drives, and sets and searches of few columns; choose them."""
-    configs = root.with_name("configs")
-    (configs / "models").mkdir(parents=True)
     campaign(root).write_text(_replace(find_config("campaigns", "smoke").read_text(), _CAMPAIGN))
+    write_short_lists(root.with_name("configs"))
+
+
+def write_short_lists(configs: Path) -> None:
+    """Write sets and searches of few columns into a new folder; choose them."""
+    (configs / "models").mkdir(parents=True)
     estimator = _replace(find_config("models", "estimator").read_text(), _SEARCH)
     anything, found = _INPUTS.subn("", estimator)
     assert found == 1

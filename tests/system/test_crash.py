@@ -33,7 +33,7 @@ pytestmark = pytest.mark.long
 
 JOB = ["run", "--campaign", "smoke", "--threads", "1"]
 KILLS = 40
-"""Ten of each command."""
+"""Two or three of each command."""
 
 
 @pytest.mark.timeout(7200)
