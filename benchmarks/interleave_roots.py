@@ -142,17 +142,10 @@ def measure(path: Path, cars: tuple[str, ...]) -> None:
 
 def prepare(root: Path, inputs: Inputs, first: str, second: str) -> Path:
     """Make a root on which two commands have something to do."""
-    environment = inputs.environment()
-    known = inputs.files
-    for arguments in (
-        ("simulate", known["campaign"], "--days", "2", "--threads", "1"),
-        ("ingest", known["old"], "--mapping", known["mapping"]),
-        ("gram",),
-        PUBLISH,
-        ("publish", "sideslip", *TRAINING, "--nested", "ax", "--force"),
-        ("ingest", known["later"], "--mapping", known["mapping"]),
-    ):
-        _give(root, arguments, environment)
+    base = root.with_name("base")
+    if not base.exists():
+        _fill(base, inputs)
+    shutil.copytree(base, root)
     arranging: Mapping[str, Callable[[], None]] = {
         "vacuum": lambda: _leave_what_killed_jobs_leave(root, inputs),
         "repair": lambda: _lose_files(root),
@@ -162,9 +155,19 @@ def prepare(root: Path, inputs: Inputs, first: str, second: str) -> Path:
     return root
 
 
-def _give(root: Path, arguments: tuple[str, ...], environment: Environment) -> None:
-    ended = Running(root, arguments, environment).end()
-    assert ended.exit_code == 0, ended.said
+def _fill(root: Path, inputs: Inputs) -> None:
+    """Give the commands that come before all others."""
+    known = inputs.files
+    for arguments in (
+        ("simulate", known["campaign"], "--days", "2", "--threads", "1"),
+        ("ingest", known["old"], "--mapping", known["mapping"]),
+        ("gram",),
+        PUBLISH,
+        ("publish", "sideslip", *TRAINING, "--nested", "ax", "--force"),
+        ("ingest", known["later"], "--mapping", known["mapping"]),
+    ):
+        ended = Running(root, arguments, inputs.environment()).end()
+        assert ended.exit_code == 0, ended.said
 
 
 def _leave_what_killed_jobs_leave(root: Path, inputs: Inputs) -> None:
