@@ -87,11 +87,12 @@ def test_estimates_for_a_cortex_m_are_above_what_is_measured(tmp_path: Path, nam
 
 
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
+@pytest.mark.parametrize("folder", ["every_kind", "learning"], indirect=True)
 def test_a_wrong_angle_is_noticed_on_a_cortex_m(folder: Path) -> None:
     source = (folder / "sideslip_any.c").read_text()
     files = {path.name: path.read_text() for path in folder.glob("*.[ch]")}
-    measure_cortex_m(folder, "sideslip_any", files)
     files["sideslip_any.c"] = source.replace("high += (int64_t)", "high -= (int64_t)")
+    assert files["sideslip_any.c"] != source  # which passes, as the test above shows
     with pytest.raises(subprocess.CalledProcessError):
         measure_cortex_m(folder, "sideslip_any", files)
 

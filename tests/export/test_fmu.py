@@ -179,14 +179,15 @@ def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.tools("fmpy")
-@pytest.mark.parametrize("fmi", [2, 3])
 @pytest.mark.parametrize("name", MODELS)
-def test_fmpy_finds_no_problem(name: str, fmi: int, tmp_path: Path) -> None:
+def test_fmpy_finds_no_problem(name: str, tmp_path: Path) -> None:
+    """Of FMI 2 in two models, which have all that the others have."""
     manifest = model_of(MODELS[name], Fraction(-1, 700), "any")
     content = export_files(ModelVersion(1, manifest, "0" * 64), None, "fmu")
-    file = tmp_path / "any.fmu"
-    file.write_bytes(content[f"sideslip_any_fmi{fmi}.fmu"])
-    assert "No problems found" in run_fmpy("validate", str(file))
+    for fmi in (2, 3) if name in ("every_kind", "learning") else (3,):
+        file = tmp_path / f"any{fmi}.fmu"
+        file.write_bytes(content[f"sideslip_any_fmi{fmi}.fmu"])
+        assert "No problems found" in run_fmpy("validate", str(file))
 
 
 def run_fmpy(*words: str) -> str:
@@ -198,10 +199,7 @@ def run_fmpy(*words: str) -> str:
 
 
 @pytest.mark.tools("fmpy")
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_fmpy_drives_a_whole_drive_as_score_does(
-    smoke_root: Path, fmi: int, tmp_path: Path
-) -> None:
+def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")
     program = compile_program(version.manifest)
@@ -215,10 +213,11 @@ def test_fmpy_drives_a_whole_drive_as_score_does(
             table.writerow([repr(tick * TICK_S), *map(repr, row)])
     words = ["--input-file", str(tmp_path / "in.csv"), "--output-file", str(tmp_path / "out.csv")]
     times = ["--output-interval", str(TICK_S), "--stop-time", str(len(log) * TICK_S)]
-    run_fmpy("simulate", str(tmp_path / f"sideslip_smoke_fmi{fmi}.fmu"), *words, *times)
-    with (tmp_path / "out.csv").open() as file:
-        rows = list(csv.DictReader(file))[1:]  # the first is from before the first tick
     scale = float(program.angle.scale)
-    found = [round(float(row["sideslip_rad"]) / scale) for row in rows]
     predicted = version.predict(log).to_numpy()
-    assert found == np.floor(predicted / scale + 0.5).astype(int).tolist()
+    for fmi in (2, 3):
+        run_fmpy("simulate", str(tmp_path / f"sideslip_smoke_fmi{fmi}.fmu"), *words, *times)
+        with (tmp_path / "out.csv").open() as file:
+            rows = list(csv.DictReader(file))[1:]  # the first is from before the first tick
+        found = [round(float(row["sideslip_rad"]) / scale) for row in rows]
+        assert found == np.floor(predicted / scale + 0.5).astype(int).tolist()
