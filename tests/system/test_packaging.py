@@ -1,6 +1,5 @@
 """The wheel works without the checkout: its SQL and configs are inside."""
 
-import shutil
 import sys
 import zipfile
 from pathlib import Path
@@ -50,16 +49,6 @@ def files_in(folder: Path) -> dict[Path, bytes]:
         for file in folder.rglob("*")
         if file.is_file() and "__pycache__" not in file.parts
     }
-
-
-@pytest.mark.long
-def test_the_wheel_learns_from_logs_away_from_the_checkout(
-    site: Path, smoke_root: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
-    run_wheel(site, tmp_path, "gram")
-    published = run_wheel(site, tmp_path, "publish", "wheel", "--models", "table1")
-    assert "published wheel@1" in published.stderr
 
 
 @pytest.mark.long
