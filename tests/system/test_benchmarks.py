@@ -21,20 +21,17 @@ DEADLINE_S = 1800
 TINY = {
     "billion": "--root {folder} --rows 3e4",
     "cluster": "--days 1 --workers 1",
-    "crash": "--kills 2 --commands gram",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
     "goals": "{root} smoke --roads 1",
     "growth": "--root {folder} --part versions --sizes 2 3",
     "ingest": "--rows 2000,4000",
     "ingest_folder": "--files 3 --rows 100",
-    "interleave": "--schedules 2 --first gram --second simulate",
     "on_board": "{root} smoke --seconds 0.01",
     "peers": "--root {root} --campaign smoke --only fleet_slip duckdb scikit-learn",
     "pipeline": "--root {root} --campaign smoke --threads 1 --gram-rows 200",
     "quality": "{root}",
     "refit": "{root} true",
-    "rivals": "{root} smoke --rows 2000 --rivals regression_8 --drives nominal",
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
     "traffic": "--drives 1",
@@ -44,6 +41,13 @@ TINY = {
     "validation": "",
 }
 """What makes each small. `{root}` is a data root, see `tiny_root`."""
+
+RUN_BY = {
+    "crash": "system/test_crash.py",
+    "interleave": "operations/test_races.py",
+    "rivals": "system/test_rivals.py",
+}
+"""What a test of its own runs, with sizes that are not tiny."""
 
 ELSEWHERE = {
     "fuzz.guided": "atheris",
@@ -61,11 +65,10 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
 
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
-        done_on(root, "simulate", "fleet", "--days", "1")
-        done_on(root, "simulate", "waterford_course", "--days", "1")
-        for feature_set in ("signals", "delay", "calibration", "fleet", "windows", "course"):
-            done_on(root, "gram", "--features", feature_set)
-        done_on(root, "evaluate", "smoke", "--scenario", "nominal")
+        few = root.with_name("few.toml")
+        few.write_text('name = "few"\nbase = "fleet"\ndrives_per_day = 8\nlaps = 0.3\n')
+        done_on(root, "simulate", few, "--days", "1")
+        done_on(root, "gram")
 
     return made_once(tmp_path_factory, "benchmarks", make)
 
@@ -132,15 +135,17 @@ def named_in(page: Path) -> set[str]:
     return set(re.findall(r"python -m benchmarks\.([\w.]*\w)", page.read_text(encoding="utf-8")))
 
 
-def test_every_benchmark_has_tiny_sizes_or_needs_what_is_not_here() -> None:
-    assert programs() == {*TINY, *ELSEWHERE}
-    assert not TINY.keys() & ELSEWHERE
+def test_every_benchmark_has_tiny_sizes_or_a_test_or_needs_what_is_not_here() -> None:
+    assert sorted(programs()) == sorted([*TINY, *RUN_BY, *ELSEWHERE])
+    for name, file in RUN_BY.items():
+        text = (HERE / "tests" / file).read_text(encoding="utf-8")
+        assert re.search(rf'"(-m )?benchmarks\.{name}[ "]', text), file
 
 
 def test_every_command_of_the_measurements_is_one_of_them() -> None:
     named = named_in(HERE / "docs/measured.md")
     assert len(named) > 10
-    assert named <= {*TINY, *ELSEWHERE}
+    assert named <= programs()
 
 
 def test_every_benchmark_is_named_by_a_page() -> None:
