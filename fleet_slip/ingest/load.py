@@ -39,6 +39,7 @@ from fleet_slip.ingest.recordings import (
     TableName,
     are_gone,
     digest_of,
+    fingerprints_of,
     keep_drives,
     keep_refused,
     let_return,
@@ -369,12 +370,7 @@ class _Writer:
             if is_new and kept:
                 full = _rows_of(drives) >= FILE_ROWS
                 self.data["logs"].add(log_table(kept, self.mapping), full=full)
-                of_drives = ((drive, Origin.of_drive(drive.drive_id)) for drive in kept)
-                fingerprints |= {
-                    f"{PREFIX}{drive.counts_digest}": origin.number
-                    for drive, origin in of_drives
-                    if origin
-                }
+                fingerprints |= fingerprints_of(kept)
         for table, following in pairwise(chain(stream.quarantine(), [None])):
             allowed = keep_refused(table, self.audit, left_out)
             self.data["quarantine"].add(allowed, full=following is not None)

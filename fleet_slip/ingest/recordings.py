@@ -159,6 +159,12 @@ class Fingerprints:
         return [Unit(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
+def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
+    """Return the fingerprint of each drive's counts, and the number of its origin."""
+    of = ((drive, Origin.of_drive(drive.drive_id)) for drive in drives)
+    return {f"{PREFIX}{drive.counts_digest}": origin.number for drive, origin in of if origin}
+
+
 def unit_of(digest: str) -> Unit:
     """Return the unit of work that a file's content is."""
     return Unit(f"{FILES}{digest}", 1)
