@@ -21,7 +21,7 @@ from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
-from fleet_slip.grams.cohort import Cohort, with_gram_rows
+from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import FOLD_KEYS, Folding
@@ -155,7 +155,8 @@ class Learner:
         Raises as `load_cohort`.
         """
         plan = SelectionPlan.of(request)
-        return cls(plan, plan.load(warehouse, condition), drives, warehouse)
+        cohort = load_cohort(warehouse, condition, plan.feature_set)
+        return cls(plan, cohort, drives, warehouse)
 
     @cached_property
     def divided(self) -> Cohort:

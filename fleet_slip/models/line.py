@@ -94,7 +94,7 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
     plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
     files = cohort_files(warehouse, parse_cohort(condition))
     update_grams(warehouse, feature_set=plan.feature_set, among=files)
-    cohort = plan.load(warehouse, condition)
+    cohort = load_cohort(warehouse, condition, plan.feature_set)
     signals, label = plan.choose(cohort).winner.model.signals, catalogue().label
     served = cohort.serving(signals)
     drives = served.drives["drive_id"].to_pylist()

@@ -314,10 +314,6 @@ class SelectionPlan:
         folds = make_folding(request.by or listed.by, request.folds, listed.count)
         return cls(request, model_list, folds, _feature_set(request, model_list))
 
-    def load(self, warehouse: Warehouse, condition: str) -> Cohort:
-        """Return the Gram rows that it is made on. Raises as `load_cohort`."""
-        return load_cohort(warehouse, condition, self.feature_set)
-
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
         weighed: dict[str, Weighed] = {}
@@ -343,10 +339,8 @@ def _answer(warehouse: Warehouse, plan: SelectionPlan, condition: str) -> Select
         request.nested and not request.ordered and not _searches_of(request, plan.model_list)
     )
     of_drives = request.ordered or request.robust or request.half_life
-    if of_drives or distances:
-        cohort = plan.load(warehouse, condition)
-    else:  # the sum of each fold suffices
-        cohort = load_cohort(warehouse, condition, plan.feature_set, folds)
+    whole = of_drives or distances  # else the sum of each fold suffices
+    cohort = load_cohort(warehouse, condition, plan.feature_set, None if whole else folds)
     if request.prior:
         from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
