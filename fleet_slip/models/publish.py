@@ -180,7 +180,8 @@ def challenger_of(
     if manifest.learned_from and not force:
         delays_s = require_in_time(warehouse, manifest)
         require_sound_course(warehouse, manifest, delays_s)
-    if not (force or candidate):
+    simulated = selection.label_noise_deg is not None  # nobody states the noise of others
+    if not (force or candidate or simulated):
         champion = registry.champion(name)
         made = registry.trained_drives(champion.manifest) if champion else None
         settled = len(champion.manifest.terms) if champion else 0
