@@ -25,7 +25,7 @@ from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import FOLD_KEYS, Folding
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionRequest
@@ -225,7 +225,7 @@ def _gram_rows(
     labelled = counts.present.get(label, np.ones(len(one.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (one.quarter == quarter)}
     name = _quarter_of(one.drive.drive_id, quarter)
-    (number,) = hash_numbers(pa.array([name])).tolist()
+    (number,) = hash_names(pa.array([name])).tolist()
     own = {"drive_id": name, "trip": name, "drive_hash": number, "trip_hash": number}
     sums = drive_sums(workspace, parts, replace(counts, present=present))
     rows = gram_rows(sums, workspace.plan.names, parts, {**line, **own})

@@ -63,7 +63,7 @@ def is_received(rows: pa.Table) -> pa.ChunkedArray:
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
-def hash_numbers(ids: pa.Array | pa.ChunkedArray) -> Hashes:
+def hash_names(ids: pa.Array | pa.ChunkedArray) -> Hashes:
     """Return the hash of each id of a drive or a car, see `Hashes`."""
     first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
     return np.frombuffer(first, dtype=">u8").astype(np.uint64)

@@ -34,7 +34,7 @@ from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageErr
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
@@ -285,7 +285,7 @@ def _divide(
             chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
             condition &= parse_condition(chosen)
         cohort = load_cohort(cohort.source, condition, cohort.feature_set)
-    numbers = hash_numbers(cohort.drives["drive_id"])
+    numbers = hash_names(cohort.drives["drive_id"])
     known = np.any([one.among(numbers) for one in made], axis=0)
     return (cohort, known) if known.any() and not known.all() else None
 
@@ -427,7 +427,7 @@ def _look(
         drives = database.execute(query, {"source": MEASURED}).fetchall()
         measured = len(drives)
         if made is not None:
-            numbers = hash_numbers(pa.array([drive for drive, _ in drives], pa.string()))
+            numbers = hash_names(pa.array([drive for drive, _ in drives], pa.string()))
             seen = made.among(numbers).tolist()
             drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
         chosen = drives[:DRIVES]

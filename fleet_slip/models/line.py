@@ -14,7 +14,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.request import SelectionRequest, load_model_list
@@ -120,5 +120,5 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
         },
         hashed=hashed,
         drives=len(set(drives)),
-        drive_hashes=np.unique(hash_numbers(pa.array(drives))).astype(">u8").tobytes().hex(),
+        drive_hashes=np.unique(hash_names(pa.array(drives))).astype(">u8").tobytes().hex(),
     )

@@ -16,7 +16,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.grams.expansion import CarCounts
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
@@ -212,7 +212,7 @@ def find_seen(
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, asking(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
-    seen = registry.trained_drives(manifest).among(hash_numbers(names))
+    seen = registry.trained_drives(manifest).among(hash_names(names))
     if not seen.any() or seen.all():
         return SeenDrives(len(names), int(seen.sum()), cohort)
     kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_files import Hashes, hash_numbers
+from fleet_slip.grams.gram_files import Hashes, hash_names
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
@@ -50,7 +50,7 @@ def marked_models(root: Folder) -> frozenset[str]:
 def _hashes_of_present(warehouse: Warehouse) -> Hashes:
     grams = warehouse.grams.snapshot()
     drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
-    found = [hash_numbers(some.unique()) for some in drives]
+    found = [hash_names(some.unique()) for some in drives]
     return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
 
 
@@ -78,7 +78,7 @@ def _may_have_seen(
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
     """Return the model versions that were trained on one of the drives, or may have been."""
     registry = Registry.of(warehouse)
-    hashes = hash_numbers(pa.array(sorted(drives), pa.string()))
+    hashes = hash_names(pa.array(sorted(drives), pa.string()))
     found: list[str] = []
     for name in registry.names():
         for number in registry.versions(name):

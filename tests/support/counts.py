@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fleet_slip.catalogue.features import PLAIN
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.warehouse.condition import parse_condition
@@ -217,7 +217,7 @@ def cohort_of(
         "part": pa.array([one.part for one in drives], pa.string()),
     }
     columns |= {
-        f"{name}_hash": pa.array(hash_numbers(pa.array(columns[f"{name}_id"])))
+        f"{name}_hash": pa.array(hash_names(pa.array(columns[f"{name}_id"])))
         for name in ("drive", "vehicle")
     }
     return Cohort(

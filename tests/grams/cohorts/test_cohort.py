@@ -13,7 +13,7 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams import reader
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
 from fleet_slip.grams.folding import Folding, FoldKey
-from fleet_slip.grams.gram_files import hash_numbers
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weights, weighted
@@ -29,12 +29,12 @@ ROWS = [("a", "ax,ay"), ("b", "ax,ay"), ("b", "ax,ay,yaw_rate"), ("c", "ax,ay,ya
 
 
 def hashes(names: list[str]) -> list[int]:
-    return sorted(hash_numbers(pa.array(names)).tolist())
+    return sorted(hash_names(pa.array(names)).tolist())
 
 
 def cohort() -> Cohort:
     columns = {
-        "drive_hash": hash_numbers(pa.array([drive for drive, _ in ROWS])),
+        "drive_hash": hash_names(pa.array([drive for drive, _ in ROWS])),
         "vehicle_hash": [7] * len(ROWS),
         "source": ["received" if drive == "c" else "simulated" for drive, _ in ROWS],
         "signals": [signals for _, signals in ROWS],
@@ -66,7 +66,7 @@ def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None
     update_grams(warehouse)
     cohort = load_cohort(warehouse)
     for name in ("drive", "vehicle"):
-        told = hash_numbers(cohort.drives[f"{name}_id"])
+        told = hash_names(cohort.drives[f"{name}_id"])
         assert cohort.drives[f"{name}_hash"].to_pylist() == told.tolist()
 
 
