@@ -211,7 +211,10 @@ def received_rows(root: Path, content: bytes) -> list[dict[str, Any]]:
     return found
 
 
-@pytest.mark.parametrize(("late", "every"), [(0, 10), (-40, 10), (-11, 5), (1, 1), (200, 20)])
+LONG = (pytest.param(*one, marks=pytest.mark.long) for one in ((-11, 5), (1, 1), (200, 20)))
+
+
+@pytest.mark.parametrize(("late", "every"), [(0, 10), (-40, 10), *LONG])
 def test_received_rows_are_those_of_the_log(
     tmp_path: Path, of_course: Counter, late: int, every: int
 ) -> None:

@@ -23,17 +23,16 @@ def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=() if n in AT_ONCE else pytest.mark.long) for n in TARGETS],
+    ("name", "examples"),
+    [
+        *((name, EXAMPLES[name] // 3) for name in AT_ONCE),
+        *(pytest.param(n, EXAMPLES.get(n, FEW), marks=pytest.mark.long) for n in TARGETS),
+    ],
 )
-def test_whatever_comes_is_answered_or_refused(name: str, sandbox: Path) -> None:
+def test_whatever_comes_is_answered_or_refused(name: str, examples: int, sandbox: Path) -> None:
     target, _ = TARGETS[name]
 
-    @settings(
-        max_examples=EXAMPLES.get(name, FEW),
-        database=None,
-        suppress_health_check=list(HealthCheck),
-    )
+    @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck))
     @given(st.binary(min_size=64, max_size=4096))
     def attack(data: bytes) -> None:
         with TemporaryDirectory(dir=sandbox) as folder:

@@ -85,15 +85,15 @@ def forged(grams: Sequence[Gram], how: str) -> Rows:
     return [row_of(one, f"LIAR{i}", start_s) for i, one in enumerate(several)]
 
 
-LIES = ("gain", "offset", "many small", "several cars")
-
-
-@pytest.mark.parametrize("how", LIES)
+@pytest.mark.parametrize(
+    "how",
+    [
+        *("gain", "several cars"),
+        *(pytest.param(how, marks=pytest.mark.long) for how in ("offset", "many small")),
+    ],
+)
 def test_the_gate_asks_groups_of_cars_not_rows(
-    fleet: fleet_slip.Fleet,
-    tmp_path: Path,
-    grams: Sequence[Gram],
-    how: str,
+    fleet: fleet_slip.Fleet, tmp_path: Path, grams: Sequence[Gram], how: str
 ) -> None:
     receive(fleet, tmp_path / "forged", forged(grams, how))
     with pytest.raises(RefusedError, match="it is worse than the champion"):

@@ -40,10 +40,8 @@ def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Tab
     counts["ay"] = pa.array(counts["ay"], mask=rng.random(rows) < 0.05)
     counts["yaw_rate"] = pa.array(counts["yaw_rate"], mask=rng.random(rows) < 0.3 / rows)
     counts[LABEL] = pa.nulls(rows, pa.int16())
-    table = log_rows(name, counts)
-    ticks = np.arange(rows) + np.where(np.arange(rows) > rows * 2 // 3, 300, 0)
-    at = table.schema.get_field_index("tick")
-    return table.set_column(at, "tick", pa.array(ticks.astype(np.int32)))
+    counts["tick"] = np.arange(rows) + np.where(np.arange(rows) > rows * 2 // 3, 300, 0)
+    return log_rows(name, counts)
 
 
 def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[int, tuple[int, ...]]:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.catalogue.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
+from fleet_slip.catalogue.features import FeatureSet, features
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
@@ -49,9 +50,8 @@ def drives(draw: st.DrawFn) -> pa.Table:
         for name in SIGNALS
     }
     mass = draw(st.sampled_from([None, 1320.0, 1320.5, 1999.4, 900.0, 1e9, float("nan")]))
-    table = log_rows("d", counts, mass_kg=mass, vehicle_model=draw(st.sampled_from(["suv", "van"])))
-    ticks = pa.array(np.cumsum([0, *steps[1:]]).astype(np.int32))
-    return table.set_column(table.schema.get_field_index("tick"), "tick", ticks)
+    counts["tick"] = np.cumsum([0, *steps[1:]])
+    return log_rows("d", counts, mass_kg=mass, vehicle_model=draw(st.sampled_from(["suv", "van"])))
 
 
 def clip(value: int, bits: int) -> int:
@@ -174,17 +174,23 @@ def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.T
         counts[f"wheel_{wheel}"] = rng.integers(0, 12_000, rows).astype(np.int16)
     for signal in ("ay", "wheel_rl", "sideslip"):
         counts[signal] = pa.array(counts[signal], mask=rng.random(rows) < null)
-    table = log_rows(name, counts)
-    ticks = np.cumsum(rng.choice([1, 1, 1, 300], rows)).astype(np.int32)
-    ticks -= ticks[0]
-    at = table.schema.get_field_index("tick")
-    return table.set_column(at, "tick", pa.array(ticks))
+    ticks = np.cumsum(rng.choice([1, 1, 1, 300], rows))
+    return log_rows(name, {**counts, "tick": ticks - ticks[0]})
 
 
-@pytest.mark.parametrize("feature_set", ["fleet", pytest.param("windows", marks=pytest.mark.long)])
+FEW = FeatureSet(
+    description="few",
+    signals=("ax", "ay", "yaw_rate", "wheel_rl"),
+    features=("curvature", "rear_ay"),
+    windows=("ay_mean_16", "ay_bias", "yaw_rate_speed_mean_8"),
+)
+
+
+@pytest.mark.parametrize("feature_set", ["few", pytest.param("windows", marks=pytest.mark.long)])
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
-    warehouse: Warehouse, feature_set: str
+    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, feature_set: str
 ) -> None:
+    monkeypatch.setitem(features().sets, "few", FEW)
     whole = log_rows("whole", random_counts(np.random.default_rng(3), 700))
     land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), whole)
     land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
@@ -221,6 +227,7 @@ def test_blocks_of_time_divide_the_gram_row_of_a_whole_drive(warehouse: Warehous
     assert found[0][0] == 5040
 
 
+@pytest.mark.long
 def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
     """Some 10,920 of them end DuckDB 2.0.0 with SIGFPE; the kernel alone computes larger sets.
 
@@ -236,10 +243,8 @@ def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
 
 
 def test_a_drive_that_goes_back_in_time_is_refused(warehouse: Warehouse) -> None:
-    table = log_rows("d", random_counts(np.random.default_rng(1), 4))
-    at = table.schema.get_field_index("tick")
-    ticks = pa.array([0, 1, 1, 2], pa.int32())
-    land(warehouse, "one", table.set_column(at, "tick", ticks))
+    counts = random_counts(np.random.default_rng(1), 4)
+    land(warehouse, "one", log_rows("d", {**counts, "tick": [0, 1, 1, 2]}))
     with pytest.raises(DataError, match=r"drive d: .*ticks of a drive do not increase"):
         update_grams(warehouse, feature_set="windows")
 
