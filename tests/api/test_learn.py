@@ -2,6 +2,7 @@
 
 import json
 import random
+import shutil
 from pathlib import Path
 
 import pytest
@@ -92,17 +93,18 @@ def test_a_version_without_assumptions_is_what_it_was(
     assert "assumed" not in manifest.model_copy(update={"assumed": ()}).model_dump(mode="json")
 
 
-def test_a_corrected_mapping_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
-    logs = write_logs(tmp_path, 4)
-    mapping = load_mapping(str(tmp_path / "own.toml"))
-    fleet = fleet_slip.open(tmp_path / "root")
-    fleet.learn("golf", logs, mapping)
+def test_a_corrected_mapping_takes_the_place_of_the_old_one(
+    learned: tuple[Path, Finished, Finished], tmp_path: Path
+) -> None:
+    folder, _, _ = learned
+    mapping = load_mapping(str(folder / "own.toml"))
+    fleet = fleet_slip.open(shutil.copytree(folder / "root", tmp_path / "root"))
     ax = mapping.signals["ax"].model_copy(update={"negate": True})
     corrected = mapping.model_copy(update={"signals": {**mapping.signals, "ax": ax}})
-    report = fleet.learn("golf", logs, corrected)
-    assert sum(one.drives_replaced for one in report.ingested) == 4
+    report = fleet.learn("golf", folder / "logs", corrected)
+    assert sum(one.drives_replaced for one in report.ingested) == 6
     assert report.problem is None
-    assert fleet.sql("SELECT count(*) FROM drives").fetchall() == [(4,)]
+    assert fleet.sql("SELECT count(*) FROM drives").fetchall() == [(6,)]
 
 
 def test_a_first_model_of_too_few_drives_is_refused_as_by_publish(tmp_path: Path) -> None:

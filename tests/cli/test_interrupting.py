@@ -4,7 +4,6 @@ import inspect
 import json
 import os
 import re
-import resource
 import shlex
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from fleet_slip.cli import app as program
 from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.storage.runs import LOGGER
+from tests.support.budget import processor_s
 from tests.support.commands import COMMAND, PATIENCE_S, run
 from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 
@@ -128,12 +128,6 @@ Session.sql = sql
 main()
 """
 """The command line, which says when it asks a query."""
-
-
-def processor_s() -> float:
-    """Return the seconds that processes which were started here, and have ended, computed."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
 
 
 @pytest.mark.parametrize(
