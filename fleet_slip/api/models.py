@@ -93,12 +93,12 @@ class PublishedModels(Rooted):
         that contradict any car; `UsageError` for an invalid name, and
         what `FleetCohort.select` raises.
         """
-        from fleet_slip.models.publish import challenger_of, publish
+        from fleet_slip.models.publish import challenger_of, publish_challenger
 
         how = {"force": force, "candidate": candidate}
         registry, selection = self.registry(), self._chosen(name, choice)
         manifest = challenger_of(self.warehouse, registry, selection, name, **how)
-        return publish(registry, manifest, selection, **how)
+        return publish_challenger(registry, manifest, selection, **how)
 
     def would_publish(
         self,

@@ -12,33 +12,24 @@ out, the median group of them must not be worse off either, each group having on
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from pydantic import Field
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY, MEASURED
-from fleet_slip.catalogue.faults import Fault
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.reader import GramReader, open_grams
-from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
-from fleet_slip.models.manifest import Manifest, TrainedDrives
+from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
@@ -57,8 +48,7 @@ from fleet_slip.regression.folds import (
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.resources import config_file
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.condition import parse_condition
 
 
 class Floor(Config):
@@ -366,94 +356,6 @@ def _require_same_features(version: ModelVersion, feature_set: str) -> None:
             raise DataError(f"the column {name} has changed since {version.reference}.")
 
 
-# A fault of all drives, such as a label with the other sign, shows in no comparison: so a few of
-# the longest that are new to the champion are examined as `ingest` does, for what contradicts cars.
-
-DRIVES = 5
-"""That are looked at, of as many cars if there are so many."""
-
-FEWEST_NEW = 3
-"""New drives that are looked at if there is a champion: one alone may be odd."""
-
-MOST_TICKS = 100_000
-
-_LONGEST = """
-    SELECT drive_id, day FROM drives WHERE source = $source AND ({condition})
-    ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
-        rows DESC, drive_id
-"""
-
-
-def require_sound_drives(
-    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None, settled: int = 0
-) -> None:
-    """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
-
-    `made` are the drives that made the champion, of `settled` columns: one of more columns needs as
-    much data for them as a first champion does. What is looked at is the label, and the signals
-    that a model has columns of. Simulated drives, and those of cars that sent no log, are passed
-    over.
-    """
-    found, looked_at, measured = _look(warehouse, manifest, made)
-    if measured and len(manifest.terms) > settled and (lacks := find_lacks(manifest)):
-        raise RefusedError(
-            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "
-            "fewer columns. To publish it anyway: --force"
-        )
-    if made is not None and looked_at < FEWEST_NEW:
-        return
-    used = {manifest.label.signal}
-    for term in manifest.terms:
-        used |= set(term.definition.signals) if term.definition else {term.signal}
-    for (_, signals), examples in found.items():
-        # Beside a champion, whose drives have no faults, half of them are enough.
-        if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
-            continue
-        raise RefusedError(
-            f"{manifest.name} was not published: {len(examples)} of {looked_at} inspected drives "
-            f"contradict the motion of any car: {examples[0]} Correct the mapping and run: "
-            "fleet-slip ingest LOGS --mapping M --replace. To publish it anyway: --force"
-        )
-
-
-def _look(
-    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
-) -> tuple[dict[tuple[str, tuple[str, ...]], list[Fault]], int, int]:
-    """Return what looks wrong in some long drives, how many these are, and of how many."""
-    found: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
-    condition = parse_condition(manifest.trained_on.cohort)
-    query = _LONGEST.format(condition=condition.sql)
-    with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
-        drives = database.execute(query, {"source": MEASURED}).fetchall()
-        measured = len(drives)
-        if made is not None:
-            numbers = hash_names(pa.array([drive for drive, _ in drives], pa.string()))
-            seen = made.among(numbers).tolist()
-            drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
-        chosen = drives[:DRIVES]
-        for drive, day in chosen:
-            columns = database.execute(
-                "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
-                f"LIMIT {MOST_TICKS}",
-                {"day": day, "drive": drive},
-            ).fetchnumpy()
-            for one in find_suspicions(_signals(columns)):
-                if one.does_harm:
-                    found.setdefault((one.kind, one.signals), []).append(one)
-    return found, len(chosen), measured
-
-
-def _signals(columns: Mapping[str, Any]) -> Signals:
-    """Return the signals of a drive that has values of them."""
-    counts = {
-        name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
-        for name in catalogue().signals
-        if name in columns
-    }
-    some = {name: values for name, values in counts.items() if np.isfinite(values).any()}
-    return on_every_tick(np.asarray(columns["tick"], dtype=np.int32), some)
-
-
 # A challenger that was trained on unusual drives is better on them, held out or not. Where the
 # champion's error on new drives is much larger than on those that made it, both are compared on the
 # latter alone.
@@ -595,84 +497,3 @@ def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion
     best = registry.history(name).best_of(CHAMPION)
     others = [] if best in (None, champion.version) else [registry.load(name, best)]
     return [champion, *others]
-
-
-# A course that is late looks like a side-slip angle, in all figures, and so does a heading.
-
-MOST_S, SURE_S = 0.01, 0.005
-"""Delay that may be left, and its standard error: 20 ms cost 0.4 deg on a real car."""
-NAMED, SHOWN = 5, 3
-
-
-def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
-    """Return how late courses still are, in s, in the Gram rows of the cars that taught a model.
-
-    Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
-    """
-    condition = parse_cohort(manifest.trained_on.cohort)
-    with open_grams(warehouse, DELAY, condition) as opened:
-        told = opened.batches(parse_condition(ALL_DRIVES))
-        delays = receiver_delays(told).cars
-    feature_set = features().name_of(manifest.trained_on.feature_set)
-    with open_grams(warehouse, feature_set, condition) as opened:
-        cars = dict(opened.course_delays(condition))
-    left = {
-        car: max((delays[car].value - GRAIN_S * parts for parts in corrected), key=abs)
-        for car, corrected in cars.items()
-        if car in delays
-    }
-    unsure = [car for car in left if (delays[car].uncertainty or math.inf) > SURE_S]
-    late = [car for car, delay_s in left.items() if abs(delay_s) > MOST_S]
-    problems = []
-    if unsure:
-        problems.append(
-            f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(delays, unsure)})"
-        )
-    if unknown := len(cars) - len(left):
-        cars_text = number_of(unknown, "car")
-        problems.append(f"that of {cars_text} cannot be estimated from their drives")
-    if late:
-        problems.append(
-            "the Gram rows of some cars are corrected by an outdated delay "
-            f"({_named(delays, late)}): run fleet-slip gram --features course, and send the new "
-            "delay to cars that count on board"
-        )
-    if problems:
-        raise RefusedError(
-            f"{manifest.name} was not published: a late course looks like side-slip, and "
-            f"{'; '.join(problems)}. fleet-slip calibrate --car NAME says it. Choose "
-            "other cars, add drives, or set the receiver type (receiver in the mapping). "
-            f"To publish it anyway: fleet-slip publish {manifest.name} --label "
-            "course --force"
-        )
-    return left
-
-
-def _named(delays: Mapping[str, ReceiverDelay], cars: Sequence[str]) -> str:
-    shown = ", ".join(f"{car}: {delays[car]}" for car in cars[:NAMED])
-    return f"{shown}, and {len(cars) - NAMED} more" if len(cars) > NAMED else shown
-
-
-def require_sound_course(
-    warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
-) -> None:
-    """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
-    condition = parse_cohort(manifest.trained_on.cohort)
-    with GramReader(warehouse) as reader:
-        cars = course_moments(reader, condition)
-    faults: dict[str, Fault] = {}
-    for car, drives in sorted(cars.items()):
-        relation = relate(np.sum(list(drives.values()), axis=0), delays_s.get(car, 0.0))
-        if relation and (fault := relation.fault or relation.misplaced):
-            faults[car] = fault
-    if not faults:
-        return
-    first = next(iter(faults.values()))
-    named = "; ".join(f"{car}: {one.figure}" for car, one in list(faults.items())[:SHOWN])
-    more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
-    raise RefusedError(
-        f"{manifest.name} was not published: the course of {len(faults)} of "
-        f"{number_of(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "
-        "ingest again, or choose other cars; fleet-slip quality lists the drives. To publish it "
-        f"anyway: fleet-slip publish {manifest.name} --label course --force"
-    )

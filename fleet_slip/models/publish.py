@@ -15,12 +15,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.models.acceptance import (
-    judge,
-    require_in_time,
-    require_sound_course,
-    require_sound_drives,
-)
+from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -36,6 +31,7 @@ from fleet_slip.models.manifest import (
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
+from fleet_slip.models.soundness import require_in_time, require_sound_course, require_sound_drives
 from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
@@ -170,7 +166,7 @@ def challenger_of(
     force: bool,
     candidate: bool,
 ) -> Manifest:
-    """Return the winner of a selection as the manifest that `publish` takes.
+    """Return the winner of a selection as the manifest that `publish_challenger` takes.
 
     Unless forced, raises `RefusedError` for a late or false course and, unless it is to be a
     candidate, for first measured drives that contradict any car.
@@ -358,7 +354,7 @@ class Publication(Answer):
         yield Remark(f"{done} {self.version.reference}. {self.reason}")
 
 
-def publish(
+def publish_challenger(
     registry: Registry,
     manifest: Manifest,
     selection: Selection,
@@ -409,7 +405,7 @@ class DryRun(Answer):
         publishes: whether there would be a new version, as champion or as candidate.
         reason: what was compared, else why nothing would be published.
         candidate: whether it would wait for somebody to promote it.
-        refused: whether `publish` would raise `RefusedError`.
+        refused: whether `publish_challenger` would raise `RefusedError`.
     """
 
     model: str
@@ -439,7 +435,7 @@ def would_publish(
     force: bool = False,
     candidate: bool = False,
 ) -> DryRun:
-    """Tell what `publish` of the same would come to; nothing is written. Raises as it does."""
+    """Tell what `publish_challenger` would come to, and raise as it does; nothing is written."""
     found = _decide(registry, manifest, selection, force=force, candidate=candidate)
     if found.stays:
         return DryRun(manifest.name, False, found.reason)

@@ -243,16 +243,7 @@ class PlainVehicle(FourWheelVehicle):
     equations 2.21 to 2.28.
     """
 
-    def step(self, dt: float) -> None:
-        """Move on by `dt` s in one step of the classical Runge-Kutta method."""
-        before = self.state
-        k1 = self.derivative_func(0.0, before)
-        k2 = self.derivative_func(0.0, before + dt / 2 * k1)
-        k3 = self.derivative_func(0.0, before + dt / 2 * k2)
-        k4 = self.derivative_func(0.0, before + dt * k3)
-        x, y, *motion = (before + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))[:, 0].tolist()
-        self.position = np.array([x, y])
-        self.heading, self.speed, self.lateral_speed, self.yaw_rate = motion
+    step = BicycleVehicle.step
 
     def _rates_of(self, x: State) -> Acceleration:
         """Return how the body moves under the forces of linear axles."""

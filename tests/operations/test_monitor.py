@@ -14,7 +14,7 @@ from scipy import stats
 import fleet_slip
 from fleet_slip.errors import DataError, UsageError
 from fleet_slip.grams.job import update_grams
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
@@ -50,7 +50,7 @@ def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warehouse = Warehouse(LocalFolder(root))
     add_days(warehouse, 0, TRAINING_DAYS)
     planned = answer_request(warehouse, SelectionRequest(models="table1"))
-    publish(Registry(warehouse.root / "models"), manifest_of(planned, "m"), planned)
+    publish_challenger(Registry(warehouse.root / "models"), manifest_of(planned, "m"), planned)
     return root
 
 

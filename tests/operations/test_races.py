@@ -18,7 +18,7 @@ from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.models.publish import manifest_of, publish
+from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
@@ -272,7 +272,7 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
     manifests = {name: manifest_of(answer, name) for name, answer in answers.items()}
     forget(warehouse, BETA, now=True)
     for name, answer in answers.items():
-        publish(registry, manifests[name], answer, force=True)
+        publish_challenger(registry, manifests[name], answer, force=True)
     assert marked_models(warehouse.root) == {"of_all@1"}
     (kept,) = Path(str(registry.folder_of("of_others"))).glob("drives-*.bin")
     kept.unlink()  # then it cannot be told
@@ -285,7 +285,9 @@ def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it
     warehouse = fill(tmp_path, *CARS)
     Audit(warehouse.root).begin(BETA, 3, [], {"beta": 0})
     answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
-    publish(Registry(warehouse.root / "models"), manifest_of(answer, "beta"), answer, force=True)
+    publish_challenger(
+        Registry(warehouse.root / "models"), manifest_of(answer, "beta"), answer, force=True
+    )
     assert marked_models(warehouse.root) == {"beta@1"}
     Audit(warehouse.root).end(BETA, grams_version=0)
     assert not marked_models(warehouse.root)

@@ -15,7 +15,7 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models import acceptance as champion_rules
-from fleet_slip.models.publish import Publication, manifest_of, publish, would_publish
+from fleet_slip.models.publish import Publication, manifest_of, publish_challenger, would_publish
 from fleet_slip.models.registry import CANDIDATE, Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
@@ -79,7 +79,7 @@ def publish_from(
     answer = answer_request(warehouse, SelectionRequest(nested=signals, worth="0.0001deg"), cohort)
     manifest = manifest_of(answer, "beta")
     told = would_publish(registry_of(warehouse), manifest, answer, **options)
-    done = publish(registry_of(warehouse), manifest, answer, **options)
+    done = publish_challenger(registry_of(warehouse), manifest, answer, **options)
     assert (told.publishes, told.candidate) == (done.new, done.candidate)
     return done
 
@@ -203,7 +203,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = answer_request(warehouse, SelectionRequest(model=every))
-    made = publish(registry_of(warehouse), manifest_of(first, "beta"), first, force=True)
+    made = publish_challenger(registry_of(warehouse), manifest_of(first, "beta"), first, force=True)
     write(warehouse, "more", 16, noise=400.0)
     version, answer = made.version, answer_request(warehouse, SelectionRequest(model=every))
     assert champion_rules.compare(answer, [version]).better
