@@ -152,26 +152,31 @@ def update(
     condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
 
 
+class Inputs(NamedTuple):
+    """What the filter reads: measurements by row, what axles can do, how it begins, the car."""
+
+    ax_mps2: FloatArray
+    ay_mps2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    vx_mps: FloatArray
+    steer_rad: FloatArray
+    axles: FloatArray
+    first_mean: Row
+    first_variances: Row
+    chassis: Chassis
+    variances: Variances
+
+
 @kernel
-def _filter(
-    ax: FloatArray,
-    ay: FloatArray,
-    yaw_rate: FloatArray,
-    vx: FloatArray,
-    steer: FloatArray,
-    loaded: FloatArray,
-    first_mean: Row,
-    first_variances: Row,
-    c: Chassis,
-    v: Variances,
-) -> FloatArray:
-    found = np.empty((2, len(ax)))
-    x = belief_of(first_mean, first_variances)
-    for k in range(len(ax)):
-        axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
+def _filter(given: Inputs) -> FloatArray:
+    found = np.empty((2, len(given.ax_mps2)))
+    x, c, v = belief_of(given.first_mean, given.first_variances), given.chassis, given.variances
+    for k in range(len(given.ax_mps2)):
+        loaded, steer = given.axles[:, k], given.steer_rad[k]
+        axles = Axles(loaded[0], loaded[1], loaded[2], loaded[3])
         if k > 0:
-            predict(x, ax[k], steer[k], STEP_S, axles, c, v)
-        update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+            predict(x, given.ax_mps2[k], steer, STEP_S, axles, c, v)
+        update(x, given.vx_mps[k], given.yaw_rate_rad_s[k], given.ay_mps2[k], steer, axles, c, v)
         found[:, k] = x.mean[:2]
     return found
 
@@ -206,23 +211,8 @@ def axles_of(
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
     """Estimate side-slip in rad by row. Raises `DataError` without a sensor."""
-    vx_mps, vy_mps = _filter(*inputs_of(drive, car, noise))
+    vx_mps, vy_mps = _filter(inputs_of(drive, car, noise))
     return sideslip_angle(vx_mps, vy_mps)
-
-
-class Inputs(NamedTuple):
-    """What the filter reads: measurements by row, what axles can do, how it begins, the car."""
-
-    ax_mps2: FloatArray
-    ay_mps2: FloatArray
-    yaw_rate_rad_s: FloatArray
-    vx_mps: FloatArray
-    steer_rad: FloatArray
-    axles: FloatArray
-    first_mean: Row
-    first_variances: Row
-    chassis: Chassis
-    variances: Variances
 
 
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
