@@ -52,13 +52,13 @@ _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
 
 
 class DriveCutter:
-    """Gives every row the number of its part, a stretch of one `group`, and refuses others.
+    """Gives every row the number of its part, which becomes a drive, and refuses others.
 
-    Within a group, a step in time larger than `split_gap_s`, forward or back, begins a new part,
-    and so does `longest_s`. A row whose neighbours are both that far is `isolated`, so that one
-    wild time stamp does not cut a drive. `time_duplicate` and `time_backwards` are rows not later
-    than all before in their stretch. None of it depends on the blocks in which rows come: what the
-    next row decides waits for it.
+    A group, such as a car, has stretches, and these have parts: a step in time larger than
+    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a part. A row whose
+    neighbours are both that far is `isolated`, so that one wild time stamp does not cut a drive.
+    `time_duplicate` and `time_backwards` are rows not later than all before in their stretch. None
+    of it depends on the blocks in which rows come: what the next row decides waits for it.
     """
 
     def __init__(self, base: TimeBase, longest_s: float = LONGEST_DRIVE_S) -> None:

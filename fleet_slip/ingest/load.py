@@ -580,7 +580,7 @@ def commit_batch(
     note: dict[str, str],
     take_out: TakeOut | None = None,
 ) -> tuple[WrittenBatch, frozenset[str]]:
-    """Commit what was written of a batch; return it, and the units that are now in the logs.
+    """Commit what was written of a batch; return it, and the units that this put into the logs.
 
     Where something was forgotten, or committed by another process, since it was written, `write`
     writes it again. What gives way to the new files is taken out in the same commits.
@@ -603,7 +603,7 @@ def commit_batch(
         snapshot = tables[name].snapshot()
         while is_outdated(name, snapshot):
             for other, table in tables.items():
-                table.discard(written.new[other].files)
+                table.discard(written.new[other].files)  # but what has landed
             written = write()
             snapshot = tables[name].snapshot()
         new = written.new[name]

@@ -44,7 +44,10 @@ REASONS = (
     "time_duplicate",
     "isolated",
 )
-"""What can be wrong with a row by itself; a problem is an index into this."""
+"""What can be wrong with a row by itself; a problem is an index into this.
+
+The last three where a log has several time bases; of one, `DriveCutter` finds them.
+"""
 
 
 @dataclass(frozen=True)

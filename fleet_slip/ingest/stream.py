@@ -85,7 +85,7 @@ class MeasuredStream:
     """
 
     def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
-        """Take the file, the mapping, the digest of both, and that of the file alone."""
+        """Take the file, the mapping, and what `_identity` returns."""
         self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker = RowChecker(file, mapping)
@@ -97,7 +97,7 @@ class MeasuredStream:
         self._first_refused: dict[str, Any] | None = None
         self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
-        self._stretches: Counter[int] = Counter()
+        self._drives_of_group: Counter[int] = Counter()
         self._trips: dict[int, tuple[str, float]] = {}
         """The trip of each group's last drive, and when that ended."""
         self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
@@ -181,8 +181,8 @@ class MeasuredStream:
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
         group = int(next(iter(rows.bases.values()))["group"][0])
-        self._stretches[group] += 1
-        name = drive_id(self.prefix, group, self._stretches[group])
+        self._drives_of_group[group] += 1
+        name = drive_id(self.prefix, group, self._drives_of_group[group])
         trip_id, ended_s = self._trips.get(group, (name, rows.start_s))
         if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
             trip_id = name
@@ -329,7 +329,7 @@ def _reach(blocks: list[CheckedBlock]) -> int:
 
 
 def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
-    """Return the rows of the first blocks up to a number, cut into parts."""
+    """Return the rows of the first blocks up to a number, cut into parts for `_usual_intervals`."""
     rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
     several = "base" in rows.columns
     if several:

@@ -1,4 +1,4 @@
-"""Which fold a drive belongs to: the SHA-256 of its id modulo the number of folds.
+"""Which fold a drive belongs to: the SHA-256 of its trip modulo the number of folds.
 
 It depends on the drive alone, so that models of different days share a split, which rules that even
 the folds out cannot. Sizes vary by chance; a fold that no drive falls into is left out.
