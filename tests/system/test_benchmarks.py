@@ -23,8 +23,8 @@ TINY = {
     "cluster": "--days 1 --workers 1",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
-    "goals": "{root} smoke --roads 1",
-    "growth": "--root {folder} --part versions --sizes 2 3",
+    "goals": "{root} few --roads 1",
+    "growth": "--root {folder} --part versions --sizes 2",
     "ingest": "--rows 2000,4000",
     "ingest_folder": "--files 3 --rows 100",
     "on_board": "{root} smoke --seconds 0.01",
@@ -49,6 +49,14 @@ RUN_BY = {
 }
 """What a test of its own runs, with sizes that are not tiny."""
 
+FEW = """
+name = "few"
+base = "fleet"
+drives_per_day = 8
+laps = 0.1
+plan.vehicles = ["d_class_sedan"]
+"""
+
 ELSEWHERE = {
     "fuzz.guided": "atheris",
     "weka": "WEKA and a JVM",
@@ -66,9 +74,10 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         few = root.with_name("few.toml")
-        few.write_text('name = "few"\nbase = "fleet"\ndrives_per_day = 8\nlaps = 0.3\n')
+        few.write_text(FEW)
         done_on(root, "simulate", few, "--days", "1")
         done_on(root, "gram")
+        done_on(root, "publish", "few", "--nested", "ay", "--cohort", "campaign = 'few'", "--force")
 
     return made_once(tmp_path_factory, "benchmarks", make)
 
