@@ -58,25 +58,19 @@ def test_the_limit_of_a_control_group_is_found(
     assert limits.memory_bytes() == 123456789
 
 
-def test_data_gets_what_the_libraries_leave_of_the_address_space(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(
+    ("address_space", "data", "left"),
+    [
+        (limits.LIBRARIES_BYTES + 10**9, resource.RLIM_INFINITY, 10**9),
+        (resource.RLIM_INFINITY, 2 * 10**9, 2 * 10**9 - limits.DATA_BYTES // 2),
+    ],
+)
+def test_data_gets_what_the_libraries_leave(
+    monkeypatch: pytest.MonkeyPatch, address_space: int, data: int, left: int
 ) -> None:
-    allowed = limits.LIBRARIES_BYTES + 10**9
-    unlimited = resource.RLIM_INFINITY
-    monkeypatch.setattr(
-        resource,
-        "getrlimit",
-        lambda kind: (allowed if kind == resource.RLIMIT_AS else unlimited,) * 2,
-    )
-    assert limits.memory_bytes() == 10**9
-
-
-def test_data_gets_what_the_libraries_leave_of_a_limit_of_data(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    hard = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: 2 * 10**9}
+    hard = {resource.RLIMIT_AS: address_space, resource.RLIMIT_DATA: data}
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (hard[kind], hard[kind]))
-    assert limits.memory_bytes() == 2 * 10**9 - limits.DATA_BYTES // 2
+    assert limits.memory_bytes() == left
 
 
 FULL = Path("/dev/full")

@@ -49,14 +49,6 @@ RUN_BY = {
 }
 """What a test of its own runs, with sizes that are not tiny."""
 
-FEW = """
-name = "few"
-base = "fleet"
-drives_per_day = 8
-laps = 0.1
-plan.vehicles = ["d_class_sedan"]
-"""
-
 ELSEWHERE = {
     "fuzz.guided": "atheris",
     "weka": "WEKA and a JVM",
@@ -74,7 +66,10 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         few = root.with_name("few.toml")
-        few.write_text(FEW)
+        few.write_text(
+            'name = "few"\nbase = "fleet"\ndrives_per_day = 8\nlaps = 0.1\n'
+            'plan.vehicles = ["d_class_sedan"]\n'
+        )
         done_on(root, "simulate", few, "--days", "1")
         done_on(root, "gram")
         done_on(root, "publish", "few", "--nested", "ay", "--cohort", "campaign = 'few'", "--force")
