@@ -4,7 +4,7 @@
 
 Each is timed in several rounds, in turn, and the best round counts, as it was disturbed least.
 A sample is one car moved on by 0.01 s: by one `BicycleVehicle.step`, or by five steps of 2 ms with
-driver, road and recording. If `--seconds` is below 0.2, there are fewer drives.
+driver, road and recording. If `--seconds` is below 0.4, there are fewer drives.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     arguments = parser.parse_args()
     share = arguments.seconds / ROUNDS
-    drives = fleet()[: max(1, round(160 * arguments.seconds))]
+    drives = fleet()[: max(1, round(80 * arguments.seconds))]
     simulate_drives(drives[:1])
     subjects: dict[str, Callable[[], float]] = {
         "highway-env BicycleVehicle.step": partial(vehicle_rate, BicycleVehicle, share),

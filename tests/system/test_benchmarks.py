@@ -35,7 +35,7 @@ TINY = {
     "simulator": "--seconds 0.01 --threads 1",
     "simulator_profile": "--campaign smoke",
     "traffic": "--drives 1",
-    "soak": "--minutes 0.1",
+    "soak": "--minutes 0.03",
     "start": "--rounds 1",
     "statistics_figures": "{root} smoke --output {folder}",
     "validation": "",

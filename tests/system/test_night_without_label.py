@@ -18,8 +18,8 @@ pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
 def logged(folder: Path, name: str, seed: int) -> str:
     """Return the CSV of a car that drives a campaign of the page with another seed."""
     root, campaign = folder / name, folder / f"{name}.toml"
-    text = FILES["small.toml"].replace('name = "small"', f'name = "{name}"\nseed = {seed}')
-    campaign.write_text(text, encoding="utf-8")
+    text = FILES["small.toml"].replace("laps = 1", f"laps = 0.4\nseed = {seed}")
+    campaign.write_text(text.replace('"small"', f'"{name}"'), encoding="utf-8")
     done_on(root, "simulate", str(campaign))
     return done_on(root, "sql", "--csv", FILES["as_a_logger.sql"]).stdout
 
