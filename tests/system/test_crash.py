@@ -135,6 +135,8 @@ def test_a_damaged_log_file_is_named(run_command: RunCommand, simulated: Path) -
         assert file.name in told.stderr
     file.write_bytes(whole)
     assert json.loads(run_command("gram", "--json").stdout)["files_read"] == 4
+    table = run_command("verify", "--grams").stdout.splitlines()
+    assert "SQL against the kernel                    8    yes" in table
 
 
 @pytest.fixture
