@@ -4,7 +4,7 @@
 
 Each is timed in several rounds, in turn, and the best round counts, as it was disturbed least.
 A sample is one car moved on by 0.01 s: by one `BicycleVehicle.step`, or by five steps of 2 ms with
-driver, road and recording. If `--seconds` is below 0.4, there are fewer drives.
+driver, road and recording. Drives are shorter than a lap and a half below `--seconds 0.4`.
 """
 
 import argparse
@@ -27,8 +27,8 @@ ROUNDS = 5
 DRIVES = 32
 
 
-def fleet() -> list[LaneDrive]:
-    """Return drives of a lap and a half on Waterford Hills, each at another speed and mass."""
+def fleet(laps: float) -> list[LaneDrive]:
+    """Return drives on Waterford Hills, each at another speed and mass."""
     track = load_track("waterford_hills")
     limits = SpeedLimits(
         lateral_mps2=5.0, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=45.0
@@ -46,7 +46,7 @@ def fleet() -> list[LaneDrive]:
                 track.closed,
             ),
             1.0,
-            1.5,
+            laps,
         )
         for i in range(DRIVES)
     ]
@@ -103,7 +103,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     arguments = parser.parse_args()
     share = arguments.seconds / ROUNDS
-    drives = fleet()[: max(1, round(80 * arguments.seconds))]
+    drives = fleet(min(1.5, 4 * arguments.seconds))
     simulate_drives(drives[:1])
     subjects: dict[str, Callable[[], float]] = {
         "highway-env BicycleVehicle.step": partial(vehicle_rate, BicycleVehicle, share),
