@@ -27,7 +27,7 @@ from fleet_slip.warehouse.tables import Warehouse
 ROUNDS = 7
 TABLE = SelectionRequest(models="table1")
 MODELS = load_model_list("table1")
-INPUTS = MODELS.model[1].signals
+INPUTS, FOLDS = MODELS.model[1].signals, MODELS.folds
 
 
 def median_ms(function: Callable[[], Any]) -> float:
@@ -42,9 +42,7 @@ def main(root: str, condition: str) -> None:
     cohort = load_cohort(warehouse, condition)
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:
-        sums = load_cohort(source, condition, folding=MODELS.folds).folds(
-            "drive", MODELS.folds.count
-        )
+        sums = load_cohort(source, condition, folding=FOLDS).folds("drive", FOLDS.count)
         fit(sums.serving(INPUTS, label).total, INPUTS, label)
 
     with GramReader(warehouse) as reader:
