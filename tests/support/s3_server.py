@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, WSGIRequestHandler, make_server
 
 from fleet_slip.storage.objects import client
@@ -62,10 +61,12 @@ class Server:
     """A running server; every bucket that is asked for by `bucket` is new."""
 
     def __init__(self) -> None:
+        from moto.moto_server import werkzeug_app as moto  # noqa: PLC0415 - a second, for a server
+
         self.faults = Faults()
         self._rng = random.Random(0)  # noqa: S311
         self._conditional = threading.Lock()
-        self._moto = DomainDispatcherApplication(create_backend_app)
+        self._moto = moto.DomainDispatcherApplication(moto.create_backend_app)
         self._server: BaseWSGIServer = make_server(
             "127.0.0.1", 0, self, threaded=True, request_handler=_Quiet
         )
