@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 # uv installs in seconds; pip, which comes with Python, installs the same where uv cannot be had or cannot reach the registry.
 define INSTALL
-$(BIN)/uv pip install --quiet --python $(BIN)/python --constraint constraints.txt $(1) || \
+$(BIN)/uv pip install --python $(BIN)/python --constraint constraints.txt $(1) || \
 	  $(BIN)/python -m pip install --constraint constraints.txt $(1)
 endef
 
@@ -65,7 +65,8 @@ setup: $(VENV)/.installed
 # What running needs, what the checks need, and what the pages need.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	-$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip uv
+	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip
+	-$(BIN)/python -m pip install --quiet --constraint constraints.txt uv
 	$(call INSTALL,--editable .)
 	touch $@
 

@@ -67,6 +67,7 @@ def test_what_is_installed_is_what_was_pinned() -> None:
     assert {name: pinned().get(name) for name in installed} == installed
 
 
+@pytest.mark.long  # after `make docs`
 @pytest.mark.skipif(
     any(required(*GROUPS["docs"])[name] is None for name in required(*GROUPS["docs"])),
     reason="what the group docs needs is known once it is installed: make docs",
