@@ -25,9 +25,10 @@ import numpy as np
 import fleet_slip
 from fleet_slip.config import load_config
 from fleet_slip.evaluation.blind import BlindSet, blind_scenarios
-from fleet_slip.evaluation.drives import EvaluatedDrive, simulate_drives
-from fleet_slip.evaluation.evaluate import train_competitors
-from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge
+from fleet_slip.evaluation.evaluator import Estimator as DriveEstimator
+from fleet_slip.evaluation.evaluator import evaluate, pooled_statistics
+from fleet_slip.evaluation.scenario_evaluation import train_competitors
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.resources import config_file
@@ -99,24 +100,26 @@ def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]
 
 
 def errors_deg(
-    some: Sequence[Scenario], estimators: Mapping[str, Estimate], *, laden: bool = False
+    some: Sequence[Scenario],
+    estimators: Mapping[str, DriveEstimator[TestDrive]],
+    *,
+    laden: bool = False,
 ) -> list[float]:
     """Return the RMSE of each estimator over all drives in which no car is lost.
 
     `laden`: judged at the centre of gravity of the loaded car instead of the empty one.
     """
     drives = [one for one in simulate_drives(some) if one.lost_control_s is None]
-    runs = [evaluate_drive(drive, estimators) for drive in drives]
     if laden:
-        runs = [_laden(run, drive) for run, drive in zip(runs, drives, strict=True)]
-    found = judge(runs)
-    return [found[name].rmse_deg or float("nan") for name in estimators]
+        drives = [_laden(drive) for drive in drives]
+    errors = pooled_statistics(evaluate(drives, estimators))
+    return [errors[name].rmse_deg or float("nan") for name in estimators]
 
 
-def _laden(run: EvaluatedScenario, drive: EvaluatedDrive) -> EvaluatedScenario:
+def _laden(drive: TestDrive) -> TestDrive:
     turned = drive.scenario.car.body.reference_m * drive.signals["yaw_rate_rad_s"]
     turned = turned / np.maximum(drive.vx_mps, 1.0)
-    return replace(run, truth_rad=np.arctan(np.tan(run.truth_rad) - turned))
+    return replace(drive, vy_mps=drive.vy_mps - drive.vx_mps * turned)
 
 
 def print_nights(version: ModelVersion, seed: int) -> None:

@@ -29,7 +29,7 @@ from benchmarks.rivals.learners import (
     one_thread,
 )
 from benchmarks.rivals.tree_filter import fit_tree_filter
-from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
@@ -37,7 +37,7 @@ from fleet_slip.evaluation.filters import (
     PublishedEstimate,
     TuningDrives,
 )
-from fleet_slip.evaluation.judge import Estimate, evaluate_drive
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
@@ -67,7 +67,7 @@ T = TypeVar("T")
 class Rival(NamedTuple):
     """What was trained, and what is known of it beside its errors on test drives."""
 
-    estimate: Estimate
+    estimate: Estimator[TestDrive]
     size_bytes: int | None = None
     training_s: float | None = None
     each_us: float | None = None
@@ -115,13 +115,13 @@ def train(
     if not (wanted(FILTER.name) or wanted(TREE)):
         return
     car = load_scenario("nominal").car
-    drives = TuningDrives.of(fleet.warehouse, cohort, weighed=False)
+    drives = TuningDrives.of(fleet.warehouse, cohort, with_mass=False)
     with ThreadPoolExecutor(1) as executor:
-        best, took_s = timed(partial(FILTER.tune, drives.read(), car, executor))
-        estimate = FilterEstimate(FILTER, best.parameters, car)
+        best, took_s = timed(partial(FILTER.tune, drives.drives, car, executor))
+        estimate = FilterEstimate(FILTER, best.parameters)
         yield FILTER.name, Rival(estimate, training_s=took_s)
         if wanted(TREE):
-            tree, took_s = timed(partial(fit_tree_filter, estimate, drives.read(), executor))
+            tree, took_s = timed(partial(fit_tree_filter, estimate, car, drives.drives, executor))
             yield TREE, Rival(tree, tree.size_bytes, took_s)
 
 
@@ -150,8 +150,8 @@ def main() -> None:
         for name, (estimate, *costs) in train(
             fleet, manifest, given.rows, lambda name: not given.rivals or name in asked
         ):
-            runs = [evaluate_drive(drive, {name: estimate}) for drive in drives]
-            show(name, *costs, *(run.results[name].whole.rmse_deg for run in runs))
+            runs = evaluate(drives, {name: estimate})
+            show(name, *costs, *(run.statistics[name].rmse_deg for run in runs))
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation.drives import EvaluatedDrive
-from fleet_slip.evaluation.judge import ErrorFigures, Signals, error_figures
+from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
+from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.compute import read_drives
 from fleet_slip.grams.expansion import CarCounts
@@ -92,20 +92,21 @@ class Inputs:
 
 @dataclass(frozen=True)
 class LearnedEstimate:
-    """A fitted learner with its inputs, in a car that knows its `facts`."""
+    """A fitted learner with its inputs."""
 
     inputs: Inputs
     fitted: FittedLearner
-    facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def in_drive(self, drive: EvaluatedDrive) -> "LearnedEstimate":
-        """Return the estimator in the car of a drive."""
-        return replace(self, facts=drive.facts)
-
-    def __call__(self, signals: Signals) -> FloatArray:
+    def __call__(self, drive: TestDrive) -> FloatArray:
         """Estimate side-slip in rad at every tick; NaN where an input is missing."""
+        return self.estimate(drive.signals, drive.vehicle_attributes)
+
+    def estimate(
+        self, signals: Mapping[str, FloatArray], attributes: Mapping[str, Any]
+    ) -> FloatArray:
+        """Estimate side-slip from signals by SI column and attributes of the vehicle."""
         plan = self.inputs.plan
-        inputs = self.inputs.values(as_counts(signals, plan.signals, self.facts))
+        inputs = self.inputs.values(as_counts(signals, plan.signals, attributes))
         complete = np.isfinite(inputs).all(axis=1)
         estimates = np.full(len(inputs), np.nan)
         if complete.any():
@@ -135,7 +136,7 @@ class RowSample:
         """Divide the rows as the regression's cross-validation divides the drives."""
         return assign_folds(self.trip.tolist(), "drive", 5)
 
-    def cross_validated(self, fit: Fit, names: tuple[str, ...]) -> ErrorFigures:
+    def cross_validated(self, fit: Fit, names: tuple[str, ...]) -> ErrorStatistics:
         """Return the figures of a learner on rows that each fold's fit has not seen."""
         inputs, folds = self.of(names), self.folds()
         estimates = np.full(len(inputs), np.nan)
@@ -143,7 +144,7 @@ class RowSample:
             test = folds.fold == fold
             fitted = fit(inputs[~test], self.sideslip_rad[~test], self.trip[~test])
             estimates[test] = fitted.predict(inputs[test])
-        return error_figures(estimates, self.sideslip_rad, np.ones(len(inputs), dtype=np.bool_))
+        return error_statistics(estimates, self.sideslip_rad, np.ones(len(inputs), dtype=np.bool_))
 
 
 def draw_sample(

@@ -21,11 +21,9 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.belief import belief_of
-from fleet_slip.evaluation.drives import EvaluatedDrive
-from fleet_slip.evaluation.filters import FilterEstimate, seen
+from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
+from fleet_slip.evaluation.gaussian_state import independent_state
 from fleet_slip.evaluation.identify import tune
-from fleet_slip.evaluation.judge import Signals
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     Axles,
@@ -36,6 +34,7 @@ from fleet_slip.evaluation.single_track import (
     measured_speed_mps,
     sideslip_angle,
 )
+from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6
@@ -65,9 +64,9 @@ class LeafNoise(Config):
 @kernel
 def _filter(given: ekf.Inputs, factors: FloatArray) -> FloatArray:
     """Return vx and vy as `ekf` does, the model's variances of each row times a factor."""
-    ax, ay, yaw_rate, vx, steer, loaded, mean, spread, c, v = given
+    ax, ay, yaw_rate, vx, steer, loaded, mean, first_variances, c, v = given
     found = np.empty((2, len(ax)))
-    x = belief_of(mean, spread)
+    x = independent_state(mean, first_variances)
     for k in range(len(ax)):
         axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
         if k > 0:
@@ -100,13 +99,9 @@ class TreeFilter:
     leaves: IntArray
     noise: LeafNoise
 
-    def in_drive(self, drive: EvaluatedDrive) -> "TreeFilter":
-        """Return the filter in the car of a drive."""
-        return replace(self, base=self.base.in_drive(drive))
-
-    def __call__(self, signals: Signals) -> FloatArray:
+    def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick."""
-        return self.estimate(seen(signals), self.base.car, self.noise)
+        return self.estimate(drive_signals(drive), self.base.car(drive), self.noise)
 
     def leaf(self, drive: DriveSignals, car: VehicleParameters) -> IntArray:
         """Return the number of the leaf of each row, shape (rows,)."""
@@ -126,10 +121,13 @@ class TreeFilter:
 
 
 def fit_tree_filter(
-    base: FilterEstimate, drives: Sequence[LabelledDrive], executor: Executor
+    base: FilterEstimate,
+    default_car: VehicleParameters,
+    drives: Sequence[LabelledDrive],
+    executor: Executor,
 ) -> TreeFilter:
     """Fit the tree to the filter's squared errors, and the leaves' factors."""
-    cars = [drive.car or base.car for drive in drives]
+    cars = [drive.car or default_car for drive in drives]
     pairs = list(zip(drives, cars, strict=True))
     seen_kinds = np.concatenate([kinds(drive.signals, car) for drive, car in pairs])
     parameters = ekf.EkfNoise.model_validate(base.parameters.model_dump())
@@ -144,5 +142,5 @@ def fit_tree_filter(
     leaves = np.flatnonzero(tree.tree_.children_left < 0)
     start = TreeFilter(base, tree, leaves, LeafNoise())
     names = [f"leaf_{number}" for number in range(len(leaves))]
-    found = tune(start.estimate, start.noise, names, drives, base.car, executor)
+    found = tune(start.estimate, start.noise, names, drives, default_car, executor)
     return replace(start, noise=found.parameters)

@@ -128,9 +128,9 @@ class FleetCohort(Rooted):
         from fleet_slip.evaluation.identify import identify_held_out, measured_car
 
         car = measured_car(name, measured)
-        chosen = TuningDrives.of(self.warehouse, self._load(PLAIN), weighed=False)
+        chosen = TuningDrives.of(self.warehouse, self._load(PLAIN), with_mass=False)
         with open_workers(self.root, threads) as executor:
-            return identify_held_out(car, chosen.read(), executor)
+            return identify_held_out(car, chosen.drives, executor)
 
     def _load(self, feature_set: str) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort

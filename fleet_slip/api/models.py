@@ -29,8 +29,8 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.evaluation.evaluate import Evaluation
-    from fleet_slip.evaluation.report import Written
+    from fleet_slip.evaluation.evaluation_document import Evaluation
+    from fleet_slip.evaluation.report import WrittenReport
     from fleet_slip.export.stepping import Estimator
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
@@ -315,8 +315,9 @@ class JudgedModels(PublishedModels):
         invalid scenario, `RefusedError` for one that changed since it was simulated, `DataError`,
         and what `model` raises.
         """
-        from fleet_slip.evaluation.drives import simulate_scenarios
-        from fleet_slip.evaluation.evaluate import evaluate, evaluations_of, keep
+        from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
+        from fleet_slip.evaluation.scenario_evaluation import evaluate_scenarios
+        from fleet_slip.evaluation.test_drives import simulate_scenarios
         from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
 
         chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
@@ -324,8 +325,8 @@ class JudgedModels(PublishedModels):
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
             simulate_scenarios(self.warehouse, chosen, executor, told)
-            content = evaluate(self.warehouse, chosen, first, rest, executor)
-        return keep(evaluations_of(self.warehouse), content)
+            content = evaluate_scenarios(self.warehouse, chosen, first, rest, executor)
+        return store_evaluation(evaluations_of(self.warehouse), content)
 
     @record_call
     def evaluate_measured(
@@ -349,9 +350,9 @@ class JudgedModels(PublishedModels):
         `DataError` without a label, `ConfigError` for an unknown car, `UsageError` for one that no
         car can be, and what `model` raises.
         """
-        from fleet_slip.evaluation.evaluate import evaluations_of, keep
+        from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
         from fleet_slip.evaluation.identify import Measured, measured_car
-        from fleet_slip.evaluation.measured import evaluate_measured
+        from fleet_slip.evaluation.measured_evaluation import evaluate_measured
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = [self.model(one) for one in (model, *others)]
@@ -362,7 +363,7 @@ class JudgedModels(PublishedModels):
             car = measured_car("measured", measured)
         with open_workers(self.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
-        return keep(evaluations_of(self.warehouse, "measured"), content)
+        return store_evaluation(evaluations_of(self.warehouse, "measured"), content)
 
     def evaluate_blind(
         self,
@@ -377,17 +378,18 @@ class JudgedModels(PublishedModels):
         published (`configs/blind.toml`). Nothing is written. Returns a document as `evaluate`
         does: over all drives, by class of road, by weather and by drive. Raises as `evaluate`.
         """
-        from fleet_slip.evaluation.evaluate import evaluate_blindly
+        from fleet_slip.evaluation.evaluation_document import Evaluation
+        from fleet_slip.evaluation.scenario_evaluation import evaluate_blind
 
         first, *rest = [self.model(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
-            return evaluate_blindly(self.warehouse, first, rest, executor)
+            return Evaluation(evaluate_blind(self.warehouse, first, rest, executor))
 
     def report(
         self,
         model: Annotated[str | ModelVersion | None, MODEL] = None,
         output: Annotated[Path | None, Doc("Folder. Default: report/ in the data root.")] = None,
-    ) -> "Written":
+    ) -> "WrittenReport":
         """Write a page that compares the latest evaluation with the paper's figures.
 
         Raises `DataError` without an

@@ -19,7 +19,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import Identified
-    from fleet_slip.evaluation.report import Written
+    from fleet_slip.evaluation.report import WrittenReport
 
 
 @command(Fleet.score, arguments=["model"])
@@ -141,7 +141,7 @@ def identify(
 
 
 @command(Fleet.report, arguments=["model"])
-def report(written: "Written") -> None:
+def report(written: "WrittenReport") -> None:
     """Write a page that compares the latest evaluation with the paper's figures.
 
     The page needs nothing but itself; the same figures stand beside it as SVG and PNG files.

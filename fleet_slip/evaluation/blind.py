@@ -1,8 +1,7 @@
-"""The blind set: test drives that nobody can look at before a model is published.
+"""The blind set: test drives that cannot be drawn before a model is published.
 
-Roads, cars, loads, tyres, weather, drivers and noise are drawn from the hash of the version that is
-judged (`configs/blind.toml` says from what). The drives are simulated for the judgement and kept
-nowhere: whoever has the version draws them again.
+Roads, cars, loads, tyres, weather, drivers and noise are drawn from the hash of the version under
+test, by `configs/blind.toml`. The drives are simulated for each evaluation and not stored.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,8 +13,8 @@ from pydantic import Field, model_validator
 
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
-from fleet_slip.evaluation.drives import simulate_drives
-from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge
+from fleet_slip.evaluation.evaluator import Estimator, EvaluatedDrive, evaluate, pooled_statistics
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.resources import config_file
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
@@ -25,7 +24,7 @@ from fleet_slip.simulation.scenario import Scenario
 
 
 class Weather(Config):
-    """Adhesion of the road, and how much of it a driver uses who sees it."""
+    """Adhesion of the road, and the share of it that drivers use."""
 
     adhesion: Uniform
     friction_use: Uniform
@@ -33,10 +32,10 @@ class Weather(Config):
 
 
 class BlindSet(Config):
-    """From what blind drives are drawn: each road once in every weather."""
+    """Distributions of blind drives; each road is driven once in every weather."""
 
     campaign: Annotated[Campaign, load_by_name(load_campaign)]
-    """Whose cars, tyres, sensors and surfaces of roads are drawn."""
+    """Campaign of the cars, tyres, sensors and road surfaces."""
     roads: tuple[Identifier, ...] = Field(min_length=1)
     """The class of each road."""
     weather: dict[Identifier, Weather] = Field(min_length=1)
@@ -45,12 +44,12 @@ class BlindSet(Config):
     tyre_stiffness: Uniform
     """Of a new tyre, over that of the vehicle's file."""
     tyre_wear_days: NotNegative
-    """Tyres have been driven for up to so many days."""
+    """Maximum age of the tyres."""
     drivers: Drivers
 
     @property
     def _fleet(self) -> tuple[FleetPlan, ImperfectionRanges]:
-        """The plan of the campaign's cars, and what is imperfect about them."""
+        """The plan of the campaign's cars, and their imperfections."""
         plan = self.campaign.plan
         if not isinstance(plan, FleetPlan) or plan.imperfections is None:
             raise ValueError(
@@ -59,10 +58,10 @@ class BlindSet(Config):
         return plan, plan.imperfections
 
     @model_validator(mode="after")
-    def _is_known(self) -> Self:
+    def _is_valid(self) -> Self:
         _ = self._fleet
-        if strange := [kind for kind in self.roads if kind not in CLASSES]:
-            raise ValueError(f"{strange[0]!r} is not a class of roads: {', '.join(CLASSES)}")
+        if unknown := [kind for kind in self.roads if kind not in CLASSES]:
+            raise ValueError(f"{unknown[0]!r} is not a class of roads: {', '.join(CLASSES)}")
         return self
 
     def scenarios(self, seed: int) -> tuple[Scenario, ...]:
@@ -76,57 +75,60 @@ class BlindSet(Config):
     def _scenario(self, seed: int, number: int, kind: str, weather: str) -> Scenario:
         plan, flaws = self._fleet
         name = f"{kind}_{number}_{weather}"
-        of_drive = random_generator(seed, "blind", name)
+        generator = random_generator(seed, "blind", name)
         road = draw_road(kind, seed + number)
-        adhesion = self.weather[weather].adhesion.draw(of_drive)
-        use = self.weather[weather].friction_use.draw(of_drive)
-        vehicle = plan.vehicles[of_drive.integers(len(plan.vehicles))]
-        days = round(of_drive.uniform(0, self.tyre_wear_days))
-        stiffer, smaller = flaws.wear(of_drive, days)
+        adhesion = self.weather[weather].adhesion.draw(generator)
+        use = self.weather[weather].friction_use.draw(generator)
+        vehicle = plan.vehicles[generator.integers(len(plan.vehicles))]
+        days = round(generator.uniform(0, self.tyre_wear_days))
+        stiffer, smaller = flaws.wear(generator, days)
         content = {
             "name": name,
             "description": f"A {kind} road, {weather}",
             "vehicle": vehicle,
-            "sprung_mass_kg": vehicle.body.sprung_mass_kg + self.load_kg.draw(of_drive),
-            "load_position_m": self.load_position_m.draw(of_drive),
-            "tyre_stiffness": self.tyre_stiffness.draw(of_drive) * stiffer,
-            "tyre_radius": plan.tyre_radius.draw(of_drive) * smaller,
-            "track": self.drivers.line(road, kind, of_drive),
+            "sprung_mass_kg": vehicle.body.sprung_mass_kg + self.load_kg.draw(generator),
+            "load_position_m": self.load_position_m.draw(generator),
+            "tyre_stiffness": self.tyre_stiffness.draw(generator) * stiffer,
+            "tyre_radius": plan.tyre_radius.draw(generator) * smaller,
+            "track": self.drivers.line(road, kind, generator),
             "adhesion": adhesion,
-            "limits": self.drivers.limits(kind, adhesion, use, of_drive),
+            "limits": self.drivers.limits(kind, adhesion, use, generator),
             "laps": 1,
             "seed": seed,
-            "sensors": plan.sensor_bias_std.draw(self.campaign.sensors, of_drive),
-            "imperfections": flaws.draw(of_drive, of_drive),
+            "sensors": plan.sensor_bias_std.draw(self.campaign.sensors, generator),
+            "imperfections": flaws.draw(generator, generator),
         }
         return Scenario.model_validate(content)
 
 
 def blind_scenarios(sha256: str) -> tuple[Scenario, ...]:
-    """Return the drives that the model version with this hash is judged on."""
+    """Draw the blind drives of the model version with this hash."""
     return load_config(config_file("blind.toml"), BlindSet).scenarios(int(sha256[:15], 16))
 
 
-def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> list[dict[str, Any]]:
-    """Judge estimators on the drives that belong to a model version.
+def evaluate_blind_drives(
+    sha256: str, estimators: Mapping[str, Estimator[TestDrive]]
+) -> list[dict[str, Any]]:
+    """Evaluate estimators on the blind drives of a model version.
 
     Returns `results` by estimator over all drives together, then by class of road, by weather and
-    by drive. The truth is the simulator's own, not what a log would keep of it.
+    by drive. The reference is the simulator's own, not quantised as in a log.
     """
-    runs = [evaluate_drive(one, estimators) for one in simulate_drives(blind_scenarios(sha256))]
-    groups = {"all": runs}
-    for place in (0, -1):
+    runs = evaluate(simulate_drives(blind_scenarios(sha256)), estimators)
+    groups = {"all": list(runs)}
+    for word in (0, -1):
         for run in runs:
-            groups.setdefault(run.name.split("_")[place], []).append(run)
+            groups.setdefault(run.name.split("_")[word], []).append(run)
     groups |= {run.name: [run] for run in runs}
-    return [_group(name, some) for name, some in groups.items()]
+    return [_group_document(name, group) for name, group in groups.items()]
 
 
-def _group(name: str, runs: Sequence[EvaluatedScenario]) -> dict[str, Any]:
-    truth = np.concatenate([run.truth_rad[run.evaluated] for run in runs])
+def _group_document(name: str, runs: Sequence[EvaluatedDrive[TestDrive]]) -> dict[str, Any]:
+    truth = np.concatenate([run.drive.sideslip_rad[run.rows] for run in runs])
+    errors = pooled_statistics(runs)
     return {
         "name": name,
         "drives": len(runs),
         "sideslip_std_deg": float(np.degrees(truth.std())),
-        "results": {name: asdict(found) for name, found in judge(runs).items()},
+        "results": {estimator: asdict(statistics) for estimator, statistics in errors.items()},
     }

@@ -9,16 +9,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.evaluation.drives import EvaluatedDrive, find_stretches
-from fleet_slip.evaluation.judge import EvaluatedScenario
-from fleet_slip.evaluation.kept import DRAWN_FILTERS, ReportData
+from fleet_slip.evaluation.evaluator import EvaluatedDrive
+from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData
+from fleet_slip.evaluation.test_drives import Section, TestDrive, find_stretches
 from fleet_slip.pages.drawing import BINS, WIDTH_IN, Picture, colour
 from fleet_slip.pages.page import degrees, listed, number
 
 
 @dataclass(frozen=True)
 class Band:
-    """Middle x, mean, least and largest value of equal bins, shape (bins,); NaN without any."""
+    """Middle x, mean, smallest and largest value of equal bins, shape (bins,); NaN without any."""
 
     x: FloatArray
     mean: FloatArray
@@ -27,7 +27,7 @@ class Band:
 
 
 def band(x: FloatArray, y: FloatArray, bins: int) -> Band:
-    """Cut a series, shape (rows,), into at most so many bins. NaN stands for no value."""
+    """Cut a series, shape (rows,), into at most `bins` bins. NaN is a missing value."""
     size = max(1, -(-len(x) // bins))
     count = -(-len(x) // size)
     padded = np.full((2, count * size), np.nan)
@@ -54,7 +54,7 @@ SPEED_IN = 2.0
 KMH_PER_MPS = 3.6
 REACHES_DEG = (0.2, 0.4, 0.6, 1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 90.0, 180.0, 360.0)
 COMPARABLE = 3
-"""Largest ratio of scales at which the smaller one is given up."""
+"""Largest ratio of scales at which blocks share the larger one."""
 
 
 class Line(NamedTuple):
@@ -69,16 +69,22 @@ class Line(NamedTuple):
 class DriveBlock:
     """One drive in a figure.
 
-    Attributes:
-        title: what is special about the drive.
-        run: the drive with its estimates.
-        lines: drawn with the true angle; each also has a strip with its difference.
-        strips: more estimators, of which the difference alone is drawn.
-        shaded: name of the section to mark.
+    Attributes
+    ----------
+    title
+        Property in which the drive differs from others.
+    run
+        The drive with its estimates.
+    lines
+        Estimators drawn with the true angle; each also has a strip with its difference.
+    strips
+        Estimators of which the difference alone is drawn.
+    shaded
+        Name of the section to mark.
     """
 
     title: str
-    run: EvaluatedScenario
+    run: EvaluatedDrive[TestDrive]
     lines: tuple[Line, ...]
     strips: tuple[Line, ...] = ()
     shaded: str | None = None
@@ -95,6 +101,12 @@ class DriveBlock:
         return HEAD_IN + ANGLE_IN + strips_in + FOOT_IN
 
     @property
+    def section(self) -> Section | None:
+        """The section to mark, if the drive has it."""
+        sections = (each for each in self.run.drive.sections if each.name == self.shaded)
+        return next(sections, None)
+
+    @property
     def truth_deg(self) -> FloatArray:
         """The true angle, shape (ticks,)."""
         return np.degrees(self.run.drive.sideslip_rad)
@@ -102,7 +114,7 @@ class DriveBlock:
     def estimate_deg(self, line: Line) -> FloatArray:
         """Return an estimate, shape (ticks,); NaN where the drive is not evaluated."""
         estimate = np.degrees(self.run.estimates[line.estimator])
-        return np.where(self.run.drive.evaluated, estimate, np.nan)
+        return np.where(self.run.rows, estimate, np.nan)
 
 
 def side_slip(blocks: Sequence[DriveBlock]) -> Figure:
@@ -118,17 +130,20 @@ def side_slip(blocks: Sequence[DriveBlock]) -> Figure:
 def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float) -> None:
     angle, *strips = _panels(figure, block, top_in)
     time_s, tone = block.run.drive.time_s, "unstable" if block.shaded == "unstable" else "outage"
-    marked = [one for one in block.run.sections if one.name == block.shaded]
+    section = block.section
+    stretches = find_stretches(block.run.drive, section.rows) if section else ()
     for axes in (angle, *strips):
         axes.set_xlim(time_s[0], time_s[-1])
-        for one in (s for m in marked for s in find_stretches(block.run.drive, m.rows)):
-            axes.axvspan(one.from_s, one.until_s, color=colour(tone), alpha=0.16, linewidth=0)
+        for stretch in stretches:
+            axes.axvspan(
+                stretch.from_s, stretch.until_s, color=colour(tone), alpha=0.16, linewidth=0
+            )
     for line in block.lines:
         _plot(angle, time_s, block.estimate_deg(line), line)
     truth = band(time_s, block.truth_deg, BINS)
     angle.plot(truth.x, truth.mean, color=colour("truth"), linewidth=1.1)
     names = [("true", "truth"), *((line.label, line.colour) for line in block.lines)]
-    if marked:
+    if section:
         names.append(("unstable" if tone == "unstable" else "no GPS", tone))
     _legend(figure, block.title, names, top_in)
     angle.set_ylabel("side-slip angle (deg)", labelpad=2)
@@ -160,7 +175,7 @@ def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line) -> None:
 
 
 def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
-    """Return the half-height of each block's strips: the same for all where that can be read."""
+    """Return the half-height of each block's strips: the same for all if it is readable."""
     reaches = []
     for block in blocks:
         sizes = [np.abs(block.estimate_deg(line) - block.truth_deg) for line in block.all_strips]
@@ -171,7 +186,7 @@ def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
 
 
 def _legend(figure: Figure, title: str, names: Sequence[tuple[str, str]], top_in: float) -> None:
-    """Write the title, and beneath it the name of each line in its colour."""
+    """Write the title, and below it the name of each line in its colour."""
     width, height = figure.get_size_inches()
     left = LEFT_IN
     figure.text(left / width, (top_in - 0.05) / height, title, fontweight="bold", va="top")
@@ -184,10 +199,10 @@ def _legend(figure: Figure, title: str, names: Sequence[tuple[str, str]], top_in
 
 
 def _caption(axes: Axes, block: DriveBlock, line: Line) -> None:
-    figures = block.run.results[line.estimator].whole
+    errors = block.run.statistics[line.estimator]
     text = f"{line.label} \N{MINUS SIGN} true"
-    if figures.error_std_deg is not None and figures.error_mean_deg is not None:
-        std, mean = degrees(figures.error_std_deg), degrees(figures.error_mean_deg, sign=True)
+    if errors.error_std_deg is not None and errors.error_mean_deg is not None:
+        std, mean = degrees(errors.error_std_deg), degrees(errors.error_mean_deg, sign=True)
         text += f": std {std}, mean {mean}"
     axes.text(
         0.0,
@@ -201,7 +216,7 @@ def _caption(axes: Axes, block: DriveBlock, line: Line) -> None:
     )
 
 
-def speed(drive: EvaluatedDrive) -> Figure:
+def speed(drive: TestDrive) -> Figure:
     """Draw the true speed of a drive."""
     figure = Figure(figsize=(WIDTH_IN, SPEED_IN))
     kmh = drive.speed_mps * KMH_PER_MPS
@@ -219,11 +234,10 @@ def speed(drive: EvaluatedDrive) -> Figure:
 FILTER_LABELS = {"kalman": "Kalman filter", "kalman_tuned": "Kalman filter, tuned"}
 
 
-class Drives(NamedTuple):
+class PaperFigure(NamedTuple):
     """A figure of the paper: its key and title, and the title of each drive in it by scenario.
 
-    `models` of Table I are drawn, by default the one that the paper settles on; the section
-    `shaded` is marked.
+    `models` of Table I are drawn, by default the paper's choice; the section `shaded` is marked.
     """
 
     key: str
@@ -235,27 +249,27 @@ class Drives(NamedTuple):
 
 TEST_DRIVE = "side-slip angle on the test drive"
 FIGURES = (
-    Drives("figure-1a", f"Figure 1(a). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("1", "2")),
-    Drives("figure-1b", f"Figure 1(b). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("3", "4", "5")),
-    Drives("figure-2", "Figure 2. Speed during the test drive", {"nominal": ""}),
-    Drives(
+    PaperFigure("figure-1a", f"Figure 1(a). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("1", "2")),
+    PaperFigure("figure-1b", f"Figure 1(b). {{}}: {TEST_DRIVE}", {"nominal": ""}, ("3", "4", "5")),
+    PaperFigure("figure-2", "Figure 2. Speed during the test drive", {"nominal": ""}),
+    PaperFigure(
         "figure-3",
         "Figure 3. Effect of increased noise",
         {"nominal": "Initial noise", "noise_doubled": "Bias and noise doubled"},
     ),
-    Drives(
+    PaperFigure(
         "figure-4",
         "Figure 4. Effect of the car's mass",
         {"mass_1000": "Sprung mass 1000 kg", "mass_1740": "Sprung mass 1740 kg"},
     ),
-    Drives(
+    PaperFigure(
         "figure-5",
         "Figure 5. Effect of the adhesion coefficient",
         {"adhesion_0_7": "Adhesion 0.7", "adhesion_0_4": "Adhesion 0.4"},
         shaded="unstable",
     ),
-    Drives("figure-6", "Figure 6. Speed on the Melbourne circuit", {"melbourne": ""}),
-    Drives(
+    PaperFigure("figure-6", "Figure 6. Speed on the Melbourne circuit", {"melbourne": ""}),
+    PaperFigure(
         "figure-7",
         "Figure 7. Side-slip angle on the Melbourne circuit",
         {"melbourne": "Melbourne Grand Prix Circuit"},
@@ -263,29 +277,29 @@ FIGURES = (
 )
 SPEEDS = ("figure-2", "figure-6")
 OUTAGES = {"nominal": "Nominal drive", "gps_tunnel": "A tunnel of 20 s"}
-DRAWN_SCENARIOS = frozenset(OUTAGES).union(*(one.drives for one in FIGURES))
+DRAWN_SCENARIOS = frozenset(OUTAGES).union(*(figure.drives for figure in FIGURES))
 
 
 def draw_pictures(data: ReportData) -> Iterator[Picture]:
-    """Yield the figures whose drives were evaluated, and whose models could be trained."""
+    """Yield the figures whose drives were evaluated and whose models were trained."""
     choice, runs = model_line(data, data.choice_number), data.runs
-    for one in FIGURES:
-        if not all(name in runs for name in one.drives):
+    for figure in FIGURES:
+        if not all(name in runs for name in figure.drives):
             continue
-        if one.key in SPEEDS:
-            yield _speed(one, *(runs[name].drive for name in one.drives))
+        if figure.key in SPEEDS:
+            yield _speed(figure, *(runs[name].drive for name in figure.drives))
             continue
         lines: tuple[Line, ...] = (choice,)
-        title, titles = one.title, one.drives
-        if one.models:
-            lines = tuple(model_line(data, n) for n in one.models if n in data.evaluated.models)
+        title, titles = figure.title, figure.drives
+        if figure.models:
+            lines = tuple(model_line(data, n) for n in figure.models if n in data.evaluated.models)
             names = listed([line.label for line in lines])
             title, titles = title.format(names), {"nominal": f"Nominal drive, {names}"}
         if lines:
             yield _series(
-                one.key,
+                figure.key,
                 title,
-                [DriveBlock(t, runs[name], lines, (), one.shaded) for name, t in titles.items()],
+                [DriveBlock(t, runs[name], lines, (), figure.shaded) for name, t in titles.items()],
             )
     filters = [name for name in DRAWN_FILTERS if name in data.evaluated.estimators]
     if filters and "nominal" in runs:
@@ -299,44 +313,45 @@ def draw_pictures(data: ReportData) -> Iterator[Picture]:
 
 
 def model_line(data: ReportData, model: str) -> Line:
-    """Return how a model of Table I is drawn."""
+    """Return the line of a model of Table I."""
     return Line(data.evaluated.models[model], f"Model {model}", f"model_{model}")
 
 
 def _series(key: str, title: str, blocks: Sequence[DriveBlock]) -> Picture:
-    found = " ".join(sentence for block in blocks for sentence in _found(block, len(blocks) > 1))
-    seen = (
+    caption = " ".join(text for block in blocks for text in _results(block, len(blocks) > 1))
+    description = (
         "Lines over time of the true angle and of the estimates, and beneath them the differences."
     )
-    return Picture(key, title, found, seen, lambda: side_slip(blocks))
+    return Picture(key, title, caption, description, lambda: side_slip(blocks))
 
 
-def _found(block: DriveBlock, named: bool) -> Iterator[str]:
-    errors = []
+def _results(block: DriveBlock, named: bool) -> Iterator[str]:
+    """Yield the sentences of a caption about the errors in a block."""
+    texts = []
     for line in block.all_strips:
-        figures = block.run.results[line.estimator].whole
-        std, mean = degrees(figures.error_std_deg), degrees(figures.error_mean_deg, sign=True)
-        errors.append(f"{line.label} {std} ({mean})")
+        errors = block.run.statistics[line.estimator]
+        std, mean = degrees(errors.error_std_deg), degrees(errors.error_mean_deg, sign=True)
+        texts.append(f"{line.label} {std} ({mean})")
     place = f"{block.title}: standard" if named else "Standard"
-    yield f"{place} deviation (mean) of the error: {', '.join(errors)}."
+    yield f"{place} deviation (mean) of the error: {', '.join(texts)}."
     if block.shaded != "unstable":
         return
-    result = block.run.results[block.lines[0].estimator]
-    if "unstable" not in result.inside:
+    if block.section is None:
         yield "The car is stable throughout."
         return
-    inside, outside = result.inside["unstable"], result.outside["unstable"]
+    estimator, rows = block.lines[0].estimator, block.section.rows
+    inside, outside = (block.run.within(r).statistics[estimator] for r in (rows, ~rows))
     yield (
         f"Where the car is unstable (shaded) it is {degrees(inside.error_std_deg)}, elsewhere "
         f"{degrees(outside.error_std_deg)} with a correlation of {number(outside.correlation)}."
     )
 
 
-def _speed(one: Drives, drive: EvaluatedDrive) -> Picture:
+def _speed(figure: PaperFigure, drive: TestDrive) -> Picture:
     kmh = drive.speed_mps * KMH_PER_MPS
     caption = (
         f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {drive.time_s[-1]:.0f} s, over "
         f"{drive.scenario.track.length_m / 1000:.2f} km."
     )
-    seen = "A line of speed over time."
-    return Picture(one.key, one.title, caption, seen, lambda: speed(drive))
+    description = "A line of speed over time."
+    return Picture(figure.key, figure.title, caption, description, lambda: speed(drive))

@@ -11,9 +11,9 @@ correct it. With the lateral forces F of the axles:
     ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
     ḃ  = 0
 
-The gyroscope's bias is a state of the yaw rate filter (`belief`) before it. A drive may begin in
-a bend: at first the rear wheels are taken to roll without slip, vy = b r. From vy = 0 the rear
-tyres would slide there, where their force has no slope that leads back.
+The bias of the gyroscope is a state of the filter before it, `yaw_rate_filter`. A drive may begin
+in a bend: at first the rear wheels roll without slip, vy = b r. From vy = 0 the rear tyres would
+slide there, where their force has no slope that leads back.
 """
 
 from dataclasses import replace
@@ -25,8 +25,14 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.evaluation import belief
-from fleet_slip.evaluation.belief import Belief, Row, YawRateNoise, belief_of, condition, spread
+from fleet_slip.evaluation import yaw_rate_filter
+from fleet_slip.evaluation.gaussian_state import (
+    GaussianState,
+    Row,
+    independent_state,
+    measurement_update,
+    predict_covariance,
+)
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     Axles,
@@ -39,6 +45,7 @@ from fleet_slip.evaluation.single_track import (
     rates,
     sideslip_angle,
 )
+from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD = (1.0, 1.0, 0.1)
@@ -46,19 +53,18 @@ INITIAL_STD = (1.0, 1.0, 0.1)
 
 
 class SensorErrors(Config):
-    """How a car's steering and lateral acceleration are off."""
+    """Gain and offset errors of a car's steering and lateral acceleration."""
 
     steer_gain: FiniteFloat = Field(default=1.0, ge=0.5, le=2)
-    """Of the road wheels' angle: what is logged is often the steering wheel's over a ratio."""
+    """Of the road wheels' angle, which is often logged as the steering wheel's over a ratio."""
     steer_offset_rad: FiniteFloat = Field(default=0.0, ge=-0.2, le=0.2)
-    """Of the road wheels where the car goes straight on."""
+    """Of the road wheels when the car drives straight."""
     ay_gain: FiniteFloat = Field(default=1.0, ge=0.7, le=1.5)
-    """Of what is measured: in a bend the body rolls, which adds g times an angle that grows with
-    the acceleration."""
+    """In a bend the body rolls, which adds g times an angle that grows with the acceleration."""
     ay_offset_mps2: FiniteFloat = Field(default=0.0, ge=-2, le=2)
 
     def corrected(self, drive: DriveSignals, car: VehicleParameters) -> DriveSignals:
-        """Return what exact sensors would say; road wheels from the steering wheel if need be."""
+        """Correct the signals of a drive; derive missing road wheels from the steering wheel."""
         left, right = drive.steer_fl_rad, drive.steer_fr_rad
         if not drive.has_road_wheels:
             left = right = drive.steering_wheel_rad / car.steering.ratio
@@ -71,7 +77,7 @@ class SensorErrors(Config):
 
 
 class EkfNoise(Config):
-    """Standard deviations: the paper's initial noise; how far the model errs is judgement."""
+    """Standard deviations: the paper's initial noise, and judgement for errors of the model."""
 
     ax_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
     lateral_model_std_mps2: FiniteFloat = Field(default=0.3, ge=0)
@@ -82,10 +88,10 @@ class EkfNoise(Config):
     ay_bias_std_mps2: FiniteFloat = Field(default=0.15, ge=0)
     """Of the accelerometer's bias before the drive; 0 leaves it out of the state."""
     stiffness_front_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
-    """Cornering stiffness of the front axle over what the car's parameters say."""
+    """Cornering stiffness of the front axle over that of the car's parameters."""
     stiffness_rear_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
     adhesion: FiniteFloat = Field(default=1.0, gt=0)
-    """What the filter knows of the road."""
+    """Adhesion of the road, as the filter assumes it."""
     yaw_rate: YawRateNoise = YawRateNoise()
     sensors: SensorErrors = SensorErrors()
 
@@ -99,7 +105,7 @@ TUNABLE = (
     "ay_bias_std_mps2",
     "stiffness_front_factor",
     "stiffness_rear_factor",
-    *belief.TUNABLE,
+    *yaw_rate_filter.TUNABLE,
 )
 """The parameters that `identify.tune` should search."""
 
@@ -117,9 +123,9 @@ class Variances(NamedTuple):
 
 @kernel
 def predict(
-    x: Belief, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
+    x: GaussianState, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
 ) -> None:
-    """Carry the belief one step on: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
+    """Time update: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
     vx, vy, r, _ = x.mean
     d = rates(vx, vy, r, steer, axles, c)
     x.mean[0] = vx + dt * (ax + r * vy)
@@ -131,12 +137,12 @@ def predict(
         (dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
-    spread(x, f, (v.q_vx, v.q_vy, v.q_r, 0.0))
+    predict_covariance(x, f, (v.q_vx, v.q_vy, v.q_r, 0.0))
 
 
 @kernel
 def update(
-    x: Belief,
+    x: GaussianState,
     vx: float,
     yaw_rate: float,
     ay: float,
@@ -145,15 +151,15 @@ def update(
     c: Chassis,
     v: Variances,
 ) -> None:
-    """Take in wheel speed, yaw rate and lateral acceleration, whose noises are independent."""
-    condition(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
-    condition(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
+    """Measurement update by wheel speed, yaw rate and lateral acceleration."""
+    measurement_update(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
+    measurement_update(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
     d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
-    condition(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
+    measurement_update(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
 
 
 class Inputs(NamedTuple):
-    """What the filter reads: measurements by row, what axles can do, how it begins, the car."""
+    """Inputs of the filter: measurements by row, `Axles` by row, initial state, car and noise."""
 
     ax_mps2: FloatArray
     ay_mps2: FloatArray
@@ -168,17 +174,17 @@ class Inputs(NamedTuple):
 
 
 @kernel
-def _filter(given: Inputs) -> FloatArray:
-    found = np.empty((2, len(given.ax_mps2)))
-    x, c, v = belief_of(given.first_mean, given.first_variances), given.chassis, given.variances
-    for k in range(len(given.ax_mps2)):
-        loaded, steer = given.axles[:, k], given.steer_rad[k]
+def _filter(u: Inputs) -> FloatArray:
+    velocities = np.empty((2, len(u.ax_mps2)))
+    x, c, v = independent_state(u.first_mean, u.first_variances), u.chassis, u.variances
+    for k in range(len(u.ax_mps2)):
+        loaded, steer = u.axles[:, k], u.steer_rad[k]
         axles = Axles(loaded[0], loaded[1], loaded[2], loaded[3])
         if k > 0:
-            predict(x, given.ax_mps2[k], steer, STEP_S, axles, c, v)
-        update(x, given.vx_mps[k], given.yaw_rate_rad_s[k], given.ay_mps2[k], steer, axles, c, v)
-        found[:, k] = x.mean[:2]
-    return found
+            predict(x, u.ax_mps2[k], steer, STEP_S, axles, c, v)
+        update(x, u.vx_mps[k], u.yaw_rate_rad_s[k], u.ay_mps2[k], steer, axles, c, v)
+        velocities[:, k] = x.mean[:2]
+    return velocities
 
 
 def variances(noise: EkfNoise) -> Variances:
@@ -194,7 +200,7 @@ def variances(noise: EkfNoise) -> Variances:
 
 
 def chassis(car: VehicleParameters) -> Chassis:
-    """Return what the filter knows of a car beside its tyres."""
+    """Return the chassis of a car."""
     body = car.body
     return Chassis(body.mass_kg, body.yaw_inertia_kgm2, body.front_axle_m, body.rear_axle_m)
 
@@ -216,19 +222,20 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Fl
 
 
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
-    """Return what the filter reads of a drive, gaps bridged. Raises `DataError`."""
+    """Return the inputs of the filter for a drive, gaps bridged. Raises `DataError`."""
     drive = noise.sensors.corrected(drive, car)
-    turning, _ = belief.estimate(drive, car, noise.yaw_rate)
+    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(drive, car, noise.yaw_rate)
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
     return Inputs(
         ax_mps2,
         ay_mps2,
-        turning,
+        yaw_rate_rad_s,
         vx_mps,
         measured_steer_rad(drive),
         axles_of(car, ax_mps2, ay_mps2, noise),
-        (vx_mps[0], car.body.rear_axle_m * turning[0], turning[0], 0.0),  # vy: rear wheels roll
+        # vy: the rear wheels roll without slip
+        (vx_mps[0], car.body.rear_axle_m * yaw_rate_rad_s[0], yaw_rate_rad_s[0], 0.0),
         (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
         chassis(car),
         variances(noise),

@@ -1,13 +1,14 @@
-"""The Kalman filters as rivals of the regression, as they are and tuned.
+"""Estimators that compete: models of Table I, published models, and Kalman filters.
 
-All know the sensors' stated noise, and the class of the car that they are in, by its file; they
-take the road for dry and the load for the usual one. `ekf_told` knows the very car and the road.
-The tuned ones have the parameters that suit drives which the regression was trained on best.
+All filters use the stated noise of the sensors and the file of the vehicle's class, and assume a
+dry road and the usual load. `ekf_told` uses the true vehicle and road. Tuned filters have the
+parameters with the smallest error on drives that the regression was trained on.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
-from fleet_slip.evaluation.drives import EvaluatedDrive
+from fleet_slip.evaluation.evaluator import Estimator
 from fleet_slip.evaluation.identify import (
     Identified,
     Measured,
@@ -28,13 +29,13 @@ from fleet_slip.evaluation.identify import (
     identify,
     tune,
 )
-from fleet_slip.evaluation.judge import Estimate, Signals
 from fleet_slip.evaluation.single_track import (
     DriveSignals,
     LabelledDrive,
     measured_speed_mps,
     read_drive,
 )
+from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
@@ -50,8 +51,8 @@ from fleet_slip.warehouse.tables import Warehouse
 TABLE_ONE = "table1"
 """The model list with the paper's five sets of signals."""
 
-Bank = dict[str, tuple[Estimate, dict[str, Any]]]
-"""Estimators by name, and what a document says of each."""
+EstimatorBank = dict[str, tuple[Estimator[TestDrive], dict[str, Any]]]
+"""Estimators by name, each with its description in a document."""
 
 
 @dataclass(frozen=True)
@@ -61,31 +62,23 @@ class LinearEstimate:
     intercept: float
     coefficients: Mapping[str, float]
 
-    def __call__(self, signals: Signals) -> FloatArray:
+    def __call__(self, drive: TestDrive) -> FloatArray:
         """Return intercept + sum of coefficient times signal."""
-        terms = [weight * signals[column] for column, weight in self.coefficients.items()]
+        terms = [weight * drive.signals[column] for column, weight in self.coefficients.items()]
         total: FloatArray = np.sum(terms, axis=0) + self.intercept
         return total
 
 
 @dataclass(frozen=True)
 class PublishedEstimate:
-    """A published model, sample by sample as a car drives.
-
-    It sees counts, as an ECU does: the columns are the integers that its Gram rows are made of.
-    `facts` are what the car knows of itself.
-    """
+    """A published model on counts, as on an ECU: the integers that its Gram rows are made of."""
 
     predictor: Predictor
-    facts: Mapping[str, Any] = field(default_factory=dict)
 
-    def in_drive(self, drive: EvaluatedDrive) -> "PublishedEstimate":
-        """Return the estimator in the car of a drive, which knows its facts."""
-        return replace(self, facts=drive.facts)
-
-    def __call__(self, signals: Signals) -> FloatArray:
-        """Return the estimate at each tick; there is one row for every tick."""
-        return self.predictor(as_counts(signals, self.predictor.plan.signals, self.facts))
+    def __call__(self, drive: TestDrive) -> FloatArray:
+        """Return the estimate at each tick."""
+        names = self.predictor.plan.signals
+        return self.predictor(as_counts(drive.signals, names, drive.vehicle_attributes))
 
 
 @dataclass(frozen=True)
@@ -97,49 +90,54 @@ class TrainedModels:
 
     @property
     def table_one(self) -> dict[str, str]:
-        """Return the estimator's name of each model of Table I that the cohort can serve."""
-        return {one.name: f"{self.version.reference}/{one.name}" for one in self.selection.models}
+        """Estimator names of the models of Table I whose signals the cohort has."""
+        return {row.name: f"{self.version.reference}/{row.name}" for row in self.selection.models}
 
-    def bank(self) -> Bank:
+    def bank(self) -> EstimatorBank:
         """Return the models of Table I, then the published one."""
         version, manifest = self.version, self.version.manifest
-        trained = {
+        common = {
             "kind": "regression",
             "group": version.reference,
             "cohort": self.selection.cohort.condition.text,
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }
-        bank: Bank = {}
+        bank: EstimatorBank = {}
         for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
-            weights = {catalogue()[name].column: one for name, one in model.model.weights.items()}
-            fitted = LinearEstimate(model.model.offset, weights)
-            about = {
-                **trained,
-                "table_one": model.name,
-                "signals": list(model.signals),
-                "cross_validated": model.pooled.as_dict(),
-                "intercept": fitted.intercept,
-                "coefficients": dict(fitted.coefficients),
+            weights = {
+                catalogue()[signal].column: weight for signal, weight in model.model.weights.items()
             }
-            bank[name] = fitted, about
-        about = {
-            **trained,
-            "published": version.reference,
-            "sha256": version.sha256,
-            "signals": list(manifest.signals),
-            "cross_validated": manifest.cross_validation.model_dump(mode="json"),
-            "intercept": manifest.intercept,
-            "coefficients": {term.column: term.coefficient for term in manifest.terms},
-            "columns": {
-                term.signal: term.definition.model_dump(mode="json")
-                if term.definition
-                else term.sql
-                for term in manifest.terms
-                if not term.logged
+            bank[name] = (
+                LinearEstimate(model.model.offset, weights),
+                {
+                    **common,
+                    "table_one": model.name,
+                    "signals": list(model.signals),
+                    "cross_validated": model.pooled.as_dict(),
+                    "intercept": model.model.offset,
+                    "coefficients": weights,
+                },
+            )
+        bank[version.reference] = (
+            PublishedEstimate(Predictor.of(manifest)),
+            {
+                **common,
+                "published": version.reference,
+                "sha256": version.sha256,
+                "signals": list(manifest.signals),
+                "cross_validated": manifest.cross_validation.model_dump(mode="json"),
+                "intercept": manifest.intercept,
+                "coefficients": {term.column: term.coefficient for term in manifest.terms},
+                "columns": {
+                    term.signal: term.definition.model_dump(mode="json")
+                    if term.definition
+                    else term.sql
+                    for term in manifest.terms
+                    if not term.logged
+                },
             },
-        }
-        bank[version.reference] = PublishedEstimate(Predictor.of(manifest)), about
+        )
         return bank
 
 
@@ -155,13 +153,20 @@ GROUP = "filters and observers"
 
 @dataclass(frozen=True)
 class Filter:
-    """One estimator of `comparison.observers`, its parameters as they are, and which to tune.
+    """A filter with its default parameters, and those to tune.
 
-    Attributes:
-        name: among the estimators.
-        module: whose it is; filters of one module share what is tuned.
-        gps: whether it needs satellite navigation.
-        informed: whether it knows the scenario's own load, tyres and road.
+    Attributes
+    ----------
+    name
+        Name among the estimators.
+    module
+        Module of the filter; filters of one module share tuned parameters.
+    gps
+        Whether it needs satellite navigation.
+    informed
+        Whether it uses the scenario's own load, tyres and road.
+    other_starts
+        Further starts of the search for parameters.
     """
 
     name: str
@@ -172,25 +177,24 @@ class Filter:
     gps: bool = False
     informed: bool = False
     other_starts: tuple[Config, ...] = ()
-    """Where the search for parameters begins besides."""
 
     def tune(
         self, drives: Sequence[LabelledDrive], car: VehicleParameters, executor: Executor
     ) -> Tuned[Config]:
-        """Return the best that any start leads to."""
+        """Return the best parameters over all starts."""
         return min(
             (
                 tune(self.estimate, start, self.tunable, drives, car, executor)
                 for start in (self.parameters, *self.other_starts)
             ),
-            key=lambda one: one.rmse_rad,
+            key=lambda tuned: tuned.rmse_rad,
         )
 
 
 LOOSE_EKF = ekf.EkfNoise(
     lateral_model_std_mps2=2.0, yaw_model_std_rad_s2=2.0, ay_bias_std_mps2=0.01
 )
-"""Believes in no bias and little in its model, as suits cars that are not as their class."""
+"""No bias and large errors of the model, as suits cars that differ from their class."""
 
 FILTERS = (
     Filter("kalman", "kalman", kalman.estimate, kalman.FilterNoise(), kalman.TUNABLE, gps=True),
@@ -206,220 +210,215 @@ FILTERS = (
 
 @dataclass(frozen=True)
 class FilterEstimate:
-    """A filter with its parameters, in a car, as an estimator of a drive's signals."""
+    """A filter with its parameters, in the car of each drive."""
 
     filter: Filter
     parameters: Config
-    car: VehicleParameters
-    weighed: bool = False
-    """Whether it knows a car's mass, as the model that it competes with does."""
+    with_mass: bool = False
+    """Whether it uses the stated mass of a car, as the model that it competes with."""
 
-    def in_drive(self, drive: EvaluatedDrive) -> "FilterEstimate":
-        """Return the filter with what it knows of the car, and of the road if it is informed."""
+    def car(self, drive: TestDrive) -> VehicleParameters:
+        """Return the car of a drive, as the filter assumes it."""
         scenario = drive.scenario
         if self.filter.informed:
-            parameters = self.parameters.model_copy(update={"adhesion": scenario.adhesion})
-            return replace(self, car=scenario.car, parameters=parameters)
-        car = scenario.vehicle
-        if self.weighed:
-            car = car.with_sprung_mass(scenario.car.body.sprung_mass_kg)
-        return replace(self, car=car)
+            return scenario.car
+        if self.with_mass:
+            return scenario.vehicle.with_sprung_mass(scenario.car.body.sprung_mass_kg)
+        return scenario.vehicle
 
-    def __call__(self, signals: Signals) -> FloatArray:
-        """Return the estimate at each tick, where the car's angle is meant."""
-        drive = seen(signals)
-        angle_rad = self.filter.estimate(drive, self.car, self.parameters)
-        if not (reference_m := self.car.body.reference_m):
+    def __call__(self, drive: TestDrive) -> FloatArray:
+        """Return the estimate at each tick, at the reference point of the car."""
+        signals, car, parameters = drive_signals(drive), self.car(drive), self.parameters
+        if self.filter.informed:
+            parameters = parameters.model_copy(update={"adhesion": drive.scenario.adhesion})
+        angle_rad = self.filter.estimate(signals, car, parameters)
+        if not (reference_m := car.body.reference_m):
             return angle_rad
-        return angle_rad + reference_m * drive.yaw_rate_rad_s / np.maximum(
-            measured_speed_mps(drive, self.car), 1.0
-        )
+        speed_mps = np.maximum(measured_speed_mps(signals, car), 1.0)
+        return angle_rad + reference_m * signals.yaw_rate_rad_s / speed_mps
 
     def description(self) -> dict[str, Any]:
-        """Return what a JSON document says of it."""
+        """Return its description in a document."""
         return {
             "kind": "filter",
             "group": GROUP,
             "gps": self.filter.gps,
             "told": "everything" if self.filter.informed else "class",
-            "weighed": self.weighed,
+            "weighed": self.with_mass,
             "parameters": self.parameters.model_dump(mode="json"),
         }
 
 
-def seen(signals: Signals) -> DriveSignals:
-    """Return what filters see of a drive's signals."""
-    return DriveSignals(**{one.name: signals[one.name] for one in fields(DriveSignals)})
+def drive_signals(drive: TestDrive) -> DriveSignals:
+    """Return the signals of a drive that filters read."""
+    names = (column.name for column in fields(DriveSignals))
+    return DriveSignals(**{name: drive.signals[name] for name in names})
 
 
-def rebuild(name: str, about: Mapping[str, Any], car: VehicleParameters) -> FilterEstimate:
-    """Return a filter from its name among the estimators and what a document says of it."""
-    (one,) = (one for one in FILTERS if one.name == name.removesuffix("_tuned"))
-    parameters = type(one.parameters).model_validate(about["parameters"])
-    return FilterEstimate(one, parameters, car, about.get("weighed", False))
+def restore_filter(name: str, about: Mapping[str, Any]) -> FilterEstimate:
+    """Restore a filter from its name among the estimators and its description in a document."""
+    (kind,) = (kind for kind in FILTERS if kind.name == name.removesuffix("_tuned"))
+    parameters = type(kind.parameters).model_validate(about["parameters"])
+    return FilterEstimate(kind, parameters, about.get("weighed", False))
 
 
 def filter_bank(
-    drives: "TuningDrives", car: VehicleParameters, executor: Executor, *, weighed: bool = False
-) -> Bank:
-    """Return each filter as it is and tuned on drives, and the one in a car identified from them.
+    drives: "TuningDrives", car: VehicleParameters, executor: Executor
+) -> EstimatorBank:
+    """Return each filter with default and with tuned parameters, and one in an identified car.
 
-    A filter that the drives lack something for is not tuned, and a remark says so.
+    A filter for which the drives lack a signal is not tuned, and a warning names it.
     """
-    found = drives.kept_or_tuned(car, executor)
-    for failing in found["failing"]:
-        LOGGER.warning("%s", failing)
-    cars = {model: Identified.load(one) for model, one in found["cars"].items()}
-    bank: Bank = {}
+    stored = drives.load_or_tune(car, executor)
+    for failure in stored["failing"]:
+        LOGGER.warning("%s", failure)
+    cars = {model: Identified.load(content) for model, content in stored["cars"].items()}
+    bank: EstimatorBank = {}
     if cars:
-        identified = IdentifiedEstimate(cars, next(iter(cars)))
+        identified = IdentifiedEstimate(cars)
         bank[IDENTIFIED_NAME] = identified, identified.description()
-    for one in FILTERS:
-        plain = FilterEstimate(one, one.parameters, car, weighed)
-        best = found["parameters"].get(one.module)
-        parameters = type(one.parameters).model_validate(best) if best else one.parameters
-        tuned = replace(plain, parameters=parameters)
+    for kind in FILTERS:
+        default = FilterEstimate(kind, kind.parameters, drives.with_mass)
+        best = stored["parameters"].get(kind.module)
+        parameters = type(kind.parameters).model_validate(best) if best else kind.parameters
+        tuned = replace(default, parameters=parameters)
         tuned_on = {"tuned_on": drives.names if best else []}
-        bank[one.name] = plain, plain.description()
-        bank[f"{one.name}_tuned"] = tuned, {**tuned.description(), **tuned_on}
+        bank[kind.name] = default, default.description()
+        bank[f"{kind.name}_tuned"] = tuned, {**tuned.description(), **tuned_on}
     return bank
 
 
-# The extended Kalman filter in a car that was identified from the drives a model learned from, as a
-# department would build it that has scales, a tape measure and labelled drives.
+# The extended Kalman filter in a car that was identified from the training drives of a model, with
+# scales, a tape measure and labelled drives.
 
 IDENTIFIED_NAME = "ekf_identified"
 
 DRIVES_OF_A_CLASS = 12
-"""Of each class of cars; a dozen give as good a car in half the time."""
+"""Drives of each class of cars; a dozen give as good a car in half the time."""
 
 
 @dataclass(frozen=True)
 class IdentifiedEstimate:
-    """The filter in the identified car of a class; in the first of another class that it knows."""
+    """The filter in the identified car of a drive's class, or in the first identified car."""
 
     cars: Mapping[str, Identified]
-    driven: str
 
-    def in_drive(self, drive: EvaluatedDrive) -> "IdentifiedEstimate":
-        """Return the filter in the car of a drive."""
-        known = drive.scenario.vehicle.name
-        return replace(self, driven=known) if known in self.cars else self
-
-    def __call__(self, signals: Signals) -> FloatArray:
+    def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick."""
-        return self.cars[self.driven].estimate(seen(signals))
+        default = next(iter(self.cars.values()))
+        car = self.cars.get(drive.scenario.vehicle.name, default)
+        return car.estimate(drive_signals(drive))
 
     def description(self) -> dict[str, Any]:
-        """Return what a JSON document says of it."""
+        """Return its description in a document."""
         return {
             "kind": "filter",
             "group": GROUP,
             "gps": False,
             "told": "labelled drives",
-            "parameters": {name: one.dump() for name, one in self.cars.items()},
+            "parameters": {name: car.dump() for name, car in self.cars.items()},
         }
 
 
 T = TypeVar("T")
 
 
-def choose_evenly(some: Sequence[T], at_most: int) -> list[T]:
-    """Return so many of some in their order, evenly apart, or all if they are fewer."""
-    places = np.linspace(0, len(some) - 1, min(at_most, len(some))).round()
-    return [some[int(place)] for place in places]
+def choose_evenly(items: Sequence[T], count: int) -> list[T]:
+    """Choose `count` items in their order, evenly apart, or all if there are fewer."""
+    places = np.linspace(0, len(items) - 1, min(count, len(items))).round()
+    return [items[int(place)] for place in places]
 
 
 TUNING_DRIVES = 24
 """Drives of the cohort that parameters are tuned on, evenly chosen."""
 
 TUNING_S = 120
-"""How much of each is taken."""
+"""Length of the beginning of each tuning drive."""
 
 
 @dataclass(frozen=True)
 class TuningDrives:
-    """Drives of a cohort to tune filters on: name, vehicle model, and mass if filters know it."""
+    """Drives of a cohort to tune filters on: name, vehicle model, and mass if filters use it."""
 
     warehouse: Warehouse
-    known: tuple[tuple[str, str, float | None], ...]
-    _read: list[LabelledDrive] = field(default_factory=list, repr=False, compare=False)
+    keys: tuple[tuple[str, str, float | None], ...]
+    with_mass: bool
 
     @classmethod
-    def of(cls, warehouse: Warehouse, cohort: Cohort, *, weighed: bool) -> "TuningDrives":
+    def of(cls, warehouse: Warehouse, cohort: Cohort, *, with_mass: bool) -> "TuningDrives":
         """Choose drives evenly, by name."""
-        rows = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"]).to_pylist()
-        one_each = {row["drive_id"]: row for row in rows}
-        chosen = [one_each[name] for name in choose_evenly(sorted(one_each), TUNING_DRIVES)]
-        return cls(
-            warehouse,
-            tuple(
-                (row["drive_id"], row["vehicle_model"], row["mass_kg"] if weighed else None)
-                for row in chosen
-            ),
+        columns = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"])
+        rows = {row["drive_id"]: row for row in columns.to_pylist()}
+        keys = (
+            (name, rows[name]["vehicle_model"], rows[name]["mass_kg"] if with_mass else None)
+            for name in choose_evenly(sorted(rows), TUNING_DRIVES)
         )
+        return cls(warehouse, tuple(keys), with_mass)
 
     @property
     def names(self) -> list[str]:
         """The drives' names."""
-        return [name for name, _, _ in self.known]
+        return [name for name, _, _ in self.keys]
 
-    def kept_or_tuned(self, car: VehicleParameters, executor: Executor) -> Mapping[str, Any]:
-        """Return what suits the drives best, as it was kept below `tuned/`, else found now.
+    def load_or_tune(self, car: VehicleParameters, executor: Executor) -> Mapping[str, Any]:
+        """Return the parameters stored below `tuned/`, or tune and store them.
 
-        That is `parameters` by module, the identified `cars` by vehicle model, and what was not
-        found for want of a fix, wheel speeds, steering or a label, in words (`failing`).
+        The document has `parameters` by module, the identified `cars` by vehicle model, and a
+        message for each failure: a fix, wheel speeds, steering or a label is missing (`failing`).
         """
         key = {
-            "drives": [TUNING_S, *(list(known) for known in self.known)],
+            "drives": [TUNING_S, *(list(each) for each in self.keys)],
             "car": car.model_dump(mode="json"),
             "program": checksum_of_sources(),
         }
         folder = DocumentFolder(self.warehouse.root / "tuned")
         documents = (folder.read(number).content for number in reversed(folder.numbers()))
-        found = next((content for content in documents if content["key"] == key), None)
-        return found or folder.append({"key": key, **self._tuned(car, executor)}).content
+        stored = next((content for content in documents if content["key"] == key), None)
+        return stored or folder.append({"key": key, **self._tuned(car, executor)}).content
 
     def _tuned(self, car: VehicleParameters, executor: Executor) -> dict[str, Any]:
-        many = number_of(len(self.names), "drive")
-        LOGGER.info("tuning filters and identifying the car on %s, once", many)
+        drives = number_of(len(self.names), "drive")
+        LOGGER.info("tuning filters and identifying the car on %s, once", drives)
         cars: dict[str, Any] = {}
         parameters: dict[str, Any] = {}
-        failing: list[str] = []
+        failures: list[str] = []
         try:
-            cars = {model: one.dump() for model, one in self._identified(executor)}
+            cars = {model: identified.dump() for model, identified in self._identified(executor)}
         except DataError as error:
-            failing.append(f"no car can be identified: {error}")
-        for one in {one.module: one for one in reversed(FILTERS)}.values():
+            failures.append(f"no car can be identified: {error}")
+        for kind in {kind.module: kind for kind in reversed(FILTERS)}.values():
             try:
-                best = one.tune(self.read(), car, executor)
-                parameters[one.module] = best.parameters.model_dump(mode="json")
+                best = kind.tune(self.drives, car, executor)
+                parameters[kind.module] = best.parameters.model_dump(mode="json")
             except DataError as error:
-                failing.append(f"{one.name} left untuned: {error}")
-        return {"cars": cars, "parameters": parameters, "failing": failing}
+                failures.append(f"{kind.name} left untuned: {error}")
+        return {"cars": cars, "parameters": parameters, "failing": failures}
 
     def _identified(self, executor: Executor) -> Iterator[tuple[str, Identified]]:
         """Identify each class of cars that has a file. Raises `DataError` as `identify`."""
-        of_class: dict[str, list[LabelledDrive]] = {}
-        for (_, model, _), drive in zip(self.known, self.read(), strict=True):
+        classes: dict[str, list[LabelledDrive]] = {}
+        for (_, model, _), drive in zip(self.keys, self.drives, strict=True):
             if drive.car is not None:
-                of_class.setdefault(model, []).append(replace(drive, car=None))
-        for model, own in sorted(of_class.items()):
-            some = choose_evenly(own, DRIVES_OF_A_CLASS)
-            yield model, identify(Measured.of(load_vehicle(model)), some, executor)
+                classes.setdefault(model, []).append(replace(drive, car=None))
+        for model, drives in sorted(classes.items()):
+            chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
+            yield model, identify(Measured.of(load_vehicle(model)), chosen, executor)
 
-    def read(self) -> Sequence[LabelledDrive]:
-        """Return the beginning of each drive, as filters meet it: they know no bias yet."""
-        if not self._read:
-            with connect(self.warehouse.root, query="SELECT 1 FROM log") as database:
-                for name, model, mass_kg in self.known:
-                    drive = read_drive(database, name).beginning(TUNING_S * SAMPLE_RATE_HZ)
-                    self._read.append(replace(drive, car=class_car(model, mass_kg)))
-        return self._read
+    @cached_property
+    def drives(self) -> tuple[LabelledDrive, ...]:
+        """The beginning of each drive, as filters meet it: with unknown biases."""
+        with connect(self.warehouse.root, query="SELECT 1 FROM log") as database:
+            return tuple(
+                replace(
+                    read_drive(database, name).beginning(TUNING_S * SAMPLE_RATE_HZ),
+                    car=class_car(model, mass_kg),
+                )
+                for name, model, mass_kg in self.keys
+            )
 
 
 def class_car(model: str, mass_kg: float | None) -> VehicleParameters | None:
-    """Return what a fleet knows of a car: its class's file, and its mass; None without a file."""
+    """Return the car of a class's file, with its stated mass; None without a file."""
     try:
         car = load_vehicle(model)
     except ConfigError:

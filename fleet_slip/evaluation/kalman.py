@@ -14,9 +14,15 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation import belief
-from fleet_slip.evaluation.belief import Belief, YawRateNoise, belief_of, condition, spread
+from fleet_slip.evaluation import yaw_rate_filter
+from fleet_slip.evaluation.gaussian_state import (
+    GaussianState,
+    independent_state,
+    measurement_update,
+    predict_covariance,
+)
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, hold_last, sideslip_angle
+from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 
@@ -28,7 +34,7 @@ class FilterNoise(Config):
     bias_std_mps2: FiniteFloat = Field(default=0.15, gt=0)
     """Of the accelerometers' biases before the drive."""
     bias_walk_mps2_per_sqrt_s: FiniteFloat = Field(default=0.0, ge=0)
-    """How much a bias wanders in 1 s. The paper has no noise on biases."""
+    """Random walk of a bias over 1 s. The paper has no noise on biases."""
     gps_vx_std_mps: FiniteFloat = Field(default=0.05, gt=0)
     gps_vy_std_mps: FiniteFloat = Field(default=0.05, gt=0)
     yaw_rate: YawRateNoise = YawRateNoise()
@@ -40,7 +46,7 @@ TUNABLE = (
     "gps_vx_std_mps",
     "gps_vy_std_mps",
     "bias_std_mps2",
-    *belief.TUNABLE,
+    *yaw_rate_filter.TUNABLE,
 )
 """The parameters of Q, R and the first P that `identify.tune` should search."""
 
@@ -69,14 +75,16 @@ def covariances(noise: FilterNoise) -> Covariances:
 
 
 @kernel
-def first_belief(gps_vx: float, gps_vy: float, c: Covariances) -> Belief:
-    """Return the belief at the first fix: its velocity, and biases around zero."""
-    return belief_of((gps_vx, 0.0, gps_vy, 0.0), (c.r_ux, c.bias, c.r_uy, c.bias))
+def initial_state(gps_vx: float, gps_vy: float, c: Covariances) -> GaussianState:
+    """Return the state at the first fix: its velocity, and biases around zero."""
+    return independent_state((gps_vx, 0.0, gps_vy, 0.0), (c.r_ux, c.bias, c.r_uy, c.bias))
 
 
 @kernel
-def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances) -> None:
-    """Carry the belief one step on, equations (6), (7) and (9).
+def predict(
+    x: GaussianState, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances
+) -> None:
+    """Time update, equations (6), (7) and (9).
 
         | 1      −Δt  ψ̇Δt   0  |            | Δt  0 |
     F = | 0       1    0    0  |   B1, B2 = | 0   0 |   x ← F x + B2 u
@@ -88,14 +96,14 @@ def predict(x: Belief, ax: float, ay: float, yaw_rate: float, dt: float, c: Cova
     x.mean[0] = ux + dt * (ax - bx) + turn * uy
     x.mean[2] = uy + dt * (ay - by) - turn * ux
     f = ((1.0, -dt, turn, 0.0), (0.0, 1.0, 0.0, 0.0), (-turn, 0.0, 1.0, -dt), (0.0, 0.0, 0.0, 1.0))
-    spread(x, f, (c.q_ux, c.q_bias, c.q_uy, c.q_bias))
+    predict_covariance(x, f, (c.q_ux, c.q_bias, c.q_uy, c.q_bias))
 
 
 @kernel
-def update(x: Belief, gps_vx: float, gps_vy: float, c: Covariances) -> None:
-    """Take in a fix, equations (10) and (11); the noises of its two velocities are independent."""
-    condition(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], c.r_ux)
-    condition(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], c.r_uy)
+def update(x: GaussianState, gps_vx: float, gps_vy: float, c: Covariances) -> None:
+    """Measurement update by the two velocities of a fix, equations (10) and (11)."""
+    measurement_update(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], c.r_ux)
+    measurement_update(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], c.r_uy)
 
 
 @kernel
@@ -110,22 +118,22 @@ def _filter(
     c: Covariances,
 ) -> FloatArray:
     means = np.full((4, len(ax)), np.nan)
-    belief = first_belief(gps_vx[first_fix], gps_vy[first_fix], c)
+    state = initial_state(gps_vx[first_fix], gps_vy[first_fix], c)
     for k in range(first_fix, len(ax)):
         if k > first_fix:
-            predict(belief, ax[k], ay[k], yaw_rate[k], dt, c)
+            predict(state, ax[k], ay[k], yaw_rate[k], dt, c)
             if not np.isnan(gps_vx[k] + gps_vy[k]):
-                update(belief, gps_vx[k], gps_vy[k], c)
-        means[:, k] = belief.mean
+                update(state, gps_vx[k], gps_vy[k], c)
+        means[:, k] = state.mean
     return means
 
 
 def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) -> FloatArray:
     """Return vx in m/s, the bias of ax in m/s², vy and the bias of ay, shape (4, rows).
 
-    The yaw rate is known. The filter begins at the first GPS fix, NaN before it, predicts at every
-    row and updates at every fix. Gaps of the accelerometers are bridged by the value before. Raises
-    `DataError` if the drive has no fix.
+    The filter starts at the first GPS fix, NaN before it, predicts at every row and updates at
+    every fix. Gaps of the accelerometers are bridged by the last value. Raises `DataError` if the
+    drive has no fix.
     """
     fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
     if not len(fixes):
@@ -145,10 +153,10 @@ def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) ->
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) -> FloatArray:
     """Estimate side-slip in rad at every row, NaN before the first fix. Raises as `fuse`.
 
-    Of the car, only the geometry counts that turns wheel speeds into a yaw rate. All of it is
+    Only the geometry of the car matters, which turns wheel speeds into a yaw rate. The filter is
     compiled and releases the interpreter's lock: many drives run on threads, as in
     `executor.map(partial(estimate, car=car, noise=noise), drives)`.
     """
-    yaw_rate_rad_s, _ = belief.estimate(drive, car, noise.yaw_rate)
+    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(drive, car, noise.yaw_rate)
     vx_mps, _, vy_mps, _ = fuse(drive, yaw_rate_rad_s, noise)
     return sideslip_angle(vx_mps, vy_mps)

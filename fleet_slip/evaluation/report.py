@@ -7,19 +7,20 @@ from dataclasses import dataclass
 from fleet_slip.base import number_of
 from fleet_slip.catalogue.facts import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
-from fleet_slip.evaluation.claims import Status, judge_claims
-from fleet_slip.evaluation.drives import simulate_drives
-from fleet_slip.evaluation.evaluate import evaluations_of
-from fleet_slip.evaluation.filters import LinearEstimate, rebuild, train_models
-from fleet_slip.evaluation.judge import LEAST_COVERAGE, Estimate, evaluate_drive
-from fleet_slip.evaluation.kept import (
+from fleet_slip.evaluation.claims import Status, evaluate_claims
+from fleet_slip.evaluation.evaluation_document import evaluations_of
+from fleet_slip.evaluation.evaluator import Estimator, evaluate
+from fleet_slip.evaluation.filters import LinearEstimate, restore_filter, train_models
+from fleet_slip.evaluation.ranking import MIN_COVERAGE
+from fleet_slip.evaluation.report_data import (
     DRAWN_FILTERS,
     PAPER_TABLE_TWO,
-    Evaluated,
     ReportData,
+    StoredEvaluation,
     compare_orders,
-    latest_of,
+    latest_evaluation,
 )
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Drawn, draw
 from fleet_slip.pages.page import (
@@ -32,7 +33,7 @@ from fleet_slip.pages.page import (
     number,
     percent,
 )
-from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+from fleet_slip.simulation.scenario import shipped_scenarios
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -41,43 +42,41 @@ PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.99
 
 
 def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
-    """Gather a report about a model version.
+    """Gather the data of a report about a model version.
 
     Raises `DataError` if the version has not been evaluated, or if its cohort or a drive of a
-    scenario has changed since: all numbers of a report must be of the same data.
+    scenario has changed since: all numbers of a report are of the same data.
     """
-    evaluated = latest_of(warehouse, version)
+    evaluated = latest_evaluation(warehouse, version)
     trained = train_models(warehouse, version)
     evaluated.require_models(trained)
     shipped = shipped_scenarios()
-    wanted = DRAWN_SCENARIOS.intersection(evaluated.scenarios)
-    drawn = [one for one in shipped if one.name in wanted]
-    estimators = _drawn(evaluated)
-    runs = {one.scenario.name: evaluate_drive(one, estimators) for one in simulate_drives(drawn)}
-    evaluated.require_figures(runs)
+    names = DRAWN_SCENARIOS.intersection(evaluated.scenarios)
+    drives = simulate_drives([scenario for scenario in shipped if scenario.name in names])
+    runs = {run.name: run for run in evaluate(drives, _drawn_estimators(evaluated))}
+    evaluated.require_errors(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
-    signals = tuple(dict.fromkeys(models[-1].signals))
     measured = evaluations_of(warehouse, "measured")
-    documents = (measured.read(number).content for number in reversed(measured.numbers()))
+    contents = (measured.read(number).content for number in reversed(measured.numbers()))
     return ReportData(
         version=version,
         evaluated=evaluated,
         trained=trained,
         runs=runs,
-        ordering=compare_orders(cohort, signals),
-        on_measured=next((one for one in documents if one["model"] == version.reference), None),
-        shipped=tuple(one.name for one in shipped),
+        orders=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
+        on_measured=next((each for each in contents if each["model"] == version.reference), None),
+        shipped=tuple(scenario.name for scenario in shipped),
     )
 
 
-def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
-    """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
-    about, car = evaluated.estimators, load_scenario("nominal").car
+def _drawn_estimators(evaluated: StoredEvaluation) -> dict[str, Estimator[TestDrive]]:
+    """Restore the estimators that figures show from their descriptions in the evaluation."""
+    about = evaluated.estimators
     models = {
         name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
         for name in evaluated.models.values()
     }
-    filters = {name: rebuild(name, about[name], car) for name in DRAWN_FILTERS if name in about}
+    filters = {name: restore_filter(name, about[name]) for name in DRAWN_FILTERS if name in about}
     return {**models, **filters}
 
 
@@ -91,11 +90,11 @@ def table_one(data: ReportData) -> ReportTable:
     """Return Table I."""
     head = ["model", "signals", "paper", "ours", "standard error", "RMSE"]
     rows: list[list[str]] = []
-    for one in data.trained.selection.models:
-        paper = PAPER_TABLE_ONE.get(one.name)
-        ours = _marked(number(one.correlation, 4), paper is not None and one.correlation >= paper)
-        error, rmse = f"± {number(one.standard_error, 4)}", degrees(one.pooled.rmse_deg)
-        rows.append([one.name, ", ".join(one.signals), number(paper, 4), ours, error, rmse])
+    for row in data.trained.selection.models:
+        paper = PAPER_TABLE_ONE.get(row.name)
+        ours = _marked(number(row.correlation, 4), paper is not None and row.correlation >= paper)
+        error, rmse = f"± {number(row.standard_error, 4)}", degrees(row.pooled.rmse_deg)
+        rows.append([row.name, ", ".join(row.signals), number(paper, 4), ours, error, rmse])
     selection = data.trained.selection
     noise = data.version.manifest.cross_validation.label_noise_deg
     note = (
@@ -114,18 +113,18 @@ def table_two(data: ReportData) -> ReportTable:
     """Return Table II: the errors on the nominal test drive."""
     rows: list[list[str]] = []
     for name, estimator in data.evaluated.models.items():
-        one = data.evaluated.figures("nominal", estimator)
-        if one is None or one.error_std_deg is None:
+        errors = data.evaluated.statistics("nominal", estimator)
+        if errors is None or errors.error_std_deg is None:
             continue
         mean, std = PAPER_TABLE_TWO[name]
         rows.append(
             [
                 name,
                 number(mean, 4, sign=True),
-                number(one.error_mean_deg, 4, sign=True),
+                number(errors.error_mean_deg, 4, sign=True),
                 number(std, 4),
-                _marked(number(one.error_std_deg, 4), one.error_std_deg <= std),
-                number(one.correlation, 4),
+                _marked(number(errors.error_std_deg, 4), errors.error_std_deg <= std),
+                number(errors.correlation, 4),
             ]
         )
     head = ["model", "mean, paper", "mean, ours", "std, paper", "std, ours", "correlation, ours"]
@@ -136,52 +135,54 @@ def table_two(data: ReportData) -> ReportTable:
 def standings(data: ReportData) -> ReportTable:
     """Return every estimator's error on every test drive; of Table I the paper's choice alone."""
     evaluated = data.evaluated
-    left_out = set(evaluated.models.values()) - {data.choice}
-    names = [name for name in evaluated.estimators if name not in left_out]
+    omitted = set(evaluated.models.values()) - {data.choice}
+    names = [name for name in evaluated.estimators if name not in omitted]
     rows: list[list[str]] = []
     for scenario in evaluated.scenarios:
         errors, texts = {}, {}
         for name in names:
-            one = evaluated.figures(scenario, name)
-            rmse_deg = one.rmse_deg if one else None
+            statistics = evaluated.statistics(scenario, name)
+            rmse_deg = statistics.rmse_deg if statistics else None
             texts[name] = number(rmse_deg)
-            if one and rmse_deg is not None and one.coverage >= LEAST_COVERAGE:
-                errors[name] = rmse_deg
-            elif one and rmse_deg is not None:
-                texts[name] += f" ({percent(one.coverage)})"
-        least = min(errors.values(), default=None)
-        marked = [_marked(texts[name], name in errors and errors[name] == least) for name in names]
-        rows.append([scenario, *marked])
-    found = evaluated.document.content["ranking"]
+            if statistics and rmse_deg is not None:
+                if statistics.coverage >= MIN_COVERAGE:
+                    errors[name] = rmse_deg
+                else:
+                    texts[name] += f" ({percent(statistics.coverage)})"
+        best = min(errors.values(), default=None)
+        rows.append(
+            [scenario, *(_marked(texts[n], n in errors and errors[n] == best) for n in names)]
+        )
+    ranking = evaluated.document.content["ranking"]
     return ReportTable(
         "standings",
         "Every estimator on every test drive: root mean square error in degrees",
         ["test drive", *names],
         rows,
         note="Green: the smallest of the row. Among all without satellite navigation "
-        f"{found['estimator']} wins {found['won']} of {found['drives']} drives, and comes within "
-        f"{found['close_ratio']} times the winner in {found['close']} more; drives that differ in "
-        "satellite navigation alone are one. A percentage: the share of the drive with an "
-        "estimate; such do not compete.",
+        f"{ranking['estimator']} wins {ranking['won']} of {ranking['drives']} drives, and comes "
+        f"within {ranking['close_ratio']} times the winner in {ranking['close']} more; drives that "
+        "differ in satellite navigation alone are one. A percentage: the share of the drive with "
+        "an estimate; such do not compete.",
     )
 
 
 def measured_drives(data: ReportData) -> list[ReportTable]:
-    """Return the errors on measured drives, if there were any."""
-    found = data.on_measured
-    if found is None:
+    """Return the errors on measured drives, if they were evaluated."""
+    content = data.on_measured
+    if content is None:
         return []
     rows = [
         [
             name,
-            one["told"],
-            _marked(degrees(one["rmse_deg"]), place == 0),
-            degrees(one["error_mean_deg"], sign=True),
-            degrees(one["error_std_deg"]),
-            number(one["correlation"]),
-            percent(one["coverage"]),
+            row["told"],
+            _marked(degrees(row["rmse_deg"]), place == 0),
+            degrees(row["error_mean_deg"], sign=True),
+            degrees(row["error_std_deg"]),
+            number(row["correlation"]),
+            percent(row["coverage"]),
         ]
-        for place, (name, one) in enumerate(found["estimators"].items())
+        for place, (name, row) in enumerate(content["estimators"].items())
     ]
     return [
         ReportTable(
@@ -190,28 +191,28 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
             ["estimator", "knows", "RMSE", "mean", "error std", "correlation", "rows"],
             rows,
             left=2,
-            note=f"{count(len(found['drives']))} drives, left out in parts of their "
-            f"{found['parts_of']} in turn: {found['cohort']}. Green: the smallest.",
+            note=f"{count(len(content['drives']))} drives, left out in parts of their "
+            f"{content['parts_of']} in turn: {content['cohort']}. Green: the smallest.",
         )
     ]
 
 
-def render(data: ReportData, shown: Sequence[Drawn]) -> str:
+def render(data: ReportData, pictures: Sequence[Drawn]) -> str:
     """Return the page."""
-    claims = judge_claims(data)
-    counted = Counter(one.status for one in claims)
+    claims = evaluate_claims(data)
+    counted = Counter(claim.status for claim in claims)
     return fill_in(
         "report.html.j2",
         version=data.version,
         evaluation=data.evaluated.document,
-        paper=shown,
+        paper=pictures,
         tables=[table_one(data), table_two(data)],
         further=[*measured_drives(data), standings(data)],
         tiles=_tiles(data, counted),
         claims=claims,
         tally={status: counted[status] for status in Status},
         measured=MEASURED in data.trained.selection.cohort.drives["source"].to_pylist(),
-        missing=[one for one in data.shipped if one not in data.evaluated.scenarios],
+        missing=[name for name in data.shipped if name not in data.evaluated.scenarios],
         provenance=_provenance(data),
         commands=_commands(data),
     )
@@ -228,8 +229,8 @@ def _tiles(data: ReportData, tally: Mapping[Status, int]) -> list[Tile]:
         Tile(count(data.version.manifest.trained_on.rows), f"training rows of {drives}"),
     ]
     names = (data.version.reference, data.choice)
-    both = [data.evaluated.figures("nominal", name) for name in names]
-    reported, chosen = (one.error_std_deg if one else None for one in both)
+    both = [data.evaluated.statistics("nominal", name) for name in names]
+    reported, chosen = (errors.error_std_deg if errors else None for errors in both)
     if reported is not None and chosen is not None:
         label = (
             f"error std of {data.version.reference} on the nominal drive; of model "
@@ -282,8 +283,18 @@ FIGURES = "figures"
 
 
 @dataclass(frozen=True)
-class Written:
-    """What was written."""
+class WrittenReport:
+    """The files of a report.
+
+    Attributes
+    ----------
+    page
+        Path or URL of the page.
+    size_bytes
+        Size of the page.
+    figures
+        Number of figures, each an SVG and a PNG file.
+    """
 
     page: str
     size_bytes: int
@@ -291,17 +302,17 @@ class Written:
 
     @property
     def figures_folder(self) -> str:
-        """Where the figures are as files."""
+        """Folder of the figures."""
         return f"{self.page.removesuffix(PAGE)}{FIGURES}"
 
 
-def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> Written:
+def write_report(warehouse: Warehouse, version: ModelVersion, output: Folder) -> WrittenReport:
     """Write the report into a folder, the page last. Raises `DataError` if not evaluated."""
     data = gather(warehouse, version)
-    shown = tuple(map(draw, draw_pictures(data)))
-    page = render(data, shown).encode("utf-8")
-    for one in shown:
-        output.put(f"{FIGURES}/{one.picture.key}.svg", one.svg_file.encode("utf-8"))
-        output.put(f"{FIGURES}/{one.picture.key}.png", one.png_file)
+    pictures = tuple(map(draw, draw_pictures(data)))
+    page = render(data, pictures).encode("utf-8")
+    for drawn in pictures:
+        output.put(f"{FIGURES}/{drawn.picture.key}.svg", drawn.svg_file.encode("utf-8"))
+        output.put(f"{FIGURES}/{drawn.picture.key}.png", drawn.png_file)
     output.put(PAGE, page)
-    return Written(f"{output}/{PAGE}", len(page), len(shown))
+    return WrittenReport(f"{output}/{PAGE}", len(page), len(pictures))

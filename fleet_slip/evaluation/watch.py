@@ -18,7 +18,7 @@ from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
-from fleet_slip.evaluation.drives import simulate_drives
+from fleet_slip.evaluation.test_drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
@@ -319,6 +319,6 @@ def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     (drive,) = simulate_drives([scenario])
     traffic = scenario.batch().drives[0].in_traffic
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
-    facts = {**drive.facts, "track": scenario.way.name, "drive_id": scenario.drive_id}
+    facts = {**drive.vehicle_attributes, "track": scenario.way.name, "drive_id": scenario.drive_id}
     title = f"{scenario.name}: {scenario.description}"
     return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version, traffic)

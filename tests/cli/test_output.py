@@ -15,7 +15,7 @@ from rich.text import Text
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
-from fleet_slip.evaluation.evaluate import Evaluation
+from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.models import select
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable

@@ -11,9 +11,9 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.features import input_scales
 from fleet_slip.catalogue.signals import catalogue
-from fleet_slip.evaluation import measured as module
+from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured
-from fleet_slip.evaluation.measured import identified_prior
+from fleet_slip.evaluation.measured_evaluation import identified_prior
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.weights import age_weights

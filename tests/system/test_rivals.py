@@ -78,7 +78,7 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> Non
         ).fetchnumpy()
     signals = {"ay_mps2": np.ma.filled(rows["ay_mps2"].astype(float), np.nan)}
     stride = cohort.rows // 1000
-    found = estimate(signals)[::stride]
+    found = estimate.estimate(signals, {})[::stride]
     expected = drawn.inputs[drawn.trip == drive_id, 1]
     np.testing.assert_array_equal(found[np.isfinite(found)], expected)
 
@@ -87,9 +87,9 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> Non
 def test_a_tree_without_factors_is_the_filter_and_never_worse_with_them() -> None:
     drive, truth = slalom(CAR, 1500)
     drives = [LabelledDrive(str(seed), noisy(drive, seed), truth) for seed in (1, 2)]
-    base = FilterEstimate(CLASS, ekf.EkfNoise(), CAR)
+    base = FilterEstimate(CLASS, ekf.EkfNoise())
     with ThreadPoolExecutor(1) as executor:
-        fitted = fit_tree_filter(base, drives, executor)
+        fitted = fit_tree_filter(base, CAR, drives, executor)
 
     def rms(one: TreeFilter) -> float:
         errors = [one.estimate(d.signals, CAR, one.noise) - d.sideslip_rad for d in drives]

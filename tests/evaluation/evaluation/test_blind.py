@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation import blind
-from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
-from fleet_slip.evaluation.drives import simulate_drives
-from fleet_slip.evaluation.evaluate import Evaluation
-from fleet_slip.evaluation.judge import Signals
+from fleet_slip.evaluation.blind import blind_scenarios, evaluate_blind_drives
+from fleet_slip.evaluation.evaluation_document import Evaluation
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from tests.support.reported import answer
@@ -69,20 +68,19 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
     some = (*scenarios[:3], *scenarios[-3:])
     monkeypatch.setattr(blind, "blind_scenarios", {HASH: some}.__getitem__)
     drives = simulate_drives(some)
-    truths = iter([drive.sideslip_rad for drive in drives])
     monkeypatch.setattr(blind, "simulate_drives", lambda scenarios: drives)  # the same again
 
-    def right(signals: Signals) -> np.ndarray:
-        return next(truths)
+    def right(drive: TestDrive) -> np.ndarray:
+        return drive.sideslip_rad
 
-    def zero(signals: Signals) -> np.ndarray:
-        return np.zeros_like(signals["ay_mps2"])
+    def zero(drive: TestDrive) -> np.ndarray:
+        return np.zeros_like(drive.sideslip_rad)
 
-    def silent(signals: Signals) -> np.ndarray:
-        return np.full_like(signals["ay_mps2"], np.nan)
+    def silent(drive: TestDrive) -> np.ndarray:
+        return np.full_like(drive.sideslip_rad, np.nan)
 
     estimators = {"right": right, "zero": zero, "silent@1": silent}
-    judged = judge_blindly(HASH, estimators)
+    judged = evaluate_blind_drives(HASH, estimators)
     rows = {row["name"]: row for row in judged}
     assert rows["all"]["drives"] == 6
     assert [rows[name]["drives"] for name in ("dry", "wet", "ice")] == [2, 2, 2]

@@ -17,12 +17,13 @@ from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.drives import EvaluatedDrive, simulate_drives, visible_signals
-from fleet_slip.evaluation.evaluate import _ranking_table, keep
+from fleet_slip.evaluation.evaluation_document import _ranking_table, store_evaluation
+from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
 from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, PublishedEstimate, class_car
 from fleet_slip.evaluation.identify import checksum_of_sources
-from fleet_slip.evaluation.judge import EvaluatedScenario, Signals, evaluate_drive, rank
+from fleet_slip.evaluation.ranking import rank
 from fleet_slip.evaluation.single_track import read_drive
+from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visible_signals
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
@@ -61,13 +62,13 @@ def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
     def overtaken(folder: DocumentFolder) -> list[int]:
         before = numbers(folder)
         monkeypatch.undo()
-        keep(kept, {"models": 5})
+        store_evaluation(kept, {"models": 5})
         return before
 
     monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
-    assert keep(kept, {"models": 5}).number == 1
-    assert keep(kept, {"models": 6}).number == 2
-    assert keep(kept, {"models": 6}).number == 2
+    assert store_evaluation(kept, {"models": 5}).number == 1
+    assert store_evaluation(kept, {"models": 6}).number == 2
+    assert store_evaluation(kept, {"models": 6}).number == 2
 
 
 def test_no_model_is_trained_on_scenarios(root: Path) -> None:
@@ -160,7 +161,7 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives([load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
-    estimate = PublishedEstimate(Predictor.of(manifest))(drive.signals)
+    estimate = PublishedEstimate(Predictor.of(manifest))(drive)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
@@ -190,8 +191,8 @@ def test_filters_know_the_mass_where_the_model_does() -> None:
     scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
     heavy = replace(drive, scenario=scenario)
     for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
-        one = FilterEstimate(FILTERS[1], FILTERS[1].parameters, scenario.vehicle, weighed)
-        assert one.in_drive(heavy).car.body.sprung_mass_kg == kg
+        estimate = FilterEstimate(FILTERS[1], FILTERS[1].parameters, weighed)
+        assert estimate.car(heavy).body.sprung_mass_kg == kg
     assert class_car("suv", 2000.0) == load_vehicle("suv").with_sprung_mass(2000.0)
     assert class_car("a_strangers_car", None) is None
 
@@ -202,24 +203,24 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     with connect(root, query="SELECT source FROM log") as database:
         alone = read_drive(database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
-    found = FilterEstimate(FILTERS[0], FILTERS[0].parameters, scenario.car)(drive.signals)
+    found = FilterEstimate(FILTERS[0], FILTERS[0].parameters)(drive)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
 ROWS = 1000
 
 
-def drive(scenario: Scenario) -> EvaluatedDrive:
+def drive(scenario: Scenario) -> TestDrive:
     """Return a drive straight ahead: the estimate is the error."""
     zeros, speed = np.zeros(ROWS), np.full(ROWS, 20.0)
     signals = {catalogue()[name].column: zeros for name in visible_signals()}
     time_s = np.arange(ROWS) / 100
-    return EvaluatedDrive(scenario, time_s, signals, speed, zeros, zeros, zeros, None)
+    return TestDrive(scenario, time_s, signals, speed, zeros, zeros, zeros, None)
 
 
-def off_by(error_deg: float, missing: int = 0) -> Callable[[Signals], FloatArray]:
-    def estimate(signals: Signals) -> FloatArray:
-        angles = np.full(len(signals["ay_mps2"]), np.radians(error_deg))
+def off_by(error_deg: float, missing: int = 0) -> Callable[[TestDrive], FloatArray]:
+    def estimate(drive: TestDrive) -> FloatArray:
+        angles = np.full(len(drive.time_s), np.radians(error_deg))
         angles[:missing] = np.nan
         return angles
 
@@ -228,13 +229,14 @@ def off_by(error_deg: float, missing: int = 0) -> Callable[[Signals], FloatArray
 
 def run(
     scenario: Scenario | None = None, **errors_deg: float | tuple[float, int]
-) -> EvaluatedScenario:
+) -> EvaluatedDrive[TestDrive]:
     parts = {k: v if isinstance(v, tuple) else (v, 0) for k, v in errors_deg.items()}
     estimators = {name: off_by(*part) for name, part in parts.items()}
-    return evaluate_drive(drive(scenario or load_scenario("nominal")), estimators)
+    (evaluated,) = evaluate([drive(scenario or load_scenario("nominal"))], estimators)
+    return evaluated
 
 
-def standing(one: EvaluatedScenario, estimator: str = "ours") -> dict[str, Any]:
+def standing(one: EvaluatedDrive[TestDrive], estimator: str = "ours") -> dict[str, Any]:
     (found,) = rank([one], estimator, gps=())["standings"]
     return dict(found)
 

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.evaluation.drives import apply_failure, join, peak_slip
+from fleet_slip.evaluation.evaluator import error_statistics
 from fleet_slip.evaluation.filters import LinearEstimate
-from fleet_slip.evaluation.judge import error_figures
-from fleet_slip.simulation.scenario import Failure
+from fleet_slip.evaluation.test_drives import TestDrive, apply_failure, join, peak_slip
+from fleet_slip.simulation.scenario import Failure, load_scenario
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
@@ -19,7 +19,7 @@ ALL = np.ones(5, dtype=np.bool_)
 
 def test_figures_of_a_known_error() -> None:
     truth = np.radians([0.0, 1.0, 2.0, 3.0, 4.0])
-    figures = error_figures(truth + np.radians([1.0, 1.0, 1.0, 1.0, 2.0]), truth, ALL)
+    figures = error_statistics(truth + np.radians([1.0, 1.0, 1.0, 1.0, 2.0]), truth, ALL)
     assert figures.rows == 5
     assert figures.coverage == 1
     assert figures.error_mean_deg == pytest.approx(1.2)
@@ -33,7 +33,7 @@ def test_figures_of_a_known_error() -> None:
 def test_rows_without_an_estimate_count_for_the_coverage_alone() -> None:
     truth = np.zeros(5)
     estimate = np.array([np.nan, np.radians(1), np.radians(1), np.inf, 7.0])
-    figures = error_figures(estimate, truth, np.array([True, True, True, True, False]))
+    figures = error_statistics(estimate, truth, np.array([True, True, True, True, False]))
     assert figures.rows == 4
     assert figures.coverage == 0.5
     assert figures.error_mean_deg == pytest.approx(1.0)
@@ -41,7 +41,7 @@ def test_rows_without_an_estimate_count_for_the_coverage_alone() -> None:
 
 
 def test_an_estimator_without_any_estimate_has_no_figures() -> None:
-    figures = error_figures(np.full(5, np.nan), np.zeros(5), ALL)
+    figures = error_statistics(np.full(5, np.nan), np.zeros(5), ALL)
     assert figures.coverage == 0
     assert figures.error_std_deg is None
 
@@ -49,7 +49,9 @@ def test_an_estimator_without_any_estimate_has_no_figures() -> None:
 def test_a_null_signal_leaves_no_estimate() -> None:
     model = LinearEstimate(0.5, {"ay_mps2": 2.0, "yaw_rate_rad_s": -1.0})
     signals = {"ay_mps2": np.array([1.0, np.nan]), "yaw_rate_rad_s": np.array([3.0, 3.0])}
-    np.testing.assert_array_equal(model(signals), [-0.5, np.nan])
+    at_rest = np.zeros(2)
+    drive = TestDrive(load_scenario("nominal"), np.arange(2) / 100, signals, *[at_rest] * 4, None)
+    np.testing.assert_array_equal(model(drive), [-0.5, np.nan])
 
 
 def test_a_stuck_signal_keeps_its_value_and_a_missing_one_has_none() -> None:

@@ -9,17 +9,17 @@ import pyarrow as pa
 import pytest
 
 import fleet_slip
-from fleet_slip.evaluation import ekf, filters, measured
-from fleet_slip.evaluation.identify import Fitted, Identified, Measured, Tuned
-from fleet_slip.evaluation.left_out import (
+from fleet_slip.evaluation import ekf, filters, measured_evaluation
+from fleet_slip.evaluation.held_out import (
     HeldOutDrive,
     Learner,
-    LeftOut,
-    kinds_to_leave_out,
-    parts_to_leave_out,
+    Segments,
+    folds_by_kind,
+    folds_of,
     read_measured_drives,
 )
-from fleet_slip.evaluation.measured import accelerated
+from fleet_slip.evaluation.identify import Fitted, Identified, Measured, Tuned
+from fleet_slip.evaluation.measured_evaluation import with_acceleration
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.request import SelectionRequest
@@ -40,35 +40,35 @@ def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) ->
     return HeldOutDrive(drive, rows, trip or drive.drive_id)
 
 
-def drives_of(left_out: LeftOut) -> list[int]:
-    assert all((drive, quarter) in left_out for drive, _ in left_out for quarter in range(4))
-    return sorted({drive for drive, _ in left_out})
+def drives_of(held_out: Segments) -> list[int]:
+    assert all((name, quarter) in held_out for name, _ in held_out for quarter in range(4))
+    return sorted({int(name.removeprefix("drive-")) for name, _ in held_out})
 
 
 def test_whole_drives_are_left_out_with_all_of_their_trip() -> None:
     drives = [a_drive(n, trip=f"trip-{n // 2}") for n in range(6)]
-    assert [drives_of(one) for one in parts_to_leave_out(drives)] == [[0, 1], [2, 3], [4, 5]]
-    many = parts_to_leave_out([a_drive(n) for n in range(20)])
+    assert [drives_of(one) for one in folds_of(drives)] == [[0, 1], [2, 3], [4, 5]]
+    many = folds_of([a_drive(n) for n in range(20)])
     assert sorted(drive for one in many for drive in drives_of(one)) == [*range(20)]
     assert len(many) == 8
 
 
 def test_of_few_drives_quarters_of_their_time_are_left_out() -> None:
     drives = [a_drive(0), a_drive(1)]
-    first, *_ = parts = parts_to_leave_out(drives)
+    first, *_ = parts = folds_of(drives)
     assert len(parts) == 4
-    assert first == {(0, 0), (1, 0)}
-    assert np.isnan(drives[0].without([0]).sideslip_rad).sum() == ROWS // 4
+    assert first == {("drive-0", 0), ("drive-1", 0)}
+    assert np.isnan(drives[0].without(first).sideslip_rad).sum() == ROWS // 4
 
 
 def test_kinds_of_driving_are_left_out_whole() -> None:
     drives = [a_drive(n, speed_mps=speed) for n, speed in enumerate((5.0, 20.0, 24.0))]
-    found = {kind: drives_of(one) for kind, one in kinds_to_leave_out(drives).items()}
+    found = {kind: drives_of(one) for kind, one in folds_by_kind(drives).items()}
     assert found == {
         "below 8 m/s, ay 1 to 2.5 m/s²": [0],
         "15 to 25 m/s, ay 1 to 2.5 m/s²": [1, 2],
     }
-    assert kinds_to_leave_out(drives[1:]) == {}
+    assert folds_by_kind(drives[1:]) == {}
 
 
 def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
@@ -76,11 +76,13 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
     logged, measured = LabelledDrive("logged", signals, still), Measured.of(car)
-    assert accelerated(logged, measured) is logged
+    assert with_acceleration(logged, measured) is logged
     missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
-    assert accelerated(missing, measured).signals.ax_mps2[100:] == pytest.approx(2.0, abs=0.01)
+    assert with_acceleration(missing, measured).signals.ax_mps2[100:] == pytest.approx(
+        2.0, abs=0.01
+    )
     blind = replace(logged, signals=NO_SIGNALS)
-    assert accelerated(blind, measured) is blind
+    assert with_acceleration(blind, measured) is blind
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +158,10 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
     drives = read_measured_drives(fleet.warehouse, cohort)
     request = SelectionRequest(model="ax,ay,yaw_rate")
     learner = Learner.of(fleet.warehouse, request, "true", drives)
-    (whole,), (quarters,) = cohort.tables, learner.divided.tables
+    (whole,), (quarters,) = cohort.tables, learner.quarters.tables
     assert len(quarters) == 4 * len(whole)
     assert quarters.total() == whole.total()
-    of_quarters = learner.choose(frozenset((drive, 3) for drive in range(6)))
+    of_quarters = learner.choose(frozenset((drive.name, 3) for drive in drives))
     assert of_quarters.winner.model.pooled.rows == 6 * 375
 
 
@@ -189,7 +191,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
 
     monkeypatch.setattr(filters, "tune", untuned)
     monkeypatch.setattr(
-        measured,
+        measured_evaluation,
         "identify",
         lambda measured, *_: Identified(measured.car(Fitted()), ekf.EkfNoise(), 0.0),
     )

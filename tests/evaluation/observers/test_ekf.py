@@ -7,8 +7,12 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.belief import Belief, belief_of, condition
 from fleet_slip.evaluation.ekf import EkfNoise, axles_of, chassis, variances
+from fleet_slip.evaluation.gaussian_state import (
+    GaussianState,
+    independent_state,
+    measurement_update,
+)
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     Axles,
@@ -36,8 +40,8 @@ UNCERTAIN = np.array(
 )
 
 
-def belief(vx: float, vy: float, r: float, b: float = 0.1) -> Belief:
-    uncertain = belief_of((vx, vy, r, b), (0.0, 0.0, 0.0, 0.0))
+def gaussian(vx: float, vy: float, r: float, b: float = 0.1) -> GaussianState:
+    uncertain = independent_state((vx, vy, r, b), (0.0, 0.0, 0.0, 0.0))
     uncertain.covariance[:] = UNCERTAIN
     return uncertain
 
@@ -105,7 +109,7 @@ def test_load_makes_axles_softer_in_bends_and_moves_grip_forward_in_braking() ->
 
 
 def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
-    x = belief(20.0, -0.4, 0.3)
+    x = gaussian(20.0, -0.4, 0.3)
     steer, ax = 0.04, 1.2
     h = 1e-6
 
@@ -124,8 +128,8 @@ def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
 
     row = np.array([0.3, -1.0, 2.0, 1.0])
     gain = UNCERTAIN @ row / (row @ UNCERTAIN @ row + 0.1)
-    x = belief(*state)
-    condition(x, (0.3, -1.0, 2.0, 1.0), 0.7, 0.1)
+    x = gaussian(*state)
+    measurement_update(x, (0.3, -1.0, 2.0, 1.0), 0.7, 0.1)
     np.testing.assert_allclose(x.mean, state + gain * 0.7, rtol=0, atol=1e-14)
     expected = UNCERTAIN - np.outer(gain, row) @ UNCERTAIN
     np.testing.assert_allclose(x.covariance, expected, rtol=0, atol=1e-14)
@@ -180,7 +184,7 @@ def test_a_bias_of_the_accelerometer_is_found() -> None:
 
 
 def test_covariance_stays_positive_definite() -> None:
-    x = belief(20.0, 0.0, 0.0)
+    x = gaussian(20.0, 0.0, 0.0)
     for k in range(20_000):
         steer = 0.1 * np.sin(0.01 * k)
         turning, ay = 0.2 * np.sin(0.01 * k), 4 * np.sin(0.01 * k)

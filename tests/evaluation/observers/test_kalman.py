@@ -13,7 +13,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.belief import Belief, belief_of
+from fleet_slip.evaluation.gaussian_state import GaussianState, independent_state
 from fleet_slip.evaluation.kalman import FilterNoise, covariances, fuse, predict, update
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -119,19 +119,19 @@ def test_agrees_with_the_joint_gaussian_posterior() -> None:
     solution = np.linalg.lstsq(whole, np.concatenate(values), rcond=None)[0]
     posterior = lever @ np.linalg.inv(whole.T @ whole) @ lever.T
 
-    belief = last_belief(drive, yaw_rate, NOISE)
-    np.testing.assert_allclose(belief.mean, mean + lever @ solution, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(belief.covariance, posterior, rtol=0, atol=1e-9)
+    state = last_state(drive, yaw_rate, NOISE)
+    np.testing.assert_allclose(state.mean, mean + lever @ solution, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(state.covariance, posterior, rtol=0, atol=1e-9)
 
 
-def last_belief(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> Belief:
+def last_state(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> GaussianState:
     c = covariances(noise)
-    belief = kalman.first_belief(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
+    state = kalman.initial_state(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
     for k in range(1, len(drive)):
-        predict(belief, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
+        predict(state, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
         if np.isfinite(drive.gps_vx_mps[k]):
-            update(belief, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
-    return belief
+            update(state, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
+    return state
 
 
 @kernel
@@ -139,18 +139,18 @@ def normalised_innovations(
     ax: Any, ay: Any, yaw_rate: Any, vx: Any, vy: Any, c: Any
 ) -> NDArray[np.float64]:
     """Return S^(−1/2) (z − H x̂) at the fixes after the first."""
-    belief = kalman.first_belief(vx[0], vy[0], c)
+    state = kalman.initial_state(vx[0], vy[0], c)
     found = np.full((2, len(ax)), np.nan)
     for k in range(1, len(ax)):
-        predict(belief, ax[k], ay[k], yaw_rate[k], STEP_S, c)
+        predict(state, ax[k], ay[k], yaw_rate[k], STEP_S, c)
         if not np.isnan(vx[k]):
-            ux, _, uy, _ = belief.mean
-            p = belief.covariance
+            ux, _, uy, _ = state.mean
+            p = state.covariance
             l00 = np.sqrt(p[0, 0] + c.r_ux)
             l10 = p[0, 2] / l00
             found[0, k] = (vx[k] - ux) / l00
             found[1, k] = (vy[k] - uy - l10 * found[0, k]) / np.sqrt(p[2, 2] + c.r_uy - l10 * l10)
-            update(belief, vx[k], vy[k], c)
+            update(state, vx[k], vy[k], c)
     return found
 
 
@@ -200,14 +200,14 @@ def test_innovations_of_a_wrong_noise_are_not_white() -> None:
 
 @kernel
 def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.float64]:
-    belief = kalman.first_belief(20.0, 0.0, c)
+    state = kalman.initial_state(20.0, 0.0, c)
     kept = np.empty((steps // every, 4, 4))
     for k in range(steps):
-        predict(belief, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
+        predict(state, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
         if k % 10 == 0:
-            update(belief, 20.0, 0.0, c)
+            update(state, 20.0, 0.0, c)
         if k % every == every - 1:
-            kept[k // every] = belief.covariance
+            kept[k // every] = state.covariance
     return kept
 
 
@@ -225,10 +225,10 @@ def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float)
 def test_joseph_keeps_the_variance_that_rounding_would_lose() -> None:
     """P (I − K H) of a very precise fix after great uncertainty rounds to zero and below."""
     vague = FilterNoise(gps_vx_std_mps=1e-5, gps_vy_std_mps=1e-5)
-    belief = belief_of((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))
-    update(belief, 1.0, 2.0, covariances(vague))
-    np.testing.assert_allclose(belief.mean, [1, 0, 2, 0], atol=1e-12)
-    np.testing.assert_allclose(np.diag(belief.covariance), [1e-10, 1, 1e-10, 1], rtol=1e-9)
+    state = independent_state((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))
+    update(state, 1.0, 2.0, covariances(vague))
+    np.testing.assert_allclose(state.mean, [1, 0, 2, 0], atol=1e-12)
+    np.testing.assert_allclose(np.diag(state.covariance), [1e-10, 1, 1e-10, 1], rtol=1e-9)
 
 
 def test_biases_are_found() -> None:

@@ -15,24 +15,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from jinja2 import meta
 
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.charts import band, draw_pictures
 from fleet_slip.evaluation.claims import (
     CLAIMS,
-    LIMITS,
-    NAMES,
-    TEXTS,
-    Facts,
     Status,
-    judge,
-    judge_claims,
+    evaluate_claim,
+    evaluate_claims,
+    generally_able,
+    many_vehicles,
+    noise_is_slight,
 )
-from fleet_slip.evaluation.evaluate import evaluations_of, keep
-from fleet_slip.evaluation.judge import LEAST_COVERAGE
-from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, blocks_won, difference
+from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
+from fleet_slip.evaluation.evaluator import ErrorStatistics
+from fleet_slip.evaluation.ranking import MIN_COVERAGE
 from fleet_slip.evaluation.report import render, standings, table_two
+from fleet_slip.evaluation.report_data import (
+    PAPER_TABLE_TWO,
+    ReportData,
+    StoredEvaluation,
+    blocks_won,
+    compare_errors,
+)
 from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.page import Cell, number
 from fleet_slip.resources import config_names
@@ -134,10 +139,10 @@ def test_the_errors_of_blocks_add_up(data: ReportData) -> None:
     run = data.runs["nominal"]
     won = blocks_won(run, list(data.evaluated.models.values()))
     assert sum(won.values()) == len(run.drive.time_s) // 500
-    better = difference(run, data.evaluated.models["4"], data.evaluated.models["1"])
+    better = compare_errors(run, data.evaluated.models["4"], data.evaluated.models["1"])
     assert better.t > 0
     assert better.p < 0.01
-    worse = difference(run, data.evaluated.models["1"], data.evaluated.models["4"])
+    worse = compare_errors(run, data.evaluated.models["1"], data.evaluated.models["4"])
     assert worse.t == pytest.approx(-better.t)
 
 
@@ -146,21 +151,34 @@ def changed(data: ReportData, content: Any) -> ReportData:
     return replace(data, evaluated=replace(data.evaluated, document=document))
 
 
-NOISE_IS_SLIGHT = CLAIMS["noise_is_slight"]
+def test_claims_name_scenarios_that_ship(data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A misspelt scenario would pass for one that was not evaluated."""
+    names: set[str] = set()
 
+    def statistics(_: object, scenario: str, *__: object) -> ErrorStatistics:
+        names.add(scenario)
+        return ErrorStatistics(*(1.0,) * 10)  # type: ignore[arg-type]
 
-def test_claims_name_nothing_but_scenarios_facts_and_limits() -> None:
-    """A scenario that is misspelt would pass for one that was not evaluated."""
-    known = {*NAMES, *LIMITS, *config_names("scenarios")}
-    for claim in CLAIMS.values():
-        texts = (claim.criterion, f"{{{{ {claim.holds} }}}}", claim.figure, claim.why)
-        for text in texts:
-            assert meta.find_undeclared_variables(TEXTS.parse(text)) <= known, text
+    class Everything(dict[str, Any]):
+        """The document of a drive, and of any other."""
+
+        def __getitem__(self, name: str) -> Any:
+            names.add(name)
+            return super().__getitem__("nominal")
+
+    evaluated = replace(data.evaluated)
+    evaluated.__dict__["scenarios"] = Everything(data.evaluated.scenarios)
+    monkeypatch.setattr(StoredEvaluation, "statistics", statistics)
+    verdicts = evaluate_claims(replace(data, evaluated=evaluated))
+    assert {"melbourne", "mass_1000", "tyres_soft", "car_rear_drive_sedan"} <= names
+    assert names <= {*config_names("scenarios")}
+    untested = [v.claim for v in verdicts if "The evaluation has no" in v.why]
+    assert untested == [many_vehicles, generally_able], "no fleet, and no drive beyond the paper"
 
 
 def test_every_claim_is_judged(data: ReportData) -> None:
-    verdicts = judge_claims(data)
-    assert len(verdicts) == len(CLAIMS)
+    verdicts = evaluate_claims(data)
+    assert len(verdicts) == len(CLAIMS) == 27
     assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
     for one in verdicts:
         assert one.why
@@ -168,11 +186,11 @@ def test_every_claim_is_judged(data: ReportData) -> None:
 
 
 def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
-    assert judge(NOISE_IS_SLIGHT, Facts(data)).status is Status.NOT_REPRODUCED
+    assert evaluate_claim(noise_is_slight, data).status is Status.NOT_REPRODUCED
     content = deepcopy(dict(data.evaluated.document.content))
     (noisy,) = (one for one in content["scenarios"] if one["name"] == "noise_doubled")
     noisy["results"][data.choice]["rmse_deg"] = 0.1
-    verdict = judge(NOISE_IS_SLIGHT, Facts(changed(data, content)))
+    verdict = evaluate_claim(noise_is_slight, changed(data, content))
     assert verdict.status is Status.REPRODUCED
     assert "0.100°" in verdict.figure
 
@@ -180,7 +198,7 @@ def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
 def test_a_claim_without_its_drives_is_not_judged(data: ReportData) -> None:
     content = deepcopy(dict(data.evaluated.document.content))
     content["scenarios"] = [one for one in content["scenarios"] if one["name"] == "nominal"]
-    verdict = judge(NOISE_IS_SLIGHT, Facts(changed(data, content)))
+    verdict = evaluate_claim(noise_is_slight, changed(data, content))
     assert verdict.status is Status.NOT_TESTABLE
     assert "noise_doubled" in verdict.why
     assert "fleet-slip evaluate" in verdict.why
@@ -198,7 +216,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
         for key in path[:-1]:
             place = place[key]
         place[path[-1]] += 0.001
-        keep(evaluations_of(Warehouse(LocalFolder(copy))), content)
+        store_evaluation(evaluations_of(Warehouse(LocalFolder(copy))), content)
         with pytest.raises(DataError, match=f"{told}.* has changed since evaluation 2"):
             call(copy, "report", "smoke")
 
@@ -216,11 +234,11 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
     shown = standings(data)
     names = shown.head[1:]
     for drive, *cells in shown.rows:
-        found = {name: data.evaluated.figures(drive, name) for name in names}
+        found = {name: data.evaluated.statistics(drive, name) for name in names}
         errors = {
             name: one.rmse_deg
             for name, one in found.items()
-            if one and one.rmse_deg is not None and one.coverage >= LEAST_COVERAGE
+            if one and one.rmse_deg is not None and one.coverage >= MIN_COVERAGE
         }
         marked = [name for name, cell in zip(names, cells, strict=True) if is_good(cell)]
         least = min(errors.values())

@@ -1,4 +1,4 @@
-"""The drives of scenarios: what estimators see, and the truth."""
+"""Test drives: the simulated drives of scenarios, with their signals and the exact truth."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
@@ -27,24 +27,34 @@ from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 from fleet_slip.warehouse.tables import Warehouse
 
-SLOWEST_MPS = 2.0
+MIN_SPEED_MPS = 2.0
 """Speed below which a side-slip angle is not evaluated: at standstill there is none."""
 
 
 @dataclass(frozen=True)
-class EvaluatedDrive:
-    """One drive. Arrays have shape (ticks,).
+class TestDrive:
+    """The drive of a scenario. Arrays have shape (ticks,).
 
-    Attributes:
-        scenario: what it is a test of.
-        time_s: time since the drive began.
-        signals: what an estimator may see, by SI column: the inputs of the catalogue and satellite
-            navigation; NaN where null.
-        vx_mps, vy_mps: true velocity of the centre of gravity.
-        station_m: distance along the track within the lap.
-        lateral_offset_m: distance from the track's centre line, positive to the left.
-        lost_control_s: when the driver lost the car; None where he did not.
+    Attributes
+    ----------
+    scenario
+        Car, road, driver and failures.
+    time_s
+        Time since the drive began.
+    signals
+        Signals that estimators may read, by SI column: the inputs of the catalogue and satellite
+        navigation; NaN where null.
+    vx_mps, vy_mps
+        True velocity of the centre of gravity.
+    station_m
+        Distance along the track within the lap.
+    lateral_offset_m
+        Distance from the track's centre line, positive to the left.
+    lost_control_s
+        Time at which the driver lost the car; None if he did not.
     """
+
+    __test__ = False  # pytest collects classes of this name
 
     scenario: Scenario
     time_s: FloatArray
@@ -56,8 +66,13 @@ class EvaluatedDrive:
     lost_control_s: float | None
 
     @property
-    def facts(self) -> dict[str, Any]:
-        """What the car knows of itself: its model and its stated mass, by drive column."""
+    def name(self) -> str:
+        """Name of the scenario."""
+        return self.scenario.name
+
+    @property
+    def vehicle_attributes(self) -> dict[str, Any]:
+        """Vehicle model and stated mass, by drive column."""
         scenario = self.scenario
         return {"vehicle_model": scenario.vehicle.name, "mass_kg": scenario.car.body.sprung_mass_kg}
 
@@ -73,12 +88,41 @@ class EvaluatedDrive:
 
     @cached_property
     def evaluated(self) -> BoolArray:
-        """Where the car moves forward, so that it has a side-slip angle."""
-        return self.vx_mps > SLOWEST_MPS
+        """Rows on which the car moves forward, so that it has a side-slip angle."""
+        return self.vx_mps > MIN_SPEED_MPS
+
+    @cached_property
+    def sections(self) -> "tuple[Section, ...]":
+        """Sections with rows of their own: unstable, and without satellite navigation."""
+        ticks = np.arange(len(self.time_s))
+        fixes = np.isfinite(self.signals["gps_vx_mps"])
+        last_fix = np.maximum.accumulate(np.where(fixes, ticks, 0))
+        sections = (
+            Section("unstable", CRITERION, find_unstable(self)),
+            Section(
+                "gps_outage",
+                f"more than {GPS_OUTAGE_S:g} s since the last fix of satellite navigation",
+                (ticks - last_fix) > GPS_OUTAGE_S * SAMPLE_RATE_HZ,
+            ),
+        )
+        return tuple(section for section in sections if section.rows.any())
+
+
+GPS_OUTAGE_S = 1.0
+"""Time without a fix after which satellite navigation counts as lost."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a drive with statistics of its own; `rows` has shape (ticks,)."""
+
+    name: str
+    criterion: str
+    rows: BoolArray
 
 
 def visible_signals() -> tuple[str, ...]:
-    """Return the names of the signals that an estimator may see: never a truth."""
+    """Return the names of the signals that an estimator may read: never a truth."""
     return (*catalogue().inputs, *GPS_SIGNALS)
 
 
@@ -96,18 +140,18 @@ def simulate_scenarios(
     return report
 
 
-def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
-    """Simulate the drives of scenarios, failures applied; nothing is written.
+def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[TestDrive, ...]:
+    """Simulate the drives of scenarios with their failures; write nothing.
 
-    Estimators see what the log holds; the truth is exact. A log keeps vy in steps of 0.005 m/s,
-    which at 25 m/s is half of what good estimates err.
+    Signals are those of the log, the truth is exact. A log quantises vy to 0.005 m/s, which at
+    25 m/s is half the error of good estimates.
     """
-    once = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
-    logs = dict(zip(once, simulate_logs(list(once.values()), MOTION), strict=True))
-    return tuple(_measured(scenario, logs[scenario.drive_id]) for scenario in scenarios)
+    drives = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
+    logs = dict(zip(drives, simulate_logs(list(drives.values()), MOTION), strict=True))
+    return tuple(_test_drive(scenario, logs[scenario.drive_id]) for scenario in scenarios)
 
 
-def _measured(scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
+def _test_drive(scenario: Scenario, log: DriveLog) -> TestDrive:
     time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
     signals = {}
     for name in visible_signals():
@@ -116,7 +160,7 @@ def _measured(scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
         signals[name] = np.where(missing, np.nan, values)
     for failure in scenario.failures:
         signals = apply_failure(signals, time_s, failure)
-    return EvaluatedDrive(
+    return TestDrive(
         scenario=scenario,
         time_s=time_s,
         signals={catalogue()[name].column: values for name, values in signals.items()},
@@ -128,7 +172,7 @@ def _measured(scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
 def apply_failure(
     signals: Mapping[str, FloatArray], time_s: FloatArray, failure: Failure
 ) -> dict[str, FloatArray]:
-    """Return signals, by name, as a car with the failure logs them; the given ones stay.
+    """Return signals, by name, as a car with the failure logs them.
 
     Raises `QuestionError` if the drive ends before the failure begins.
     """
@@ -141,8 +185,8 @@ def apply_failure(
         )
     changed = dict(signals)
     for name in failure.signals:
-        kept = signals[name][np.argmax(failed)] if failure.kind == "stuck" else np.nan
-        changed[name] = np.where(failed, kept, signals[name])
+        value = signals[name][np.argmax(failed)] if failure.kind == "stuck" else np.nan
+        changed[name] = np.where(failed, value, signals[name])
     return changed
 
 
@@ -197,7 +241,7 @@ def peak_slip(vehicle: VehicleParameters, adhesion: float) -> PeakSlip:
     return PeakSlip(peak(c.static_front, c.stiffness_front), peak(c.static_rear, c.stiffness_rear))
 
 
-def slip_angles(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
+def slip_angles(drive: TestDrive) -> tuple[FloatArray, FloatArray]:
     """Return the slip angles of front and rear axle in rad, positive when sliding to the left.
 
     The yaw rate is the gyroscope's, less the bias that the scenario states; where it is null there
@@ -211,8 +255,8 @@ def slip_angles(drive: EvaluatedDrive) -> tuple[FloatArray, FloatArray]:
     return front, rear
 
 
-def find_unstable(drive: EvaluatedDrive) -> BoolArray:
-    """Return for each tick whether the car is within an unstable stretch."""
+def find_unstable(drive: TestDrive) -> BoolArray:
+    """Return the mask of ticks within an unstable stretch, shape (ticks,)."""
     peak = peak_slip(drive.scenario.car, drive.scenario.adhesion)
     front, rear = slip_angles(drive)
     beyond = (np.abs(front) > peak.front_rad) | (np.abs(rear) > peak.rear_rad)
@@ -220,7 +264,7 @@ def find_unstable(drive: EvaluatedDrive) -> BoolArray:
 
 
 def join(mask: BoolArray, gap: int) -> BoolArray:
-    """Return a mask with the gaps between its runs filled that are shorter than so many entries."""
+    """Fill the gaps of a mask that are shorter than `gap` entries."""
     joined = mask.copy()
     runs = list(_runs(mask))
     for (_, end), (begin, _) in pairwise(runs):
@@ -229,8 +273,8 @@ def join(mask: BoolArray, gap: int) -> BoolArray:
     return joined
 
 
-def find_stretches(drive: EvaluatedDrive, mask: BoolArray) -> tuple[Stretch, ...]:
-    """Return where a mask over the ticks of a drive is true."""
+def find_stretches(drive: TestDrive, mask: BoolArray) -> tuple[Stretch, ...]:
+    """Return the stretches of a drive on which a mask over its ticks is true."""
     return tuple(
         Stretch(
             from_s=float(drive.time_s[begin]),

@@ -1,0 +1,152 @@
+"""Documents of evaluations: stored below evaluations/, and printed as tables."""
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fleet_slip.base import number_of
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
+from fleet_slip.storage.documents import Document, DocumentFolder, checksum
+from fleet_slip.warehouse.tables import Warehouse
+
+BLIND_COLUMNS = 5
+"""Estimators of the table that is printed first: published models, then the best of the others."""
+
+
+@dataclass(frozen=True)
+class Evaluation(Answer):
+    """The document of an evaluation, and the number under which it is stored.
+
+    Attributes
+    ----------
+    content
+        Estimators and their errors, as `--json` prints them.
+    number
+        Number of the document. None for a blind evaluation, which is not stored.
+    sha256
+        Checksum of the content; empty for a blind evaluation.
+    """
+
+    DOCUMENT = "number? sha256? *content"
+
+    content: Mapping[str, Any]
+    number: int | None = None
+    sha256: str = ""
+
+    def parts(self, everything: bool = False) -> Iterator[Part]:
+        """Yield the summary, or the errors of all estimators on every drive besides.
+
+        Parameters
+        ----------
+        everything
+            Include the table of every drive and estimator.
+        """
+        content, is_measured = self.content, "cohort" in self.content
+        names = list(content["estimators"])
+        if "scenarios" in content:
+            drives, title = content["scenarios"], "Test drives: RMSE in deg"
+            yield _ranking_table(content["ranking"])
+            yield f"Pictures: fleet-slip report {shlex.quote(content['ranking']['estimator'])}"
+        elif is_measured:
+            drives, title = content["drives"], "RMSE in deg by drive"
+            yield from _measured_tables(content)
+        else:
+            drives, title = content["drives"], "Blind drives: RMSE in deg against the exact angle"
+            errors = {name: row["rmse_deg"] for name, row in drives[0]["results"].items()}
+            names.sort(key=lambda name: ("@" not in name, errors[name] is None, errors[name]))
+            if not everything:
+                groups = [group for group in drives if group["drives"] > 1]
+                columns = [name for name in names if "/" not in name]
+                yield _error_table(title, groups, columns[:BLIND_COLUMNS])
+        if everything:
+            yield _error_table(f"\n{title}", drives, names)
+        else:
+            yield "Every drive, and all estimators: --all; for machines --json."
+        if self.number:
+            folder = "measured/" if is_measured else ""
+            yield Remark(f"kept as evaluations/{folder}{self.number}.json")
+
+
+def _error_table(
+    title: str, drives: Sequence[Mapping[str, Any]], names: Sequence[str]
+) -> TextTable:
+    """Tabulate RMSE by drive and estimator, with the coverage unless it is 100 %."""
+    headings = [name.replace("_", " ") for name in names]  # which a terminal can wrap
+
+    def cell(statistics: Mapping[str, Any]) -> str:
+        if statistics["rmse_deg"] is None:
+            return "none"
+        coverage = statistics["coverage"]
+        return f"{statistics['rmse_deg']:.3f}" + ("" if coverage == 1 else f" ({coverage:.0%})")
+
+    rows = (
+        [
+            drive["name"],
+            f"{drive.get('truth', drive)['sideslip_std_deg']:.2f}",
+            *(cell(drive["results"][name]) for name in names),
+        ]
+        for drive in drives
+    )
+    return TextTable(title, "|".join(["drive", "side-slip std", *headings]), rows)
+
+
+def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
+    """Tabulate the winner of each test drive."""
+    coverage, model = ranking["least_coverage"], ranking["estimator"]
+    return TextTable(
+        f"\n{model} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is "
+        f"within {ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nCompared "
+        f"are estimators without GPS that cover {coverage:.0%} of the rows. Drives that differ "
+        f"only in GPS count once. {model}/3 is model 3 of Table I, trained on what {model} was "
+        "trained on.",
+        f"scenario|won by|RMSE deg|{model} deg|ratio",
+        (standing for standing in ranking["standings"] if standing["same_as"] is None),
+        "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
+        left=2,
+    )
+
+
+def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
+    """Tabulate statistics on measured drives, the best estimator first."""
+    drives = number_of(len(content["drives"]), "drive")
+    left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
+    kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
+    yield TextTable(
+        f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
+        "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
+        (
+            {**row, "name": name, "kinds": (row["kinds_left_out"] or {}).get("rmse_deg")}
+            for name, row in content["estimators"].items()
+        ),
+        "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
+        "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
+        "{kinds:.3f}",
+        left=2,
+    )
+    yield (
+        "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
+        + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
+    )
+    if content["vehicle"] is None:
+        yield (
+            "No filter was evaluated: the car is unknown. Give --mass, --front-axle and "
+            "--rear-axle, or a vehicle file with --vehicle."
+        )
+
+
+def evaluations_of(warehouse: Warehouse, kind: str = "") -> DocumentFolder:
+    """Return the folder of stored evaluations; kind `measured` for those on measured drives."""
+    folder = warehouse.root / "evaluations"
+    return DocumentFolder(folder / kind if kind else folder)
+
+
+def store_evaluation(documents: DocumentFolder, content: Mapping[str, Any]) -> Evaluation:
+    """Append an evaluation unless the latest one is equal; return the stored one."""
+
+    def attempt(newest: int) -> Document | None:
+        if newest and (latest := documents.read(newest)).sha256 == checksum(content):
+            return latest
+        return documents.create(newest + 1, content)
+
+    return Evaluation(**vars(documents.after_newest(attempt)))

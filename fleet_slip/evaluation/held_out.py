@@ -1,0 +1,278 @@
+"""Segments of measured drives that are held out, and models that are trained without them.
+
+Segments are whole drives, or quarters of each drive's time where there are few, and kinds of
+driving. The columns of a model are chosen on the Gram rows of the other segments, by its recipe.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.columns.drive_columns import Workspace
+from fleet_slip.columns.plan import ColumnPlan
+from fleet_slip.errors import DataError
+from fleet_slip.evaluation.filters import choose_evenly
+from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
+from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
+from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
+from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.grams.folding import FOLD_KEYS, Folding
+from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.publish import manifest_of, with_straight_intercept
+from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.select import Selection, SelectionPlan
+from fleet_slip.views import connect
+from fleet_slip.warehouse.tables import Warehouse
+
+# Segments of drives: a drive and a quarter of its time. All four quarters are a whole drive.
+
+QUARTERS = 4
+MIN_DRIVES = 3
+"""With fewer trips, quarters of their time are held out, not whole drives."""
+
+MAX_FOLDS = 10
+GROUPED_FOLDS = 8
+"""Up to `MAX_FOLDS` trips are held out one by one; more are dealt into this number of groups."""
+
+SPEEDS_MPS = (8.0, 15.0, 25.0)
+LATERAL_MPS2 = (1.0, 2.5, 4.0)
+"""Limits between kinds of driving, by mean speed and by root mean square of ay."""
+
+NOMINAL_RADIUS_M = 0.31
+"""Radius of a tyre, to classify kinds of driving."""
+
+Segments = frozenset[tuple[str, int]]
+"""Segments held out together: name of a drive, and quarter of its time from 0."""
+
+
+@dataclass(frozen=True)
+class HeldOutDrive:
+    """A measured drive: its signals and label, its rows as logged, and its trip."""
+
+    drive: LabelledDrive
+    rows: pa.Table
+    trip: str
+
+    @property
+    def name(self) -> str:
+        """Identifier of the drive."""
+        return self.drive.drive_id
+
+    @property
+    def sideslip_rad(self) -> FloatArray:
+        """The label; NaN where there is none."""
+        return self.drive.sideslip_rad
+
+    @property
+    def evaluated(self) -> BoolArray:
+        """Rows with a label."""
+        return np.isfinite(self.drive.sideslip_rad)
+
+    @cached_property
+    def quarter(self) -> IntArray:
+        """Quarter of the drive's time, by row."""
+        return np.arange(len(self.rows)) * QUARTERS // len(self.rows)
+
+    @cached_property
+    def kind(self) -> str:
+        """Kind of driving, by `SPEEDS_MPS` and `LATERAL_MPS2`."""
+        signals = self.drive.signals
+        wheel = _first_logged(signals.wheel_rl_rad_s, signals.wheel_fl_rad_s)
+        lateral = _first_logged(signals.ay_mps2)
+        words = []
+        if len(wheel):
+            words.append(f"{_band(float(wheel.mean()) * NOMINAL_RADIUS_M, SPEEDS_MPS)} m/s")
+        if len(lateral):
+            size = float(np.sqrt(np.mean(lateral**2)))
+            words.append(f"ay {_band(size, LATERAL_MPS2)} m/s²")
+        return ", ".join(words)
+
+    def rows_in(self, segments: Segments) -> BoolArray:
+        """Return the mask of rows in segments."""
+        return np.isin(self.quarter, [part for name, part in segments if name == self.name])
+
+    def without(self, segments: Segments) -> LabelledDrive:
+        """Return the drive without the labels of segments."""
+        label = np.where(self.rows_in(segments), np.nan, self.drive.sideslip_rad)
+        return replace(self.drive, sideslip_rad=label)
+
+
+def _first_logged(*signals: FloatArray) -> FloatArray:
+    """Return the values of the first signal that has any."""
+    values = [signal[np.isfinite(signal)] for signal in signals]
+    return next((logged for logged in values if len(logged)), values[0])
+
+
+def _band(value: float, edges: Sequence[float]) -> str:
+    names = [f"below {edges[0]:g}"]
+    names += [f"{lower:g} to {upper:g}" for lower, upper in pairwise(edges)]
+    return [*names, f"above {edges[-1]:g}"][int(np.searchsorted(edges, value, side="right"))]
+
+
+def _segments(
+    drives: Iterable[HeldOutDrive], quarters: Iterable[int] = range(QUARTERS)
+) -> Segments:
+    return frozenset((drive.name, quarter) for drive in drives for quarter in quarters)
+
+
+def folds_of(drives: Sequence[HeldOutDrive]) -> list[Segments]:
+    """Return the folds: whole drives, together with all of their trip, or quarters."""
+    trips = list(dict.fromkeys(drive.trip for drive in drives))
+    if len(trips) < MIN_DRIVES:
+        return [_segments(drives, [quarter]) for quarter in range(QUARTERS)]
+    count = len(trips) if len(trips) <= MAX_FOLDS else GROUPED_FOLDS
+    return [
+        _segments(drive for drive in drives if trips.index(drive.trip) % count == fold)
+        for fold in range(count)
+    ]
+
+
+def folds_by_kind(drives: Sequence[HeldOutDrive]) -> dict[str, Segments]:
+    """Return the drives of each kind of driving; empty if all are of one kind."""
+    kinds = sorted({drive.kind for drive in drives})
+    if len(kinds) < 2:
+        return {}
+    return {kind: _segments(drive for drive in drives if drive.kind == kind) for kind in kinds}
+
+
+# Regressions: chosen and fitted on the Gram rows of the training segments.
+
+
+@dataclass(frozen=True)
+class Learner:
+    """A model that is trained again without held-out segments, by its own recipe.
+
+    Attributes
+    ----------
+    plan
+        Recipe of the model.
+    cohort
+        Gram rows of all drives.
+    drives
+        Their rows as logged, with the label.
+    warehouse
+        Data from which a label-free model takes its intercept.
+    """
+
+    plan: SelectionPlan
+    cohort: Cohort
+    drives: Sequence[HeldOutDrive]
+    warehouse: Warehouse
+
+    @classmethod
+    def of(
+        cls,
+        warehouse: Warehouse,
+        request: SelectionRequest,
+        predicate: str,
+        drives: Sequence[HeldOutDrive],
+    ) -> "Learner":
+        """Prepare a model's recipe for the drives of a cohort. Raises as `load_cohort`."""
+        plan = SelectionPlan.of(request)
+        cohort = load_cohort(warehouse, predicate, plan.feature_set)
+        return cls(plan, cohort, drives, warehouse)
+
+    @cached_property
+    def quarters(self) -> Cohort:
+        """Gram rows of each quarter, each as a drive of its own."""
+        name = self.plan.feature_set
+        if features().feature_set(name).change_ticks:
+            raise DataError("a label-free model needs three drives or more: add some.")
+        workspace = Workspace(ColumnPlan.of_set(features(), name))
+        parts = Parts.of_set(features().feature_set(name))
+        attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
+        rows = [
+            row
+            for drive in self.drives
+            for quarter in range(QUARTERS)
+            for row in _gram_rows(workspace, parts, drive, quarter, attributes[drive.name])
+        ]
+        schema = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
+        return with_gram_rows(self.cohort, pa.Table.from_pylist(rows, schema=schema))
+
+    def choose(self, held_out: Segments, prior: Cohort | None = None) -> Selection:
+        """Choose a model without held-out segments, in folds of drives if its key has one value.
+
+        For a single training drive, or for quarters, each quarter counts as a drive.
+        """
+        training = _segments(self.drives) - held_out
+        names = {name for name, _ in training}
+        cohort, plan = self.cohort, self.plan
+        if len(training) < QUARTERS * len(names) or len(names) < 2:
+            cohort = self.quarters
+            names = {_quarter_name(name, quarter) for name, quarter in training}
+        cohort = cohort.part(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
+        if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
+            plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
+        return plan.choose(replace(cohort, prior=prior) if prior else cohort)
+
+    def train(self, held_out: Segments, prior: Cohort | None = None) -> tuple[list[str], Predictor]:
+        """Train without held-out segments; return the chosen columns and the model."""
+        selection = self.choose(held_out, prior)
+        manifest = with_straight_intercept(self.warehouse, manifest_of(selection, "left_out"))
+        return [*selection.winner.model.signals], Predictor.of(manifest)
+
+
+_SUMS = pa.list_(pa.int64())
+
+
+def _quarter_name(drive_id: str, quarter: int) -> str:
+    return f"{drive_id}, quarter {quarter + 1}"
+
+
+def _gram_rows(
+    workspace: Workspace,
+    parts: Parts,
+    drive: HeldOutDrive,
+    quarter: int,
+    attributes: Mapping[str, Any],
+) -> list[dict[str, Any]]:
+    """Return the Gram rows of a quarter's labelled rows; columns look back beyond it."""
+    label = catalogue().label
+    counts = counts_of(drive.rows, workspace.plan, attributes)
+    labelled = counts.present.get(label, np.ones(len(drive.rows), dtype=np.bool_))
+    present = {**counts.present, label: labelled & (drive.quarter == quarter)}
+    name = _quarter_name(drive.name, quarter)
+    (number,) = hash_names(pa.array([name])).tolist()
+    identity = {"drive_id": name, "trip": name, "drive_hash": number, "trip_hash": number}
+    sums = drive_sums(workspace, parts, replace(counts, present=present))
+    rows = gram_rows(sums, workspace.plan.names, parts, {**attributes, **identity})
+    return [row for row in rows if label in row["signals"].split(",")]
+
+
+def predict_drive(model: Predictor, cars: CarCounts, drive: HeldOutDrive) -> FloatArray:
+    """Estimate a drive by a model, shape (rows,)."""
+    numbers = cars.get(drive.rows["vehicle_id"][0].as_py())
+    return model(counts_of(drive.rows, model.plan, None, numbers))
+
+
+MAX_DRIVES = 96
+"""Drives to evaluate of a larger cohort, evenly chosen."""
+
+
+def read_measured_drives(warehouse: Warehouse, cohort: Cohort) -> list[HeldOutDrive]:
+    """Read drives of a cohort, at most `MAX_DRIVES`. Raises `DataError` if none has a label."""
+    trips = {row["drive_id"]: row["trip"] for row in cohort.drives.to_pylist()}
+    drives: list[HeldOutDrive] = []
+    query = "SELECT * FROM log_counts WHERE drive_id = $drive ORDER BY tick"
+    with connect(warehouse.root, query="SELECT 1 FROM log, log_counts") as database:
+        for name in choose_evenly(sorted(trips), MAX_DRIVES):
+            drive = read_drive(database, name)
+            if np.isfinite(drive.sideslip_rad).any():
+                rows = database.sql(query, params={"drive": name}).to_arrow_table()
+                drives.append(HeldOutDrive(drive, rows, trips[name]))
+    if not drives:
+        raise DataError(
+            "no drive of the cohort has the side-slip angle, the reference of every RMSE. Choose "
+            "drives with that label."
+        )
+    return drives

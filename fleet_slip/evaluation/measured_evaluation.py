@@ -1,0 +1,420 @@
+"""Evaluation on measured drives with a label, held out in turn.
+
+Without the held-out segments, columns are chosen by each model's own recipe and fitted, filters are
+tuned and a car is identified: neither a fit nor a choice saw the rows that an error is taken on.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import version as package_version
+from typing import Any
+
+import numpy as np
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.catalogue.features import features
+from fleet_slip.config import Config
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation import yaw_rate_filter
+from fleet_slip.evaluation.evaluator import (
+    Estimator,
+    evaluate,
+    pooled_statistics,
+    try_estimate,
+    variation_between_drives,
+)
+from fleet_slip.evaluation.filters import (
+    FILTERS,
+    TABLE_ONE,
+    TUNING_DRIVES,
+    TUNING_S,
+    Filter,
+    choose_evenly,
+    class_car,
+)
+from fleet_slip.evaluation.held_out import (
+    QUARTERS,
+    HeldOutDrive,
+    Learner,
+    Segments,
+    folds_by_kind,
+    folds_of,
+    predict_drive,
+    read_measured_drives,
+)
+from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Identified, Measured, identify
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    LabelledDrive,
+    follow,
+    measured_speed_mps,
+    without_rest,
+)
+from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.prior import simulate_prior
+from fleet_slip.models.publish import recipe_of
+from fleet_slip.models.registry import ModelVersion, Registry
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.score import calibrated_cars, find_seen
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.storage.runs import LOGGER
+from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.warehouse.tables import Warehouse
+
+FITTED = "fitted without what is judged"
+CHOSEN = "chosen and fitted without what is judged"
+
+
+def evaluate_measured(
+    warehouse: Warehouse,
+    versions: Sequence[ModelVersion],
+    predicate: str,
+    car: VehicleParameters | Measured | None,
+    executor: Executor,
+) -> dict[str, Any]:
+    """Evaluate models, those of Table I and, in a car, filters; return the document.
+
+    A model that was trained on labels of these drives is chosen and fitted anew; another is
+    evaluated as published. The default car is that of the drives' class, if a file ships. Raises
+    `DataError` without drives that have a label, and as `load_cohort`.
+    """
+    cohort = load_cohort(warehouse, predicate)
+    drives = read_measured_drives(warehouse, cohort)
+    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
+    car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
+    competition = Competition.of(warehouse, versions, predicate, drives, car, executor)
+    folds, kinds = folds_of(drives), folds_by_kind(drives)
+    fitted = {
+        held_out: competition.fit(held_out) for held_out in dict.fromkeys([*folds, *kinds.values()])
+    }
+    runs = evaluate(competition.drives, cross_fitted({fold: fitted[fold] for fold in folds}))
+    errors = {
+        name: statistics
+        for name, statistics in pooled_statistics(runs).items()
+        if statistics.rmse_deg is not None
+    }
+    of_kinds = {}
+    if kinds:
+        by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
+        of_kinds = pooled_statistics(evaluate(competition.drives, by_kind))
+    order = sorted(errors, key=lambda name: errors[name].rmse_deg or 0.0)
+    whole_drives = len({quarter for _, quarter in folds[0]}) > 1
+    units = runs
+    if not whole_drives:
+        units = tuple(
+            run.within(run.drive.quarter == quarter, f"{run.name}, quarter {quarter + 1}")
+            for run in runs
+            for quarter in range(QUARTERS)
+        )
+    sources = {name: estimator.told for fold in fitted.values() for name, estimator in fold.items()}
+    return {
+        "format": 2,
+        "package_version": package_version("fleet-slip"),
+        "model": versions[0].reference,
+        "cohort": predicate,
+        "vehicle": car.name if car else None,
+        "parts_of": "drives" if whole_drives else "time",
+        "parts": len(folds),
+        "kinds": [
+            {"name": kind, "drives": sorted({name for name, _ in held_out})}
+            for kind, held_out in kinds.items()
+        ],
+        "estimators": {
+            name: {
+                "told": sources[name],
+                **asdict(errors[name]),
+                **variation_between_drives(units, name),
+                "kinds_left_out": asdict(of_kinds[name]) if name in of_kinds else None,
+                "found": [
+                    fitted[fold][name].parameters if name in fitted[fold] else None
+                    for fold in folds
+                ],
+            }
+            for name in order
+        },
+        "drives": [
+            {
+                "name": run.name,
+                "kind": run.drive.kind,
+                "sideslip_std_deg": run.sideslip_std_deg,
+                "results": {name: asdict(run.statistics[name]) for name in order},
+            }
+            for run in runs
+        ],
+    }
+
+
+@dataclass(frozen=True)
+class FittedEstimator:
+    """An estimator that was fitted without held-out segments.
+
+    Attributes
+    ----------
+    told
+        Its sources of knowledge, in words.
+    estimate
+        Estimator of a drive.
+    parameters
+        Result of the fit, for the document.
+    """
+
+    told: str
+    estimate: Estimator[HeldOutDrive]
+    parameters: Any = None
+
+
+FittedFold = Mapping[str, FittedEstimator]
+
+
+def cross_fitted(fitted: Mapping[Segments, FittedFold]) -> dict[str, Estimator[HeldOutDrive]]:
+    """Combine the folds: each estimates the segments that it was not fitted on."""
+
+    def estimate(name: str, drive: HeldOutDrive) -> FloatArray:
+        combined = np.full(len(drive.rows), np.nan)
+        for held_out, fold in fitted.items():
+            rows = drive.rows_in(held_out)
+            if name in fold and rows.any():
+                combined[rows] = try_estimate(fold[name].estimate, drive)[rows]
+        return combined
+
+    names = dict.fromkeys(name for fold in fitted.values() for name in fold)
+    return {name: partial(estimate, name) for name in names}
+
+
+@dataclass(frozen=True)
+class Competition:
+    """Estimators that compete on measured drives, to be fitted without held-out segments.
+
+    Attributes
+    ----------
+    drives
+        Drives to evaluate, with labels where the car moves.
+    published
+        Models that are evaluated as published.
+    learners
+        Models that are trained again; with their sources of knowledge in words.
+    vehicle
+        The car of a file, for filters.
+    measured
+        Measures of the car, to identify it by.
+    cars
+        Calibration parameters of each car, for calibrated columns.
+    """
+
+    drives: Sequence[HeldOutDrive]
+    published: Mapping[str, Predictor]
+    learners: Mapping[str, tuple[str, Learner]]
+    vehicle: VehicleParameters | None
+    measured: Measured | None
+    cars: CarCounts
+    executor: Executor
+    _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
+    _failures: set[str] = field(default_factory=set)
+
+    @classmethod
+    def of(
+        cls,
+        warehouse: Warehouse,
+        versions: Sequence[ModelVersion],
+        predicate: str,
+        drives: Sequence[HeldOutDrive],
+        car: VehicleParameters | Measured | None,
+        executor: Executor,
+    ) -> "Competition":
+        """Collect Table I, the versions, and filters in the car if there is one."""
+        registry = Registry.of(warehouse)
+        recipes = {
+            f"table1/{row.name}": (FITTED, SelectionRequest(model=",".join(row.signals)))
+            for row in load_model_list(TABLE_ONE).model
+        }
+        published: dict[str, Predictor] = {}
+        for version in versions:
+            manifest, name = version.manifest, version.reference
+            is_label_free = manifest.learned_from is not None
+            if is_label_free or not find_seen(warehouse, registry, manifest, predicate).trained:
+                published[name] = Predictor.of(manifest)
+            else:
+                recipes[name] = CHOSEN, recipe_of(version)[0]
+        learners = {
+            name: (told, Learner.of(warehouse, request, predicate, drives))
+            for name, (told, request) in recipes.items()
+        }
+        is_calibrated = any(model.plan.numbers for model in published.values()) or any(
+            features().feature_set(learner.plan.feature_set).calibrated
+            for _, learner in learners.values()
+        )
+        vehicle = car if isinstance(car, VehicleParameters) else None
+        measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
+        cars = calibrated_cars(warehouse) if is_calibrated else {}
+        if measured is not None:
+            drives = [
+                replace(each, drive=_moving(with_acceleration(each.drive, measured), measured))
+                for each in drives
+            ]
+        return cls(drives, published, learners, vehicle, measured, cars, executor)
+
+    def fit(self, held_out: Segments) -> FittedFold:
+        """Fit, tune and identify without the held-out segments."""
+        identified = self._identify(held_out)
+        return {
+            **{
+                name: FittedEstimator("as published", partial(predict_drive, model, self.cars))
+                for name, model in self.published.items()
+            },
+            **dict(self._train(held_out, identified)),
+            **dict(self._tune(held_out, identified)),
+        }
+
+    def _identify(self, held_out: Segments) -> Identified | None:
+        """Identify the car; None without measures of it, or if the drives lack a signal."""
+        if self.measured is None:
+            return None
+        try:
+            return identify(self.measured, self._training_drives(held_out), self.executor)
+        except DataError as error:
+            LOGGER.warning("no car identified: %s", error)
+            return None
+
+    def _training_drives(self, held_out: Segments) -> list[LabelledDrive]:
+        drives = [drive.without(held_out) for drive in self.drives]
+        drives = [drive for drive in drives if np.isfinite(drive.sideslip_rad).any()]
+        if sum(len(each.signals) for each in drives) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
+            rows = TUNING_S * SAMPLE_RATE_HZ
+            drives = [each.beginning(rows) for each in choose_evenly(drives, TUNING_DRIVES)]
+        return drives
+
+    def _train(
+        self, held_out: Segments, identified: Identified | None
+    ) -> Iterator[tuple[str, FittedEstimator]]:
+        """Train the learners; warn of those that cannot be trained."""
+        for name, (told, learner) in self.learners.items():
+            try:
+                columns, model = learner.train(held_out, self._prior(learner, identified))
+            except (DataError, QuestionError) as error:
+                if name not in self._failures:
+                    LOGGER.warning("%s is missing in some folds: %s", name, error)
+                self._failures.add(name)
+            else:
+                yield name, FittedEstimator(told, partial(predict_drive, model, self.cars), columns)
+
+    def _prior(self, learner: Learner, identified: Identified | None) -> Cohort | None:
+        """Simulate a learner's prior, in the car of this fold if its car was identified."""
+        name, feature_set = learner.plan.request.prior, learner.plan.feature_set
+        if name is None:
+            return None
+        campaign = load_campaign(name)
+        if self.measured and identified_prior(campaign):
+            if identified is None:
+                raise DataError("the car of the prior cannot be identified without these drives.")
+            plan = campaign.plan.model_copy(update={"vehicles": (identified.car,)})
+            campaign = campaign.model_copy(update={"plan": plan})
+        key = campaign.digest, feature_set
+        if key not in self._priors:
+            self._priors[key] = simulate_prior(campaign, feature_set, self.executor)
+        return self._priors[key]
+
+    def _tune(
+        self, held_out: Segments, identified: Identified | None
+    ) -> Iterator[tuple[str, FittedEstimator]]:
+        """Tune filters in the car of the file and in the identified car."""
+        if self.measured is None:
+            return
+        rolling = partial(rolling_estimate, self.measured.car(Fitted()))
+        yield "kinematic", FittedEstimator("geometry", rolling)
+        cars: dict[str, tuple[str, VehicleParameters]] = {}
+        if self.vehicle is not None and (
+            identified is None or self.vehicle.description != IDENTIFIED
+        ):
+            cars["tuned"] = ("the vehicle's file", self.vehicle)
+        if identified is not None:
+            cars["identified"] = ("the identified car", identified.car)
+            yield (
+                "ekf_identified",
+                FittedEstimator(
+                    "geometry, and a car identified from the other parts",
+                    partial(_identified_estimate, identified),
+                    identified.as_dict()["found"],
+                ),
+            )
+        drives = self._training_drives(held_out)
+        has_gps = any(np.isfinite(drive.signals.gps_vx_mps).any() for drive in drives)
+        for kind in FILTERS:
+            for suffix, (source, car) in cars.items():
+                name = f"{kind.module}_{suffix}"
+                if kind.informed or name == "ekf_identified" or (kind.gps and not has_gps):
+                    continue
+                try:
+                    tuned = kind.tune(drives, car, self.executor).parameters
+                except DataError as error:
+                    LOGGER.warning("%s left out: %s", name, error)
+                    continue
+                yield (
+                    name,
+                    FittedEstimator(
+                        f"{source}, and labels to be tuned by",
+                        partial(_filter_estimate, kind, car, tuned),
+                        tuned.model_dump(mode="json"),
+                    ),
+                )
+
+
+def prior_of(version: ModelVersion) -> Campaign | None:
+    """Return the campaign of a version's prior, if it has one. Raises `ConfigError`."""
+    name = recipe_of(version)[0].prior if version.manifest.prior else None
+    return load_campaign(name) if name else None
+
+
+def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
+    """Return the car of a prior that was identified from drives; None for another prior."""
+    cars = campaign.plan.vehicles if campaign else ()
+    return cars[0] if len(cars) == 1 and cars[0].description == IDENTIFIED else None
+
+
+def _filter_estimate(
+    kind: Filter, car: VehicleParameters, parameters: Config, drive: HeldOutDrive
+) -> FloatArray:
+    return kind.estimate(drive.drive.signals, car, parameters)
+
+
+def _identified_estimate(identified: Identified, drive: HeldOutDrive) -> FloatArray:
+    return identified.estimate(drive.drive.signals)
+
+
+def rolling_estimate(vehicle: VehicleParameters, drive: HeldOutDrive) -> FloatArray:
+    """Return side-slip in rad of rear wheels that roll without slip, arctan(b r / vx)."""
+    signals = drive.drive.signals
+    noise = yaw_rate_filter.YawRateNoise()
+    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(signals, vehicle, noise)
+    lateral_mps = vehicle.body.rear_axle_m * yaw_rate_rad_s
+    angle_rad: FloatArray = np.arctan2(lateral_mps, measured_speed_mps(signals, vehicle))
+    return angle_rad
+
+
+WHEELS_LAG = 0.1
+"""Share of a new sample in the acceleration from wheel speeds."""
+
+
+def with_acceleration(drive: LabelledDrive, car: Measured) -> LabelledDrive:
+    """Derive ax from wheel speeds where none is logged."""
+    signals = drive.signals
+    if np.isfinite(signals.ax_mps2).any():
+        return drive
+    try:
+        speed = measured_speed_mps(signals, car.car(Fitted()))
+    except DataError:
+        return drive
+    ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
+    return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
+
+
+def _moving(drive: LabelledDrive, car: Measured) -> LabelledDrive:
+    """Drop the labels of rows in which the wheels show that the car rests."""
+    with suppress(DataError):
+        return without_rest(drive, car.car(Fitted()))
+    return drive
