@@ -38,7 +38,7 @@ def plot(root: str, model: str, file: str) -> None:
     above.plot(frames.x_m[reach], frames.y_m[reach], color=colour("grid"), linewidth=14)
     ours = frames.x_m[now], frames.y_m[now], frames.heading_rad[now]
     for x, y, heading, name in [
-        *((*place, "muted") for place in frames.others[now].T),
+        *((*place, "muted") for place in frames.other_cars[now].T),
         (*ours, "model_4"),
     ]:
         turned = Affine2D().rotate(heading).translate(x, y) + above.transData
@@ -57,7 +57,7 @@ def plot(root: str, model: str, file: str) -> None:
 
 
 def _turns(frames: DriveFrames) -> Iterator[tuple[NDArray[Any], float]]:
-    return zip(frames.others, frames.sideslip_deg.tolist(), strict=True)
+    return zip(frames.other_cars, frames.sideslip_deg.tolist(), strict=True)
 
 
 def main() -> None:

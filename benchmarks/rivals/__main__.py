@@ -115,7 +115,7 @@ def train(
     if not (wanted(FILTER.name) or wanted(TREE)):
         return
     car = load_scenario("nominal").car
-    drives = TuningDrives.of(fleet.warehouse, cohort, with_mass=False)
+    drives = TuningDrives.choose(fleet.warehouse, cohort, with_mass=False)
     with ThreadPoolExecutor(1) as executor:
         best, took_s = timed(partial(FILTER.tune, drives.drives, car, executor))
         estimate = FilterEstimate(FILTER, best.parameters)

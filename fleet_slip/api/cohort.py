@@ -128,7 +128,7 @@ class FleetCohort(Rooted):
         from fleet_slip.evaluation.identify import identify_held_out, measured_car
 
         car = measured_car(name, measured)
-        chosen = TuningDrives.of(self.warehouse, self._load(PLAIN), with_mass=False)
+        chosen = TuningDrives.choose(self.warehouse, self._load(PLAIN), with_mass=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.drives, executor)
 

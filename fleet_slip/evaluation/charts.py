@@ -103,8 +103,8 @@ class DriveBlock:
     @property
     def section(self) -> Section | None:
         """The section to mark, if the drive has it."""
-        sections = (each for each in self.run.drive.sections if each.name == self.shaded)
-        return next(sections, None)
+        sections = {section.name: section for section in self.run.drive.sections}
+        return sections.get(self.shaded or "")
 
     @property
     def truth_deg(self) -> FloatArray:
@@ -160,12 +160,12 @@ def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float) 
 
 def _panels(figure: Figure, block: DriveBlock, top_in: float) -> Iterator[Axes]:
     width, height = figure.get_size_inches()
-    left, across = LEFT_IN / width, 1 - (LEFT_IN + RIGHT_IN) / width
+    begin, across = LEFT_IN / width, 1 - (LEFT_IN + RIGHT_IN) / width
     bottom = top_in - HEAD_IN - ANGLE_IN
-    yield figure.add_axes((left, bottom / height, across, ANGLE_IN / height))
+    yield figure.add_axes((begin, bottom / height, across, ANGLE_IN / height))
     for _ in block.all_strips:
         bottom -= GAP_IN + STRIP_IN
-        yield figure.add_axes((left, bottom / height, across, STRIP_IN / height))
+        yield figure.add_axes((begin, bottom / height, across, STRIP_IN / height))
 
 
 def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line) -> None:
@@ -188,14 +188,14 @@ def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
 def _legend(figure: Figure, title: str, names: Sequence[tuple[str, str]], top_in: float) -> None:
     """Write the title, and below it the name of each line in its colour."""
     width, height = figure.get_size_inches()
-    left = LEFT_IN
-    figure.text(left / width, (top_in - 0.05) / height, title, fontweight="bold", va="top")
+    x_in = LEFT_IN
+    figure.text(x_in / width, (top_in - 0.05) / height, title, fontweight="bold", va="top")
     for name, tone in names:
         mark = "\N{BLACK SQUARE}" if tone in ("unstable", "outage") else "\N{EM DASH}"
         figure.text(
-            left / width, (top_in - 0.24) / height, f"{mark} {name}", color=colour(tone), va="top"
+            x_in / width, (top_in - 0.24) / height, f"{mark} {name}", color=colour(tone), va="top"
         )
-        left += 0.07 * (len(name) + 3.5)
+        x_in += 0.07 * (len(name) + 3.5)
 
 
 def _caption(axes: Axes, block: DriveBlock, line: Line) -> None:
@@ -303,9 +303,9 @@ def draw_pictures(data: ReportData) -> Iterator[Picture]:
             )
     filters = [name for name in DRAWN_FILTERS if name in data.evaluated.estimators]
     if filters and "nominal" in runs:
-        first, *others = (Line(name, FILTER_LABELS[name], name) for name in filters)
+        first, *further = (Line(name, FILTER_LABELS[name], name) for name in filters)
         blocks = [
-            DriveBlock(title, runs[name], (first, choice), tuple(others), "gps_outage")
+            DriveBlock(title, runs[name], (first, choice), tuple(further), "gps_outage")
             for name, title in OUTAGES.items()
             if name in runs
         ]

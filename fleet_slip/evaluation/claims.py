@@ -268,7 +268,7 @@ def last_two_best(report: ReportContext) -> Finding:
     if winner.model is winner.best:
         why = f"No model with fewer signals comes near model {winner.best.name}."
     else:
-        gain = next(each for each in winner.shortfalls if each.model is winner.model)
+        gain = next(gap for gap in winner.shortfalls if gap.model is winner.model)
         why = (
             f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE "
             f"that is larger by {gain}: {'real' if gain.real else 'not real'}, and negligible."
@@ -326,13 +326,13 @@ def best_but_for_a_section(report: ReportContext) -> Finding:
     errors, models = _nominal_errors(report), report.data.evaluated.models
     by_estimator = blocks_won(report.data.runs["nominal"], list(models.values()))
     won = {name: by_estimator[estimator] for name, estimator in models.items()}
-    blocks, near = sum(won.values()), [errors[name] for name in errors if name != "1"]
+    blocks, similar = sum(won.values()), [errors[name] for name in errors if name != "1"]
     counts = ", ".join(f"model {name} in {times}" for name, times in won.items())
     return Finding(
         won["4"] + won["5"] >= blocks - 1,
         f"smallest error of {blocks} blocks: {counts}",
-        f"From model 2 on they differ by {degrees(max(near) - min(near))} in root mean square, so "
-        "that chance decides a block.",
+        f"From model 2 on they differ by {degrees(max(similar) - min(similar))} in root mean "
+        "square, so that chance decides a block.",
     )
 
 
@@ -402,13 +402,13 @@ def appropriate_at_0_4(report: ReportContext) -> Finding:
     """At 0.4 the model works appropriately but for one section."""
     subject = "unstable section at an adhesion of 0.4"
     inside, outside = (report.slippery(side, subject) for side in ("inside", "outside"))
-    whole = report.errors(SLIPPERY)
+    drive = report.errors(SLIPPERY)
     return Finding(
         outside.correlation >= MIN_CORRELATION,
         f"correlation {number(outside.correlation)} and root mean square error "
         f"{degrees(outside.rmse_deg)} while stable, {number(inside.correlation)} and "
-        f"{degrees(inside.rmse_deg)} while not; the drive as a whole {number(whole.correlation)} "
-        f"and {degrees(whole.rmse_deg)}",
+        f"{degrees(inside.rmse_deg)} while not; the drive as a whole {number(drive.correlation)} "
+        f"and {degrees(drive.rmse_deg)}",
         "The model knows steering and lateral acceleration; a car that slides over its front "
         "wheels is steered more and turns no more, which no training drive has shown.",
     )

@@ -65,13 +65,13 @@ class SensorErrors(Config):
 
     def corrected(self, drive: DriveSignals, car: VehicleParameters) -> DriveSignals:
         """Correct the signals of a drive; derive missing road wheels from the steering wheel."""
-        left, right = drive.steer_fl_rad, drive.steer_fr_rad
+        steer_fl, steer_fr = drive.steer_fl_rad, drive.steer_fr_rad
         if not drive.has_road_wheels:
-            left = right = drive.steering_wheel_rad / car.steering.ratio
+            steer_fl = steer_fr = drive.steering_wheel_rad / car.steering.ratio
         return replace(
             drive,
-            steer_fl_rad=(left - self.steer_offset_rad) / self.steer_gain,
-            steer_fr_rad=(right - self.steer_offset_rad) / self.steer_gain,
+            steer_fl_rad=(steer_fl - self.steer_offset_rad) / self.steer_gain,
+            steer_fr_rad=(steer_fr - self.steer_offset_rad) / self.steer_gain,
             ay_mps2=(drive.ay_mps2 - self.ay_offset_mps2) / self.ay_gain,
         )
 

@@ -345,7 +345,7 @@ class TuningDrives:
     with_mass: bool
 
     @classmethod
-    def of(cls, warehouse: Warehouse, cohort: Cohort, *, with_mass: bool) -> "TuningDrives":
+    def choose(cls, warehouse: Warehouse, cohort: Cohort, *, with_mass: bool) -> "TuningDrives":
         """Choose drives evenly, by name."""
         columns = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"])
         rows = {row["drive_id"]: row for row in columns.to_pylist()}
@@ -367,7 +367,7 @@ class TuningDrives:
         message for each failure: a fix, wheel speeds, steering or a label is missing (`failing`).
         """
         key = {
-            "drives": [TUNING_S, *(list(each) for each in self.keys)],
+            "drives": [TUNING_S, *map(list, self.keys)],
             "car": car.model_dump(mode="json"),
             "program": checksum_of_sources(),
         }

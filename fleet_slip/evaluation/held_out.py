@@ -54,28 +54,22 @@ Segments = frozenset[tuple[str, int]]
 """Segments held out together: name of a drive, and quarter of its time from 0."""
 
 
-@dataclass(frozen=True)
-class HeldOutDrive:
-    """A measured drive: its signals and label, its rows as logged, and its trip."""
+@dataclass(frozen=True, kw_only=True)
+class HeldOutDrive(LabelledDrive):
+    """A measured drive with its label, its rows as logged, and its trip."""
 
-    drive: LabelledDrive
     rows: pa.Table
     trip: str
 
     @property
     def name(self) -> str:
         """Identifier of the drive."""
-        return self.drive.drive_id
-
-    @property
-    def sideslip_rad(self) -> FloatArray:
-        """The label; NaN where there is none."""
-        return self.drive.sideslip_rad
+        return self.drive_id
 
     @property
     def evaluated(self) -> BoolArray:
         """Rows with a label."""
-        return np.isfinite(self.drive.sideslip_rad)
+        return np.isfinite(self.sideslip_rad)
 
     @cached_property
     def quarter(self) -> IntArray:
@@ -85,7 +79,7 @@ class HeldOutDrive:
     @cached_property
     def kind(self) -> str:
         """Kind of driving, by `SPEEDS_MPS` and `LATERAL_MPS2`."""
-        signals = self.drive.signals
+        signals = self.signals
         wheel = _first_logged(signals.wheel_rl_rad_s, signals.wheel_fl_rad_s)
         lateral = _first_logged(signals.ay_mps2)
         words = []
@@ -102,8 +96,8 @@ class HeldOutDrive:
 
     def without(self, segments: Segments) -> LabelledDrive:
         """Return the drive without the labels of segments."""
-        label = np.where(self.rows_in(segments), np.nan, self.drive.sideslip_rad)
-        return replace(self.drive, sideslip_rad=label)
+        label = np.where(self.rows_in(segments), np.nan, self.sideslip_rad)
+        return LabelledDrive(self.drive_id, self.signals, label)
 
 
 def _first_logged(*signals: FloatArray) -> FloatArray:
@@ -169,7 +163,7 @@ class Learner:
     warehouse: Warehouse
 
     @classmethod
-    def of(
+    def prepare(
         cls,
         warehouse: Warehouse,
         request: SelectionRequest,
@@ -269,7 +263,7 @@ def read_measured_drives(warehouse: Warehouse, cohort: Cohort) -> list[HeldOutDr
             drive = read_drive(database, name)
             if np.isfinite(drive.sideslip_rad).any():
                 rows = database.sql(query, params={"drive": name}).to_arrow_table()
-                drives.append(HeldOutDrive(drive, rows, trips[name]))
+                drives.append(HeldOutDrive(**vars(drive), rows=rows, trip=trips[name]))
     if not drives:
         raise DataError(
             "no drive of the cohort has the side-slip angle, the reference of every RMSE. Choose "

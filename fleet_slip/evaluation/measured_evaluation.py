@@ -88,7 +88,7 @@ def evaluate_measured(
     drives = read_measured_drives(warehouse, cohort)
     car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
     car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
-    competition = Competition.of(warehouse, versions, predicate, drives, car, executor)
+    competition = Competition.collect(warehouse, versions, predicate, drives, car, executor)
     folds, kinds = folds_of(drives), folds_by_kind(drives)
     fitted = {
         held_out: competition.fit(held_out) for held_out in dict.fromkeys([*folds, *kinds.values()])
@@ -112,7 +112,9 @@ def evaluate_measured(
             for run in runs
             for quarter in range(QUARTERS)
         )
-    sources = {name: estimator.told for fold in fitted.values() for name, estimator in fold.items()}
+    sources = {
+        name: estimator.source for fold in fitted.values() for name, estimator in fold.items()
+    }
     return {
         "format": 2,
         "package_version": package_version("fleet-slip"),
@@ -156,15 +158,15 @@ class FittedEstimator:
 
     Attributes
     ----------
-    told
-        Its sources of knowledge, in words.
+    source
+        Its source of knowledge, in words.
     estimate
         Estimator of a drive.
     parameters
         Result of the fit, for the document.
     """
 
-    told: str
+    source: str
     estimate: Estimator[HeldOutDrive]
     parameters: Any = None
 
@@ -218,7 +220,7 @@ class Competition:
     _failures: set[str] = field(default_factory=set)
 
     @classmethod
-    def of(
+    def collect(
         cls,
         warehouse: Warehouse,
         versions: Sequence[ModelVersion],
@@ -242,8 +244,8 @@ class Competition:
             else:
                 recipes[name] = CHOSEN, recipe_of(version)[0]
         learners = {
-            name: (told, Learner.of(warehouse, request, predicate, drives))
-            for name, (told, request) in recipes.items()
+            name: (source, Learner.prepare(warehouse, request, predicate, drives))
+            for name, (source, request) in recipes.items()
         }
         is_calibrated = any(model.plan.numbers for model in published.values()) or any(
             features().feature_set(learner.plan.feature_set).calibrated
@@ -253,10 +255,7 @@ class Competition:
         measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
-            drives = [
-                replace(each, drive=_moving(with_acceleration(each.drive, measured), measured))
-                for each in drives
-            ]
+            drives = [_moving(with_acceleration(drive, measured), measured) for drive in drives]
         return cls(drives, published, learners, vehicle, measured, cars, executor)
 
     def fit(self, held_out: Segments) -> FittedFold:
@@ -284,16 +283,16 @@ class Competition:
     def _training_drives(self, held_out: Segments) -> list[LabelledDrive]:
         drives = [drive.without(held_out) for drive in self.drives]
         drives = [drive for drive in drives if np.isfinite(drive.sideslip_rad).any()]
-        if sum(len(each.signals) for each in drives) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
+        if sum(len(drive.signals) for drive in drives) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
             rows = TUNING_S * SAMPLE_RATE_HZ
-            drives = [each.beginning(rows) for each in choose_evenly(drives, TUNING_DRIVES)]
+            drives = [drive.beginning(rows) for drive in choose_evenly(drives, TUNING_DRIVES)]
         return drives
 
     def _train(
         self, held_out: Segments, identified: Identified | None
     ) -> Iterator[tuple[str, FittedEstimator]]:
         """Train the learners; warn of those that cannot be trained."""
-        for name, (told, learner) in self.learners.items():
+        for name, (source, learner) in self.learners.items():
             try:
                 columns, model = learner.train(held_out, self._prior(learner, identified))
             except (DataError, QuestionError) as error:
@@ -301,7 +300,10 @@ class Competition:
                     LOGGER.warning("%s is missing in some folds: %s", name, error)
                 self._failures.add(name)
             else:
-                yield name, FittedEstimator(told, partial(predict_drive, model, self.cars), columns)
+                yield (
+                    name,
+                    FittedEstimator(source, partial(predict_drive, model, self.cars), columns),
+                )
 
     def _prior(self, learner: Learner, identified: Identified | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""
@@ -345,7 +347,7 @@ class Competition:
         drives = self._training_drives(held_out)
         has_gps = any(np.isfinite(drive.signals.gps_vx_mps).any() for drive in drives)
         for kind in FILTERS:
-            for suffix, (source, car) in cars.items():
+            for suffix, (knowledge, car) in cars.items():
                 name = f"{kind.module}_{suffix}"
                 if kind.informed or name == "ekf_identified" or (kind.gps and not has_gps):
                     continue
@@ -357,7 +359,7 @@ class Competition:
                 yield (
                     name,
                     FittedEstimator(
-                        f"{source}, and labels to be tuned by",
+                        f"{knowledge}, and labels to be tuned by",
                         partial(_filter_estimate, kind, car, tuned),
                         tuned.model_dump(mode="json"),
                     ),
@@ -379,16 +381,16 @@ def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
 def _filter_estimate(
     kind: Filter, car: VehicleParameters, parameters: Config, drive: HeldOutDrive
 ) -> FloatArray:
-    return kind.estimate(drive.drive.signals, car, parameters)
+    return kind.estimate(drive.signals, car, parameters)
 
 
 def _identified_estimate(identified: Identified, drive: HeldOutDrive) -> FloatArray:
-    return identified.estimate(drive.drive.signals)
+    return identified.estimate(drive.signals)
 
 
 def rolling_estimate(vehicle: VehicleParameters, drive: HeldOutDrive) -> FloatArray:
     """Return side-slip in rad of rear wheels that roll without slip, arctan(b r / vx)."""
-    signals = drive.drive.signals
+    signals = drive.signals
     noise = yaw_rate_filter.YawRateNoise()
     yaw_rate_rad_s, _ = yaw_rate_filter.estimate(signals, vehicle, noise)
     lateral_mps = vehicle.body.rear_axle_m * yaw_rate_rad_s
@@ -400,7 +402,7 @@ WHEELS_LAG = 0.1
 """Share of a new sample in the acceleration from wheel speeds."""
 
 
-def with_acceleration(drive: LabelledDrive, car: Measured) -> LabelledDrive:
+def with_acceleration(drive: HeldOutDrive, car: Measured) -> HeldOutDrive:
     """Derive ax from wheel speeds where none is logged."""
     signals = drive.signals
     if np.isfinite(signals.ax_mps2).any():
@@ -413,7 +415,7 @@ def with_acceleration(drive: LabelledDrive, car: Measured) -> LabelledDrive:
     return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
 
 
-def _moving(drive: LabelledDrive, car: Measured) -> LabelledDrive:
+def _moving(drive: HeldOutDrive, car: Measured) -> HeldOutDrive:
     """Drop the labels of rows in which the wheels show that the car rests."""
     with suppress(DataError):
         return without_rest(drive, car.car(Fitted()))

@@ -64,7 +64,7 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
         trained=trained,
         runs=runs,
         orders=compare_orders(cohort, tuple(dict.fromkeys(models[-1].signals))),
-        on_measured=next((each for each in contents if each["model"] == version.reference), None),
+        on_measured=next((c for c in contents if c["model"] == version.reference), None),
         shipped=tuple(scenario.name for scenario in shipped),
     )
 

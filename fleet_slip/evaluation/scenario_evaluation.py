@@ -37,7 +37,7 @@ def train_competitors(
     for models in trained:
         bank |= models.bank()
     with_mass = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
-    drives = TuningDrives.of(warehouse, trained[0].selection.cohort, with_mass=with_mass)
+    drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     return trained, bank | filter_bank(drives, load_scenario("nominal").car, executor)
 
 
@@ -49,7 +49,7 @@ def evaluate_scenarios(
     executor: Executor,
 ) -> dict[str, Any]:
     """Evaluate a model and its competitors on scenarios; return the document."""
-    (first, *others), bank = train_competitors(warehouse, one_car, fleets, executor)
+    (first, *fleet_models), bank = train_competitors(warehouse, one_car, fleets, executor)
     estimators = {name: estimator for name, (estimator, _) in bank.items()}
     runs = evaluate(simulate_drives(scenarios), estimators)
     gps = {name for name, (_, about) in bank.items() if about.get("gps")}
@@ -62,7 +62,7 @@ def evaluate_scenarios(
         "grams_version": first.selection.cohort.grams_version,
         "comparisons": [
             row
-            for fleet in others
+            for fleet in fleet_models
             for row in compare_models(runs, first.table_one, fleet.table_one)
         ],
         "ranking": rank(runs, first.version.reference, gps),
@@ -72,11 +72,11 @@ def evaluate_scenarios(
 def evaluate_blind(
     warehouse: Warehouse,
     model: ModelVersion,
-    others: Sequence[ModelVersion],
+    fleets: Sequence[ModelVersion],
     executor: Executor,
 ) -> dict[str, Any]:
     """Evaluate on drives that follow from the model's hash; return the document."""
-    _, bank = train_competitors(warehouse, model, others, executor)
+    _, bank = train_competitors(warehouse, model, fleets, executor)
     estimators = {name: estimator for name, (estimator, _) in bank.items()}
     return {
         "format": 1,
@@ -111,7 +111,7 @@ def _scenario_document(run: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
                 "name": section.name,
                 "criterion": section.criterion,
                 "rows": int(section.rows.sum()),
-                "stretches": [asdict(each) for each in find_stretches(drive, section.rows)],
+                "stretches": list(map(asdict, find_stretches(drive, section.rows))),
             }
             for section in drive.sections
         ],

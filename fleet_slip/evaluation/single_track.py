@@ -7,7 +7,7 @@ and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics" (2012), s
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, cast
+from typing import NamedTuple, TypeVar, cast
 
 import duckdb
 import numpy as np
@@ -20,7 +20,7 @@ from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from fleet_slip.warehouse.database import reading_files
 
-# What an estimator may read of one drive, in SI units at 100 Hz, and what its wheels tell.
+# Signals of a drive in SI units at 100 Hz, and speeds of its wheels.
 #
 # Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
 # reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque
@@ -53,22 +53,22 @@ class DriveSignals:
 
     @property
     def has_road_wheels(self) -> bool:
-        """Whether the angle of any front wheel is logged."""
+        """True if the angle of a front wheel is logged."""
         return bool(np.isfinite([self.steer_fl_rad, self.steer_fr_rad]).any())
 
 
 @dataclass(frozen=True)
 class LabelledDrive:
-    """A drive with its true side-slip, for evaluation and tuning; no estimator sees it."""
+    """A drive with its true side-slip angle, for evaluation and tuning."""
 
     drive_id: str
     signals: DriveSignals
     sideslip_rad: FloatArray
     car: VehicleParameters | None = None
-    """The car as filters know it; None where it is that of all drives."""
+    """The car of this drive, as filters assume it; None for the car of all drives."""
 
     def beginning(self, rows: int) -> "LabelledDrive":
-        """Return its first rows."""
+        """Return the first rows."""
         arrays = {name: values[:rows] for name, values in vars(self.signals).items()}
         return replace(self, signals=DriveSignals(**arrays), sideslip_rad=self.sideslip_rad[:rows])
 
@@ -78,13 +78,13 @@ def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDr
     label = catalogue()[catalogue().label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]
     with reading_files(database, f"reading the drive {drive_id!r}"):
-        found = database.execute(
+        rows = database.execute(
             f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
             {"drive_id": drive_id},
         ).fetchnumpy()
-    if not len(found[label]):
+    if not len(rows[label]):
         raise QuestionError(f"no drive is called {drive_id!r}. The view drives lists them.")
-    arrays = {name: np.ma.filled(found[name].astype(np.float64), np.nan) for name in columns}
+    arrays = {name: np.ma.filled(rows[name].astype(np.float64), np.nan) for name in columns}
     sideslip_rad = arrays.pop(label)
     return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
 
@@ -105,7 +105,7 @@ def hold_last(values: FloatArray, name: str) -> FloatArray:
 
 @dataclass(frozen=True)
 class AxleSpeeds:
-    """Rolling velocity of the two wheels of one axle over cos δ, and their distance."""
+    """Rolling velocities of the wheels of an axle over cos δ, and their distance."""
 
     left_mps: FloatArray
     right_mps: FloatArray
@@ -139,17 +139,17 @@ def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
         return AxleSpeeds(
             radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
         )
-    left, right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
+    tan_left, tan_right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
     return AxleSpeeds(
         radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
         radius * drive.wheel_fr_rad_s / np.cos(drive.steer_fr_rad),
-        car.body.track_front_m + front * (right - left),
-        front * (left + right) / 2,
+        car.body.track_front_m + front * (tan_right - tan_left),
+        front * (tan_left + tan_right) / 2,
     )
 
 
 SLOWEST_ANGLE_MPS = 1.0
-"""Longitudinal velocity below which the angle is taken as if the car drove so fast."""
+"""Longitudinal velocity that replaces a smaller one in the angle."""
 
 
 def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
@@ -172,11 +172,13 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
 
 
 WALKING_MPS = 2.0
-"""Slower than this an angle of travel is noise: a reference sensor at rest says anything."""
+"""Speed below which the label is noise: a reference sensor measures no angle at rest."""
+
+L = TypeVar("L", bound=LabelledDrive)
 
 
-def without_rest(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
-    """Return the drive without the labels of rows in which the car rests or creeps.
+def without_rest(drive: L, car: VehicleParameters) -> L:
+    """Drop the labels of rows in which the car rests or creeps.
 
     Raises `DataError` without wheel speeds.
     """
@@ -185,21 +187,22 @@ def without_rest(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
 
 
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
-    """Return the mean angle of the front wheels, or that of the one that a car logs.
+    """Return the mean angle of the front wheels that are logged.
 
     Raises `DataError` without any.
     """
-    logged = [one for one in (drive.steer_fl_rad, drive.steer_fr_rad) if np.isfinite(one).any()]
+    wheels = (drive.steer_fl_rad, drive.steer_fr_rad)
+    logged = [angle_rad for angle_rad in wheels if np.isfinite(angle_rad).any()]
     mean = sum(logged, np.zeros(len(drive))) / max(len(logged), 1)
     return hold_last(mean if logged else drive.steer_fl_rad, "steer_fl and steer_fr")
 
 
 LEAST_LOAD = 0.05
-"""Smallest load of a wheel over that at rest: noise lifts none."""
+"""Smallest load of a wheel over its load at rest, so that noise lifts no wheel."""
 
 
 class Axles(NamedTuple):
-    """What both tyres of an axle can do together."""
+    """Cornering stiffness and grip of both tyres of each axle together."""
 
     stiffness_front_n: float
     """Cornering stiffness per unit of slip."""
@@ -234,7 +237,7 @@ def loaded_axles(
 
 @kernel
 def follow(values: FloatArray, gain: float) -> FloatArray:
-    """Return what follows values with a lag, x ← x + gain (value − x), from the first value on."""
+    """Filter values with a lag, x ← x + gain (value − x), from the first value on."""
     lagged = np.empty(len(values))
     x = values[0]
     for k in range(len(values)):

@@ -34,8 +34,6 @@ from fleet_slip.warehouse.tables import Warehouse
 if TYPE_CHECKING:
     from fleet_slip.simulation.traffic import TrafficDrive
 
-# What is to be seen of a drive: where the car is, its angles, its wheels, and its gates.
-
 FRAMES_PER_S = 25
 SPACING_M = 3.0
 SMOOTHED_TICKS = 51
@@ -47,16 +45,26 @@ FACTS = ("vehicle_model", "mass_kg")
 class DriveFrames:
     """A drive at 25 frames a second; arrays have shape (frames,).
 
-    Attributes:
-        model: the version that estimates, NAME@VERSION.
-        x_m, y_m, heading_rad: place and direction of the car on the ground.
-        sideslip_deg: the reference; NaN where the drive has none.
-        estimate_deg: the estimate; NaN where the model lacks a signal.
-        wheel_rad_s: speeds of fl, fr, rl, rr; NaN where they were not logged.
-        steer_rad: mean angle of the front wheels.
-        gates: how far each gate of the model is open, from 0 to 1.
-        track: x and y of the track's centre line; empty where no track is known.
-        others: of each frame x, y and heading of the other cars in traffic, (3, cars).
+    Attributes
+    ----------
+    model
+        The version that estimates, NAME@VERSION.
+    x_m, y_m, heading_rad
+        Position and heading of the car on the ground.
+    sideslip_deg
+        The reference; NaN where the drive has none.
+    estimate_deg
+        The estimate; NaN where the model lacks a signal.
+    wheel_rad_s
+        Speeds of fl, fr, rl, rr; NaN where they were not logged.
+    steer_rad
+        Mean angle of the front wheels.
+    gates
+        Opening of each gate of the model, from 0 to 1.
+    track
+        x and y of the track's centre line; empty without a track.
+    other_cars
+        x, y and heading of the other cars in traffic by frame, shape (3, cars).
     """
 
     title: str
@@ -72,14 +80,14 @@ class DriveFrames:
     steer_rad: FloatArray
     gates: Mapping[str, FloatArray]
     track: tuple[FloatArray, FloatArray]
-    others: NDArray[np.object_]
+    other_cars: NDArray[np.object_]
 
     def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
         """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
-        wanted = self.time_s >= from_s
+        mask = self.time_s >= from_s
         if until_s is not None:
-            wanted &= self.time_s <= until_s
-        if wanted.sum() < 2:
+            mask &= self.time_s <= until_s
+        if mask.sum() < 2:
             raise UsageError(
                 f"the drive lasts from {self.time_s[0]:.1f} to {self.time_s[-1]:.1f} s; choose a "
                 "part of it."
@@ -87,20 +95,20 @@ class DriveFrames:
         changed: dict[str, Any] = {}
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
-                changed[name] = value[wanted]
+                changed[name] = value[mask]
             elif isinstance(value, Mapping):
-                changed[name] = {key: array[wanted] for key, array in value.items()}
+                changed[name] = {key: array[mask] for key, array in value.items()}
         return replace(self, **changed)
 
 
-def is_scenario(what: str) -> bool:
-    """Whether a name or path is that of a scenario, not of a drive."""
-    return what.endswith(".toml") or what in config_names("scenarios")
+def is_scenario(name: str) -> bool:
+    """Return True for the name or path of a scenario, False for a drive."""
+    return name.endswith(".toml") or name in config_names("scenarios")
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError`."""
-    names = [one.column for one in catalogue().signals.values()]
+    names = [signal.column for signal in catalogue().signals.values()]
     query = (
         "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
         f"{', '.join(names)} FROM log"
@@ -121,12 +129,12 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
 
 
 def _traffic_of(drive_id: str, campaign: str | None, day: date) -> "TrafficDrive | None":
-    """Return what highway-env decided of a drive of a shipped campaign, computed again."""
+    """Compute the traffic of a drive of a shipped campaign again."""
     try:
         drives = load_campaign(campaign or "").drives(day)
     except ConfigError:
         return None
-    return next((one.in_traffic for one in drives if one.drive_id == drive_id), None)
+    return next((drive.in_traffic for drive in drives if drive.drive_id == drive_id), None)
 
 
 def frames_of(
@@ -137,53 +145,55 @@ def frames_of(
     version: ModelVersion,
     traffic: "TrafficDrive | None" = None,
 ) -> DriveFrames:
-    """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
+    """Return the frames of a drive. Raises `DataError` without a velocity.
 
     The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` are the model
-    and mass of the car, its `drive_id`, and its `track` if that is known.
+    and mass of the car, its `drive_id`, and its `track` if it has one.
     """
-    seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
+    frames = np.flatnonzero(
+        np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1)
+    )
     # The drive as the view `log` has it; NaN is null there.
     arrays = {name: pa.array(values, from_pandas=True) for name, values in columns.items()}
-    known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
-    estimate = version.predict(pa.table({**known, "time_s": time_s, **arrays}))
+    constants = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
+    estimate = version.predict(pa.table({**constants, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
     x, y, heading, track = _places(columns, facts, time_s, vx, vy, traffic)
     gates = gates_on(version.manifest, columns, facts)
     return DriveFrames(
         title=title,
         model=version.reference,
-        time_s=time_s[seen],
-        speed_mps=np.hypot(vx, vy)[seen],
-        x_m=x[seen],
-        y_m=y[seen],
-        heading_rad=heading[seen],
-        sideslip_deg=np.degrees(columns["sideslip_rad"])[seen],
-        estimate_deg=np.degrees(np.asarray(estimate, dtype=np.float64))[seen],
-        wheel_rad_s={wheel: columns[f"wheel_{wheel}_rad_s"][seen] for wheel in WHEELS},
-        steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[seen],
-        gates={name: values[seen] for name, values in gates.items()},
+        time_s=time_s[frames],
+        speed_mps=np.hypot(vx, vy)[frames],
+        x_m=x[frames],
+        y_m=y[frames],
+        heading_rad=heading[frames],
+        sideslip_deg=np.degrees(columns["sideslip_rad"])[frames],
+        estimate_deg=np.degrees(np.asarray(estimate, dtype=np.float64))[frames],
+        wheel_rad_s={wheel: columns[f"wheel_{wheel}_rad_s"][frames] for wheel in WHEELS},
+        steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[frames],
+        gates={name: values[frames] for name, values in gates.items()},
         track=track,
-        others=_others(traffic, columns["station_m"], seen),
+        other_cars=_other_cars(traffic, columns["station_m"], frames),
     )
 
 
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return vx and vy: true, else by wheels and the reference angle. Raises `DataError`."""
+    """Return true vx and vy, or those from wheels and reference angle. Raises `DataError`."""
     vx, vy = columns["vx_mps"], columns["vy_mps"]
     if np.isfinite(vx).any():
         return np.nan_to_num(vx), np.nan_to_num(vy)
     wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
     if not np.isfinite(wheels).any():
         raise DataError("the drive has neither a velocity nor wheel speeds: nothing can be shown.")
-    here = np.isfinite(wheels)  # a tick may lack them all, of which nanmean would warn
-    mean = np.where(here, wheels, 0.0).sum(axis=0) / np.maximum(here.sum(axis=0), 1)
+    logged = np.isfinite(wheels)  # nanmean would warn of a tick without any wheel
+    mean = np.where(logged, wheels, 0.0).sum(axis=0) / np.maximum(logged.sum(axis=0), 1)
     rolling = 0.31 * mean
     return rolling, rolling * np.tan(np.nan_to_num(columns["sideslip_rad"]))
 
 
 def _smooth(values: FloatArray) -> FloatArray:
-    """Return the mean over half a second around each tick, over less at the ends."""
+    """Average over half a second around each tick, over less at the ends."""
     window = np.ones(SMOOTHED_TICKS)
     weights = np.convolve(np.ones(len(values)), window, "same")
     smoothed: FloatArray = values[0] + np.convolve(values - values[0], window, "same") / weights
@@ -198,10 +208,10 @@ def _places(
     vy: FloatArray,
     traffic: "TrafficDrive | None",
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-    """Return x, y and heading of the car, and the line of the track, if that is known."""
+    """Return x, y and heading of the car, and the centre line of its track if it has one."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    track = traffic.profile.track if traffic else _known_track(facts.get("track"))
+    track = traffic.profile.track if traffic else _load_track(facts.get("track"))
     if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
@@ -218,29 +228,29 @@ def _places(
     return x, y, heading, (empty, empty)
 
 
-def _known_track(name: str | None) -> Track | None:
-    """Return a track by name; None if its file is not here, as of a campaign by path."""
+def _load_track(name: str | None) -> Track | None:
+    """Return a track by name; None if no such track ships."""
     try:
         return load_track(name) if name else None
     except ConfigError:
         return None
 
 
-def _others(
-    traffic: "TrafficDrive | None", station_m: FloatArray, seen: IntArray
+def _other_cars(
+    traffic: "TrafficDrive | None", station_m: FloatArray, frames: IntArray
 ) -> NDArray[np.object_]:
-    """Return where the other cars are when ours is at its stations: x, y and heading, (3, cars)."""
-    places = np.empty(len(seen), dtype=object)
-    places[:] = [np.empty((3, 0))] * len(seen)
+    """Return x, y and heading of the other cars by frame, each of shape (3, cars)."""
+    places = np.empty(len(frames), dtype=object)
+    places[:] = [np.empty((3, 0))] * len(frames)
     if traffic is None or not np.isfinite(station_m).all():
         return places
     line = traffic.profile.track.centre_line(SPACING_M)
-    stations = _smooth(station_m)[seen]
+    stations = _smooth(station_m)[frames]
     for frame, (station, x, y, along) in enumerate(zip(stations, *line.at(stations), strict=True)):
-        ahead, left, turned = traffic.others_at(station).T
+        ahead, aside, turned = traffic.others_at(station).T
         cosine, sine = np.cos(along), np.sin(along)
         places[frame] = np.stack(
-            [x + cosine * ahead - sine * left, y + sine * ahead + cosine * left, along + turned]
+            [x + cosine * ahead - sine * aside, y + sine * ahead + cosine * aside, along + turned]
         )
     return places
 
@@ -248,8 +258,7 @@ def _others(
 def gates_on(
     manifest: Manifest, signals: Mapping[str, FloatArray], facts: Mapping[str, Any]
 ) -> Mapping[str, FloatArray]:
-    """Return by gate how far it is open at each tick, shape (ticks,): 0 at the first knot, 1 at
-    the last, and equally far from knot to knot."""
+    """Return the opening of each gate by tick: 0 at the first knot, 1 at the last, linear."""
     gates: dict[str, tuple[Definition, set[int]]] = {}
     for term in manifest.terms:
         gate = term.definition.gate if term.definition else None
@@ -299,11 +308,11 @@ def _data(frames: DriveFrames) -> dict[str, Any]:
         "beta": _listed(frames.sideslip_deg, 3),
         "estimate": _listed(frames.estimate_deg, 3),
         "steer": _listed(frames.steer_rad, 4),
-        "wheels": [_listed(one, 2) for one in excess],
-        "gates": [_listed(one, 3) for one in frames.gates.values()],
-        "track": [_listed(one, 1) for one in frames.track],
+        "wheels": [_listed(wheel, 2) for wheel in excess],
+        "gates": [_listed(gate, 3) for gate in frames.gates.values()],
+        "track": [_listed(axis, 1) for axis in frames.track],
         "others": [
-            [_listed(row, 2) for row in cars] if cars.size else [] for cars in frames.others
+            [_listed(row, 2) for row in cars] if cars.size else [] for cars in frames.other_cars
         ],
     }
 

@@ -49,8 +49,8 @@ def test_an_estimator_without_any_estimate_has_no_figures() -> None:
 def test_a_null_signal_leaves_no_estimate() -> None:
     model = LinearEstimate(0.5, {"ay_mps2": 2.0, "yaw_rate_rad_s": -1.0})
     signals = {"ay_mps2": np.array([1.0, np.nan]), "yaw_rate_rad_s": np.array([3.0, 3.0])}
-    at_rest = np.zeros(2)
-    drive = TestDrive(load_scenario("nominal"), np.arange(2) / 100, signals, *[at_rest] * 4, None)
+    zero, scenario = np.zeros(2), load_scenario("nominal")
+    drive = TestDrive(scenario, zero, signals, zero, zero, zero, zero, None)
     np.testing.assert_array_equal(model(drive), [-0.5, np.nan])
 
 

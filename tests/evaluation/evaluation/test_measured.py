@@ -20,7 +20,7 @@ from fleet_slip.evaluation.held_out import (
 )
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured, Tuned
 from fleet_slip.evaluation.measured_evaluation import with_acceleration
-from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.evaluation.single_track import DriveSignals
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -35,9 +35,8 @@ NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
 def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) -> HeldOutDrive:
     wheels = np.full(ROWS, speed_mps / 0.31)
     signals = replace(NO_SIGNALS, wheel_rl_rad_s=wheels, ay_mps2=np.ones(ROWS))
-    drive = LabelledDrive(f"drive-{number}", signals, np.zeros(ROWS))
-    rows = pa.table({"tick": np.arange(ROWS)})
-    return HeldOutDrive(drive, rows, trip or drive.drive_id)
+    name, rows = f"drive-{number}", pa.table({"tick": np.arange(ROWS)})
+    return HeldOutDrive(name, signals, np.zeros(ROWS), rows=rows, trip=trip or name)
 
 
 def drives_of(held_out: Segments) -> list[int]:
@@ -75,7 +74,7 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     car, still = load_vehicle("d_class_sedan"), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
-    logged, measured = LabelledDrive("logged", signals, still), Measured.of(car)
+    logged, measured = replace(a_drive(0), signals=signals), Measured.of(car)
     assert with_acceleration(logged, measured) is logged
     missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
     assert with_acceleration(missing, measured).signals.ax_mps2[100:] == pytest.approx(
@@ -157,7 +156,7 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
     cohort = load_cohort(fleet.warehouse, "true")
     drives = read_measured_drives(fleet.warehouse, cohort)
     request = SelectionRequest(model="ax,ay,yaw_rate")
-    learner = Learner.of(fleet.warehouse, request, "true", drives)
+    learner = Learner.prepare(fleet.warehouse, request, "true", drives)
     (whole,), (quarters,) = cohort.tables, learner.quarters.tables
     assert len(quarters) == 4 * len(whole)
     assert quarters.total() == whole.total()

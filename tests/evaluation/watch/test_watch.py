@@ -120,7 +120,7 @@ def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(
     data = data_of(render_watch(frames))
     assert len(data["others"]) == len(data["t"])
     assert max(len(cars[0]) for cars in data["others"] if cars) >= 3
-    for before, after in itertools.pairwise(frames.others):
+    for before, after in itertools.pairwise(frames.other_cars):
         if before.shape == after.shape:
             assert np.abs(after - before)[:2].max() < 2.5  # at most 40 m/s, 25 frames a second
     assert np.nanstd(frames.estimate_deg - frames.sideslip_deg) < 1.0
