@@ -11,6 +11,9 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
 
+MIN_SPEED_MPS = 2.0
+"""Speed below which no angle is evaluated: at standstill there is none, and a label is noise."""
+
 
 class Drive(Protocol):
     """A drive with a reference for its side-slip angle; arrays have shape (ticks,)."""

@@ -4,7 +4,7 @@ Without the held-out segments, columns are chosen by each model's own recipe and
 tuned and a car is identified: neither a fit nor a choice saw the rows that an error is taken on.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -16,7 +16,6 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.features import features
-from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation import yaw_rate_filter
 from fleet_slip.evaluation.evaluator import (
@@ -31,7 +30,6 @@ from fleet_slip.evaluation.filters import (
     TABLE_ONE,
     TUNING_DRIVES,
     TUNING_S,
-    Filter,
     choose_evenly,
     class_car,
 )
@@ -48,6 +46,7 @@ from fleet_slip.evaluation.held_out import (
 from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Identified, Measured, identify
 from fleet_slip.evaluation.single_track import (
     STEP_S,
+    DriveSignals,
     LabelledDrive,
     follow,
     measured_speed_mps,
@@ -327,7 +326,7 @@ class Competition:
         """Tune filters in the car of the file and in the identified car."""
         if self.measured is None:
             return
-        rolling = partial(rolling_estimate, self.measured.car(Fitted()))
+        rolling = on_signals(rolling_sideslip, self.measured.car(Fitted()))
         yield "kinematic", FittedEstimator("geometry", rolling)
         cars: dict[str, tuple[str, VehicleParameters]] = {}
         if self.vehicle is not None and (
@@ -340,7 +339,7 @@ class Competition:
                 "ekf_identified",
                 FittedEstimator(
                     "geometry, and a car identified from the other parts",
-                    partial(_identified_estimate, identified),
+                    on_signals(identified.estimate),
                     identified.as_dict()["found"],
                 ),
             )
@@ -360,7 +359,7 @@ class Competition:
                     name,
                     FittedEstimator(
                         f"{knowledge}, and labels to be tuned by",
-                        partial(_filter_estimate, kind, car, tuned),
+                        on_signals(kind.estimate, car, tuned),
                         tuned.model_dump(mode="json"),
                     ),
                 )
@@ -378,19 +377,13 @@ def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
     return cars[0] if len(cars) == 1 and cars[0].description == IDENTIFIED else None
 
 
-def _filter_estimate(
-    kind: Filter, car: VehicleParameters, parameters: Config, drive: HeldOutDrive
-) -> FloatArray:
-    return kind.estimate(drive.signals, car, parameters)
+def on_signals(estimate: Callable[..., FloatArray], *parameters: object) -> Estimator[HeldOutDrive]:
+    """Return the estimator that applies a function of signals to a drive."""
+    return lambda drive: estimate(drive.signals, *parameters)
 
 
-def _identified_estimate(identified: Identified, drive: HeldOutDrive) -> FloatArray:
-    return identified.estimate(drive.signals)
-
-
-def rolling_estimate(vehicle: VehicleParameters, drive: HeldOutDrive) -> FloatArray:
+def rolling_sideslip(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
     """Return side-slip in rad of rear wheels that roll without slip, arctan(b r / vx)."""
-    signals = drive.signals
     noise = yaw_rate_filter.YawRateNoise()
     yaw_rate_rad_s, _ = yaw_rate_filter.estimate(signals, vehicle, noise)
     lateral_mps = vehicle.body.rear_axle_m * yaw_rate_rad_s

@@ -16,6 +16,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from fleet_slip.warehouse.database import reading_files
@@ -171,9 +172,6 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
     return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
-WALKING_MPS = 2.0
-"""Speed below which the label is noise: a reference sensor measures no angle at rest."""
-
 L = TypeVar("L", bound=LabelledDrive)
 
 
@@ -182,7 +180,7 @@ def without_rest(drive: L, car: VehicleParameters) -> L:
 
     Raises `DataError` without wheel speeds.
     """
-    moves = measured_speed_mps(drive.signals, car) > WALKING_MPS
+    moves = measured_speed_mps(drive.signals, car) > MIN_SPEED_MPS
     return replace(drive, sideslip_rad=np.where(moves, drive.sideslip_rad, np.nan))
 
 

@@ -13,6 +13,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
+from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.job import (
     MOTION,
@@ -26,9 +27,6 @@ from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 from fleet_slip.warehouse.tables import Warehouse
-
-MIN_SPEED_MPS = 2.0
-"""Speed below which a side-slip angle is not evaluated: at standstill there is none."""
 
 
 @dataclass(frozen=True)
