@@ -42,7 +42,7 @@ class BlindSet(Config):
     load_kg: Range
     load_position_m: Range
     tyre_stiffness: Uniform
-    """Of a new tyre, over that of the vehicle's file."""
+    """Stiffness of a new tyre over that of the vehicle's file."""
     tyre_wear_days: NotNegative
     """Maximum age of the tyres."""
     drivers: Drivers

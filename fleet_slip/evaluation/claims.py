@@ -104,7 +104,7 @@ class ReportContext:
 
 
 class Finding(NamedTuple):
-    """Whether a claim holds (None if it cannot be tested), the figures, and the reason."""
+    """Result of a claim: `holds` (None if it cannot be tested), the figures, and the reason."""
 
     holds: bool | None
     figure: str

@@ -49,16 +49,16 @@ from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD = (1.0, 1.0, 0.1)
-"""Of vx, vy (m/s) and r (rad/s) at the first row."""
+"""Standard deviations of vx, vy (m/s) and r (rad/s) at the first row."""
 
 
 class SensorErrors(Config):
     """Gain and offset errors of a car's steering and lateral acceleration."""
 
     steer_gain: FiniteFloat = Field(default=1.0, ge=0.5, le=2)
-    """Of the road wheels' angle, which is often logged as the steering wheel's over a ratio."""
+    """Gain of the road wheels' angle, often logged as the steering wheel's over a ratio."""
     steer_offset_rad: FiniteFloat = Field(default=0.0, ge=-0.2, le=0.2)
-    """Of the road wheels when the car drives straight."""
+    """Angle of the road wheels when the car drives straight."""
     ay_gain: FiniteFloat = Field(default=1.0, ge=0.7, le=1.5)
     """In a bend the body rolls, which adds g times an angle that grows with the acceleration."""
     ay_offset_mps2: FiniteFloat = Field(default=0.0, ge=-2, le=2)
@@ -86,7 +86,7 @@ class EkfNoise(Config):
     yaw_rate_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
     ay_std_mps2: FiniteFloat = Field(default=0.1, gt=0)
     ay_bias_std_mps2: FiniteFloat = Field(default=0.15, ge=0)
-    """Of the accelerometer's bias before the drive; 0 leaves it out of the state."""
+    """Accelerometer's bias before the drive; 0 removes it from the state."""
     stiffness_front_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
     """Cornering stiffness of the front axle over that of the car's parameters."""
     stiffness_rear_factor: FiniteFloat = Field(default=1.0, ge=0.5, le=1.5)
@@ -208,7 +208,7 @@ def chassis(car: VehicleParameters) -> Chassis:
 def axles_of(
     car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, noise: EkfNoise
 ) -> FloatArray:
-    """Return `loaded_axles` under the measured accelerations, as stiff as the parameters say."""
+    """Return `loaded_axles` with the stiffness factors of the parameters."""
     axles = loaded_axles(car, ax_mps2, ay_mps2, noise.adhesion)
     axles[0] *= noise.stiffness_front_factor
     axles[1] *= noise.stiffness_rear_factor

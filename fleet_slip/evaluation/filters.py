@@ -162,9 +162,9 @@ class Filter:
     module
         Module of the filter; filters of one module share tuned parameters.
     gps
-        Whether it needs satellite navigation.
+        True if it needs satellite navigation.
     informed
-        Whether it uses the scenario's own load, tyres and road.
+        True if it uses the scenario's own load, tyres and road.
     other_starts
         Further starts of the search for parameters.
     """
@@ -215,7 +215,7 @@ class FilterEstimate:
     filter: Filter
     parameters: Config
     with_mass: bool = False
-    """Whether it uses the stated mass of a car, as the model that it competes with."""
+    """True to use the stated mass of a car, as the model under comparison does."""
 
     def car(self, drive: TestDrive) -> VehicleParameters:
         """Return the car of a drive, as the filter assumes it."""

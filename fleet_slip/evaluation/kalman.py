@@ -32,7 +32,7 @@ class FilterNoise(Config):
     ax_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
     ay_std_mps2: FiniteFloat = Field(default=0.1, ge=0)
     bias_std_mps2: FiniteFloat = Field(default=0.15, gt=0)
-    """Of the accelerometers' biases before the drive."""
+    """Accelerometers' biases before the drive."""
     bias_walk_mps2_per_sqrt_s: FiniteFloat = Field(default=0.0, ge=0)
     """Random walk of a bias over 1 s. The paper has no noise on biases."""
     gps_vx_std_mps: FiniteFloat = Field(default=0.05, gt=0)

@@ -23,7 +23,7 @@ from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, undriven_ax
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD_RAD_S = 1.0
-"""Of the yaw rate before the first measurement: uninformative."""
+"""Standard deviation of the yaw rate before the first measurement: uninformative."""
 
 BRAKING_MPS2 = -0.5
 """Longitudinal acceleration below which wheels brake; a coasting car stays above."""
@@ -34,11 +34,11 @@ class YawRateNoise(Config):
 
     gyro_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
     gyro_bias_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
-    """Of the bias before the drive."""
+    """Bias before the drive."""
     wheel_yaw_rate_std_rad_s: FiniteFloat = Field(default=0.006, gt=0)
-    """Of the yaw rate from wheel speeds: √2 R σ_ω / track with σ_ω of 0.02 rad/s."""
+    """Yaw rate from wheel speeds: √2 R σ_ω / track with σ_ω of 0.02 rad/s."""
     yaw_acceleration_std_rad_s2: FiniteFloat = Field(default=0.5, gt=0)
-    """How fast the yaw rate may change."""
+    """Change of the yaw rate per second."""
 
 
 TUNABLE = (
