@@ -104,7 +104,7 @@ def let_an_hour_pass(root: Path) -> None:
 def state(root: Path) -> dict[str, Any]:
     """All that a root holds, apart from file names and the moments at which it was written."""
     warehouse = Warehouse(LocalFolder(root))
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root))
     names = registry.names()
     histories = {name: registry.history(name) for name in names}
     return {

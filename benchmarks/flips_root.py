@@ -198,7 +198,7 @@ def _add_what_is_rare(root: Path) -> None:
     rows = QUARANTINE_SCHEMA.empty_table().from_pylist(refused, schema=QUARANTINE_SCHEMA)
     written = warehouse.quarantine.write_file("refused", rows)
     warehouse.quarantine.snapshot().commit(Change(add=[written]))
-    DocumentFolder(warehouse.root / "evaluations").append({"format": 1, "values": [1, 2.5]})
+    DocumentFolder(warehouse.root, "evaluations").append({"format": 1, "values": [1, 2.5]})
     for table in (warehouse.logs, warehouse.grams):
         delta = table.open_delta()
         assert delta is not None

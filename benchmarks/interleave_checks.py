@@ -154,7 +154,7 @@ def forgotten_findings(root: str, unsaid: bool) -> list[str]:
             where = "readable" if file.path in active else "unsaid"
             if (where == "readable" or unsaid) and _has_car(table, file.path):
                 found.append(f"{where}: {table.folder.name} has rows of the forgotten car")
-    registry = Registry(warehouse.root / "models")
+    registry = Registry(warehouse.root)
     marked = marked_models(warehouse.root)
     for name in registry.names():
         for number in registry.versions(name):
@@ -174,7 +174,7 @@ def _has_car(table: Table, path: str) -> bool:
 def version_findings(root: str) -> list[str]:
     """Return the versions that do not follow from the Gram rows that they name."""
     warehouse = warehouse_at(root)
-    registry = Registry(warehouse.root / "models")
+    registry = Registry(warehouse.root)
     found = []
     for name in registry.names():
         for number in registry.versions(name):

@@ -1,6 +1,6 @@
 """The part of a `Fleet` that watches the warehouse and looks after it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Annotated
@@ -137,13 +137,21 @@ class HealthAndUpkeep(JudgedModels):
             ),
         ] = False,
         repair: Annotated[bool, Doc("Rebuild Gram rows from the logs.")] = False,
+        accept_loss: Annotated[
+            Sequence[str],
+            Doc(
+                "Go on without a lost document of which there is no backup: FOLDER/NUMBER.json, "
+                "or FOLDER for all of it."
+            ),
+        ] = (),
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "Verification":
         """Verify every byte against its checksum, and all tables against each other.
 
         Progress is in bytes. `damage` is what is wrong, after a repair what is left. Raises
-        `StorageError` without a data root, and `ClusterError`.
+        `StorageError` without a data root, `QuestionError` if nothing is lost at `accept_loss`, and
+        `ClusterError`.
         """
         from fleet_slip.grams.check import check_grams
         from fleet_slip.operations.verify import verify
@@ -156,15 +164,27 @@ class HealthAndUpkeep(JudgedModels):
                 executor=unless_local(executor),
             )
 
+        accepted = self.accept_losses(accept_loss) if accept_loss else ()
         with open_workers(self.root, workers) as executor:
             found = look()
             if repair:
                 rebuilt = self.repair(found)
                 found = look()
                 found.rebuilt, found.repaired = rebuilt, True
+        found.accepted = accepted
         if grams and not found.damage:
             found.compared = check_grams(self.warehouse)
         return found
+
+    @record_call
+    def accept_losses(self, paths: Sequence[str]) -> list[str]:
+        """Go on without lost documents, given by files or folders below the root; return the files.
+
+        Raises `QuestionError` if nothing is lost there.
+        """
+        from fleet_slip.storage.documents import accept_losses
+
+        return accept_losses(self.warehouse.root, paths)
 
     @record_call
     def repair(self, found: "Verification") -> list[str]:

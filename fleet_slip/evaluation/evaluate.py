@@ -253,16 +253,17 @@ def _measured(content: Mapping[str, Any]) -> Iterator[Part]:
 
 def evaluations_of(warehouse: Warehouse, kind: str = "") -> DocumentFolder:
     """Return where a data root keeps its evaluations; `measured` are those on measured drives."""
-    folder = warehouse.root / "evaluations"
-    return DocumentFolder(folder / kind if kind else folder)
+    return DocumentFolder(warehouse.root, f"evaluations/{kind}" if kind else "evaluations")
 
 
 def keep(documents: DocumentFolder, content: Mapping[str, Any]) -> Evaluation:
     """Add an evaluation, unless the latest one is the same; return it as it is kept."""
 
     def attempt(newest: int) -> Document | None:
-        if newest and (before := documents.read(newest)).sha256 == checksum(content):
-            return before
+        if newest in documents.numbers():  # else its loss was accepted
+            before = documents.read(newest)
+            if before.sha256 == checksum(content):
+                return before
         return documents.create(newest + 1, content)
 
     return Evaluation(**vars(documents.after_newest(attempt)))

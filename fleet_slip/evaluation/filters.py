@@ -375,7 +375,7 @@ class TuningDrives:
             "car": car.model_dump(mode="json"),
             "program": checksum_of_sources(),
         }
-        folder = DocumentFolder(self.warehouse.root / "tuned")
+        folder = DocumentFolder(self.warehouse.root, "tuned")
         documents = (folder.read(number).content for number in reversed(folder.numbers()))
         found = next((content for content in documents if content["key"] == key), None)
         return found or folder.append({"key": key, **self._tuned(car, executor)}).content

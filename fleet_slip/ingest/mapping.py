@@ -338,14 +338,14 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
 
 def keep_assumptions(root: Folder, mapping: Mapping) -> None:
     """Write down what a mapping of drives leaves open, unless it was the same before."""
-    kept, found = DocumentFolder(root / ASSUMPTIONS / mapping.name), assumptions_of(mapping)
+    kept, found = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
     if found != _newest(kept):
         kept.append({"assumed": found})
 
 
 def kept_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:
     """Return what the mappings of some drives leave open. Raises `StorageError`."""
-    folders = (DocumentFolder(root / ASSUMPTIONS / name) for name in sorted(mappings))
+    folders = (DocumentFolder(root, f"{ASSUMPTIONS}/{name}") for name in sorted(mappings))
     return tuple(dict.fromkeys(text for folder in folders for text in _newest(folder)))
 
 

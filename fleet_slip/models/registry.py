@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 # A move follows the moves before it directly: of two processes that decide at once, one decides
 # again.
 
+FOLDER = "models"
+
 CHAMPION = "champion"
 """The alias of the version in use."""
 
@@ -261,14 +263,19 @@ _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder."""
+    """All models of a data root."""
 
-    folder: Folder
+    root: Folder
 
     @classmethod
     def of(cls, warehouse: "Warehouse") -> "Registry":
         """Return the models of a data root."""
-        return cls(warehouse.root / "models")
+        return cls(warehouse.root)
+
+    @property
+    def folder(self) -> Folder:
+        """The folder of all models."""
+        return self.root / FOLDER
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
@@ -344,7 +351,7 @@ class Registry:
 
     def history(self, name: str) -> AliasHistory:
         """Return the moves of a model's aliases."""
-        return AliasHistory(DocumentFolder(self.folder / name / "history"))
+        return AliasHistory(DocumentFolder(self.root, f"{FOLDER}/{name}/history"))
 
     def trained_drives(self, manifest: Manifest) -> TrainedDrives:
         """Return what drives made a version. Raises `StorageError`."""
@@ -368,7 +375,9 @@ class Registry:
         self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
 
         def next_version(latest: int) -> int | None:
-            if latest and self.load(name, latest).manifest.same_estimator(manifest):
+            if latest in versions.numbers() and self.load(name, latest).manifest.same_estimator(
+                manifest
+            ):
                 return latest
             document = versions.create(latest + 1, manifest.model_dump(mode="json"))
             return document.number if document else None
@@ -448,7 +457,7 @@ class Registry:
         return rows
 
     def _versions(self, name: str) -> DocumentFolder:
-        return DocumentFolder(self.folder / name / "versions")
+        return DocumentFolder(self.root, f"{FOLDER}/{name}/versions")
 
 
 _TABLE_SCHEMA = pa.schema(

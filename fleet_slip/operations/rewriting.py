@@ -27,6 +27,7 @@ from fleet_slip.grams.job import land_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -340,11 +341,13 @@ class MigrationReport(Answer):
     logs_version: int | None
     files_without_names: int = 0
     """Files that were written anew because they had names that none of their rows has."""
+    sealed: tuple[str, ...] = ()
+    """Folders whose documents were brought to the present format, or anchored."""
 
     @property
     def changed(self) -> bool:
         """Whether there was anything to do."""
-        return bool(self.added or self.files_without_names)
+        return bool(self.added or self.files_without_names or self.sealed)
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was added and written anew."""
@@ -355,6 +358,8 @@ class MigrationReport(Answer):
         if self.files_without_names:
             files = number_of(self.files_without_names, "file")
             yield Remark(f"{files} written anew, without names that none of their rows has")
+        if self.sealed:
+            yield Remark(f"anchored the documents of {', '.join(self.sealed)}")
 
 
 def migrate(warehouse: Warehouse) -> MigrationReport:
@@ -363,6 +368,7 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
     Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
     """
     warehouse.require()
+    sealed = tuple(folder.path for folder in document_folders(warehouse.root) if folder.seal())
     found: Evolution | None = None
     for table in (warehouse.quarantine, warehouse.grams, warehouse.logs):
         delta = table.open_delta()
@@ -371,10 +377,10 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
             found = table.require_readable(delta)
             _add_columns(table, delta, found)
     if found is None:
-        return MigrationReport((), (), None)
+        return MigrationReport((), (), None, sealed=sealed)
     cleaned = drop_unused_names(warehouse)
     version = warehouse.logs.snapshot().version
-    return MigrationReport(found.added, found.retired, version, cleaned)
+    return MigrationReport(found.added, found.retired, version, cleaned, sealed)
 
 
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:

@@ -24,6 +24,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import read_sql
+from fleet_slip.storage.documents import find_lost
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
 from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
 from fleet_slip.storage.storage_errors import storage_errors
@@ -156,7 +157,7 @@ def status_of(
         *_failed(last_runs),
         *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
-        *damaged,
+        *dict.fromkeys([*damaged, *find_lost(warehouse.root)]),
         *(f"{path}: {what}" for path, what in changed),
     ]
     return WarehouseStatus(

@@ -96,7 +96,7 @@ class Audit:
 
     @property
     def _folder(self) -> DocumentFolder:
-        return DocumentFolder(self.root / FOLDER)
+        return DocumentFolder(self.root, FOLDER)
 
     def entries(self) -> list[Mapping[str, Any]]:
         """Return all entries, oldest first."""
@@ -136,7 +136,7 @@ class Audit:
         """Return the numbers of the entries that bar a car or a drive."""
         return frozenset(
             number
-            for number, entry in enumerate(self.entries(), 1)
+            for number, entry in zip(self._folder.numbers(), self.entries(), strict=False)
             if entry["event"] == "begun" and entry["kind"] != "before"
         )
 

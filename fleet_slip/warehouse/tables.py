@@ -110,6 +110,9 @@ class Warehouse:
         """The folder of fitted lines, a folder of documents for each, by its digest."""
         return self.root / "lines"
 
+    def _line_documents(self, digest: str) -> DocumentFolder:
+        return DocumentFolder(self.root, f"lines/{digest}")
+
     def __post_init__(self) -> None:
         self.look_for_lines()
 
@@ -135,7 +138,7 @@ class Warehouse:
 
     def line(self, digest: str) -> FittedLine | None:
         """Return a line by its digest; None if there is none. Raises `StorageError`."""
-        kept = DocumentFolder(self.lines / digest)
+        kept = self._line_documents(digest)
         if 1 not in kept.numbers():
             return None
         try:
@@ -148,7 +151,7 @@ class Warehouse:
 
     def keep_line(self, line: FittedLine) -> None:
         """Write a line down, durably, unless it is there."""
-        DocumentFolder(self.lines / line.digest).create(1, {"line": line.model_dump(mode="json")})
+        self._line_documents(line.digest).create(1, {"line": line.model_dump(mode="json")})
         remember_line(line)
 
     @property

@@ -14,7 +14,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.resources import find_config
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.documents import DocumentFolder, checksum
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand
 from tests.support.logs import path_of
@@ -26,7 +26,7 @@ NAME = manifest().name
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     """A registry with one version."""
-    registry = Registry(LocalFolder(tmp_path / "models"))
+    registry = Registry(LocalFolder(tmp_path))
     publish(registry, manifest())
     return registry
 
@@ -41,8 +41,8 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         document["content"][key] = part | value if isinstance(part, dict) else value
     if term:
         document["content"]["terms"][0] |= term
-    document["sha256"] = checksum(document["content"])
-    file.write_text(json.dumps(document))
+    file.unlink()
+    DocumentFolder(registry.root, f"models/{NAME}/{kind}").create(1, document["content"])
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_document_that_is_none_is_refused(registry: Registry, text: str) -> No
 
 
 def test_only_numbers_are_documents(registry: Registry) -> None:
-    folder = DocumentFolder(registry.folder / NAME / "versions")
+    folder = DocumentFolder(registry.root, f"models/{NAME}/versions")
     for stem in ("01", "0", "-1", "1e3", "٣", "9" * 200, "x"):
         (path_of(folder.folder) / f"{stem}.json").write_text("{}")
     assert folder.numbers() == [1]

@@ -115,7 +115,7 @@ def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int
         warehouse = Warehouse(LocalFolder(tmp_path / "data"))
         land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
         update_grams(warehouse, no_progress)
-        publish(Registry(warehouse.root / "models"), manifest())
+        publish(Registry(warehouse.root), manifest())
     finally:
         os.umask(old)
     files = [*path_of(warehouse.root).rglob("*")]
@@ -281,7 +281,7 @@ def test_a_document_is_read_from_a_file_only(
     tmp_path: Path, place: Place, file: str, run_command: RunCommand
 ) -> None:
     """Even a link to the very document: tomorrow it may lead to another."""
-    publish(Registry(LocalFolder(tmp_path / "data/models")), manifest())
+    publish(Registry(LocalFolder(tmp_path / "data")), manifest())
     document = tmp_path / "data/models/sideslip" / file
     content = document.read_text()
     other = place(document)

@@ -60,7 +60,7 @@ def test_select_says_what_the_gate_buys(root: Path, models: Path) -> None:
 
 
 def test_gates_stand_in_the_manifest_as_they_are_defined(root: Path) -> None:
-    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    manifest = Registry(LocalFolder(root)).resolve("roads").manifest
     gates = [term.definition.gate for term in manifest.terms if term.definition]
     opened = [gate for gate in gates if gate]
     assert {gate.by.of for gate in opened} == {"steering_excess"}
@@ -71,7 +71,7 @@ def test_gates_stand_in_the_manifest_as_they_are_defined(root: Path) -> None:
 def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     """Every row of every drive, computed again from the logs, against sums of Gram rows."""
     warehouse = Warehouse(LocalFolder(root))
-    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    manifest = Registry(LocalFolder(root)).resolve("roads").manifest
     cohort = load_cohort(warehouse, "true", "gated")
     total = cohort.serving(manifest.signals).table.total()
     fitted = exact.fit(total, manifest.signals, manifest.label.signal)

@@ -41,7 +41,7 @@ def test_publishing_again_without_options_is_the_same_model(root: Path, name: st
 
 
 def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root))
     kept = recipe_for(registry, "ranked", SelectionRequest())
     assert (kept.request.rank, kept.request.folds, kept.request.intercept) == (
         "forward",

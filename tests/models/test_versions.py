@@ -63,7 +63,7 @@ def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
 
 def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path))
-    DocumentFolder(LocalFolder(tmp_path / "sideslip" / "versions")).append(
+    DocumentFolder(LocalFolder(tmp_path), "models/sideslip/versions").append(
         manifest().model_dump(mode="json")
     )
     assert registry.champion("sideslip") is None
@@ -74,7 +74,7 @@ def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None
 @pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
 def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
     publish(Registry(LocalFolder(tmp_path)), manifest())
-    file = tmp_path / "sideslip" / "versions" / "1.json"
+    file = tmp_path / "models" / "sideslip" / "versions" / "1.json"
     envelope = json.loads(file.read_text())
     if change == "coefficient":
         envelope["content"]["terms"][0]["coefficient"] = 0.5
@@ -87,7 +87,7 @@ def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
 
 def test_a_signature_of_an_earlier_release_is_ignored(tmp_path: Path) -> None:
     publish(Registry(LocalFolder(tmp_path)), manifest())
-    (tmp_path / "sideslip" / "versions" / "1.sig").write_bytes(b"AAAA")
+    (tmp_path / "models" / "sideslip" / "versions" / "1.sig").write_bytes(b"AAAA")
     assert Registry(LocalFolder(tmp_path)).versions("sideslip") == [1]
     assert publish(Registry(LocalFolder(tmp_path)), manifest(Fraction(2))).version == 2
 

@@ -50,14 +50,14 @@ def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warehouse = Warehouse(LocalFolder(root))
     add_days(warehouse, 0, TRAINING_DAYS)
     planned = answer_request(warehouse, SelectionRequest(models="table1"))
-    publish_challenger(Registry(warehouse.root / "models"), manifest_of(planned, "m"), planned)
+    publish_challenger(Registry(warehouse.root), manifest_of(planned, "m"), planned)
     return root
 
 
 @pytest.fixture
 def trained(of_training_days: Path, warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
     shutil.copytree(of_training_days, str(warehouse.root))
-    return warehouse, Registry(warehouse.root / "models").resolve("m")
+    return warehouse, Registry(warehouse.root).resolve("m")
 
 
 def new_days(chart: Chart) -> list[tuple[date, tuple[str, ...]]]:

@@ -264,7 +264,7 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
 ) -> None:
     """Whoever selected before the erasure and publishes after it."""
     warehouse = fill(tmp_path, *CARS)
-    registry, answers = Registry(warehouse.root / "models"), {}
+    registry, answers = Registry(warehouse.root), {}
     cohorts = {"of_all": "true", "of_others": "vehicle_id <> 'beta'"}
     for name, cohort in cohorts.items():
         request = SelectionRequest(nested="ay,yaw_rate")
@@ -285,9 +285,7 @@ def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it
     warehouse = fill(tmp_path, *CARS)
     Audit(warehouse.root).begin(BETA, 3, [], {"beta": 0})
     answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
-    publish_challenger(
-        Registry(warehouse.root / "models"), manifest_of(answer, "beta"), answer, force=True
-    )
+    publish_challenger(Registry(warehouse.root), manifest_of(answer, "beta"), answer, force=True)
     assert marked_models(warehouse.root) == {"beta@1"}
     Audit(warehouse.root).end(BETA, grams_version=0)
     assert not marked_models(warehouse.root)

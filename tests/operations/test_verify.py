@@ -39,7 +39,7 @@ def filled(warehouse: Warehouse) -> None:
     for name in "ab":
         land(warehouse, name, log_rows(name, random_counts(rng, 300)))
     update_grams(warehouse)
-    DocumentFolder(warehouse.root / "evaluations").append({"drive": "ä", "values": [1, 2.5]})
+    DocumentFolder(warehouse.root, "evaluations").append({"drive": "ä", "values": [1, 2.5]})
 
 
 def flip(file: Path, bit: int) -> None:
@@ -193,7 +193,7 @@ def test_a_log_file_lost_with_its_gram_rows_is_told_and_the_rest_rebuilt(
 
 
 def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
-    folder = DocumentFolder(filled.root / "models" / "m" / "history")
+    folder = DocumentFolder(filled.root, "models/m/history")
     for number in range(3):
         folder.append({"number": number})
     (path_of(folder.folder) / "2.json").unlink()

@@ -147,7 +147,7 @@ QUESTIONS: dict[str, Callable[[Warehouse], Any]] = {
     "load_cohort": lambda w: load_cohort(w).tables[0].products.sum(),
     "fold sums": lambda w: load_cohort(w, folding=Folding()).rows,
     "publish": lambda w: publish_from(w, force=True).version.version,
-    "score": lambda w: score(w, Registry(w.root / "models").resolve("beta").manifest, "true"),
+    "score": lambda w: score(w, Registry(w.root).resolve("beta").manifest, "true"),
     "sql": lambda w: query(w, "SELECT sum(ay) FROM log_counts"),
 }
 

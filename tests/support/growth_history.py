@@ -190,7 +190,7 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
 def write_versions(root: Path, name: str, versions: int) -> None:
     """Repeat the first version of a model and the first move of its alias so many times."""
     for kind, number in (("versions", "trained_on"), ("history", "version")):
-        folder = DocumentFolder(LocalFolder(root / "models" / name / kind))
+        folder = DocumentFolder(LocalFolder(root), f"models/{name}/{kind}")
         first = folder.read(1).content
         for i in range(2, versions + 1):
             changed = {**first[number], "grams_version": i % 2} if kind == "versions" else i

@@ -95,7 +95,7 @@ def state(root: Path, model: str = "smoke") -> dict[str, Any]:
         for table in (warehouse.logs, warehouse.grams)
         for path in table.snapshot().paths
     }
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root))
     return {
         "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
         "versions": [registry.load(model, n).sha256 for n in registry.versions(model)],

@@ -27,7 +27,7 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.simulation.scenario import Scenario, load_scenario
-from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.documents import DocumentFolder, Inventory
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
@@ -55,16 +55,16 @@ def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: An
 def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept = DocumentFolder(LocalFolder(tmp_path))
-    numbers = DocumentFolder.numbers
+    kept = DocumentFolder(LocalFolder(tmp_path), "evaluations")
+    inventory = DocumentFolder.inventory
 
-    def overtaken(folder: DocumentFolder) -> list[int]:
-        before = numbers(folder)
+    def overtaken(folder: DocumentFolder) -> Inventory:
+        before = inventory(folder)
         monkeypatch.undo()
         keep(kept, {"models": 5})
         return before
 
-    monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
+    monkeypatch.setattr(DocumentFolder, "inventory", overtaken)
     assert keep(kept, {"models": 5}).number == 1
     assert keep(kept, {"models": 6}).number == 2
     assert keep(kept, {"models": 6}).number == 2
@@ -125,7 +125,7 @@ def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
 
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, again: Any) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
-    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    manifest = Registry(LocalFolder(root)).resolve("smoke").manifest
     in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
     one = again["scenarios"][0]
     here = one["results"]["smoke@1"]
@@ -159,7 +159,7 @@ def test_a_missing_signal_costs_the_models_that_need_it(again: Any) -> None:
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives([load_scenario("nominal")])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
-    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    manifest = Registry(LocalFolder(root)).resolve("smoke").manifest
     estimate = PublishedEstimate(Predictor.of(manifest))(drive.signals)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 

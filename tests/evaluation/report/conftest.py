@@ -25,5 +25,5 @@ def reported(tmp_path_factory: pytest.TempPathFactory, evaluated: Path) -> Repor
 
 @pytest.fixture(scope="session")
 def data(reported: Reported) -> ReportData:
-    version = Registry(LocalFolder(reported.root / "models")).resolve("smoke")
+    version = Registry(LocalFolder(reported.root)).resolve("smoke")
     return gather(Warehouse(LocalFolder(reported.root)), version)

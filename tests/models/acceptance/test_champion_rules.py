@@ -85,7 +85,7 @@ def publish_from(
 
 
 def registry_of(warehouse: Warehouse) -> Registry:
-    return Registry(warehouse.root / "models")
+    return Registry(warehouse.root)
 
 
 def copy(root: Path, folder: Path) -> Warehouse:

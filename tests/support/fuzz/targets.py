@@ -39,7 +39,7 @@ from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.documents import checksum
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -135,7 +135,7 @@ def names(rng: random.Random, place: Path) -> None:
 def references(rng: random.Random, place: Path) -> None:
     """Name models, aliases, configs and signals that do not exist."""
     warehouse = Warehouse(LocalFolder(template(place)))
-    registry = Registry(warehouse.root / "models")
+    registry = Registry(warehouse.root)
     word = rng.choice([*WORDS, f"{MODEL}@{rng.choice(WORDS)}", f"{rng.choice(WORDS)}@1"])
     match rng.randrange(7):
         case 0:
@@ -255,14 +255,15 @@ def manifest(rng: random.Random, place: Path) -> None:
         document = json.loads(file.read_text(encoding="utf-8"))
         document["content"] = mutate_tree(rng, document["content"])
         text = to_json(document)
-        with contextlib.suppress(ValueError, RecursionError):
-            document = json.loads(text)
-            document["sha256"] = checksum(document["content"])  # as a forger does
-            text = to_json(document)
-        file.write_text(text, encoding="utf-8", errors="surrogatepass")
+        file.unlink()
+        try:  # as a forger does
+            folder = DocumentFolder(LocalFolder(root), f"models/{MODEL}/{kind}")
+            folder.create(1, json.loads(text)["content"])
+        except (ValueError, RecursionError):
+            file.write_text(text, encoding="utf-8", errors="surrogatepass")
     if rng.random() < 0.1:
         file.rename(file.with_name(rng.choice(["2.json", "01.json", "9" * 200 + ".json"])))
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root))
     steps: list[Callable[[], object]] = [
         registry.as_table,
         registry.history(MODEL).moves,
@@ -318,9 +319,7 @@ def _use(root: Path) -> None:
             lambda: read("grams"),
             lambda: load_cohort(warehouse),
             lambda: answer_request(warehouse, SelectionRequest(nested="ax,ay", folds=2)),
-            lambda: score(
-                warehouse, Registry(LocalFolder(root / "models")).resolve(MODEL).manifest, "true"
-            ),
+            lambda: score(warehouse, Registry(LocalFolder(root)).resolve(MODEL).manifest, "true"),
             lambda: update_grams(warehouse, no_progress),
         ]
     )
