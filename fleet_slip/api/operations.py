@@ -141,7 +141,7 @@ class HealthAndUpkeep(JudgedModels):
             Sequence[str],
             Doc(
                 "Go on without a lost document of which there is no backup: FOLDER/NUMBER.json, "
-                "or FOLDER for all of it."
+                "or FOLDER for all of it. May be repeated."
             ),
         ] = (),
         workers: Workers = None,

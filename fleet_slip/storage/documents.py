@@ -90,9 +90,8 @@ class DocumentFolder:
         inventory = self.inventory()
         if inventory.lost:
             more = f" (and {len(inventory.lost) - 1} more)" if inventory.lost[1:] else ""
-            raise StorageError(
-                f"{self.file(inventory.lost[0])}{more}: {self._loss(inventory.lost[0])}"
-            )
+            first = inventory.lost[0]
+            raise StorageError(f"{self.file(first)}{more}: {self._loss(first)}")
         return inventory
 
     def inventory(self) -> Inventory:
@@ -233,9 +232,8 @@ class DocumentFolder:
 
     def _loss(self, number: int) -> str:
         return (
-            "is missing, although it or a later one was written. Restore it from a backup. If "
-            f"there is none, see: fleet-slip verify --accept-loss {self.path}/"
-            f"{document_file(number)}"
+            "the document was written and is missing. Restore the file from a backup. Without "
+            f"one: fleet-slip verify --accept-loss {self.path}/{document_file(number)}"
         )
 
     def _place(self, number: int) -> dict[str, Any]:
