@@ -167,7 +167,7 @@ def test_a_root_is_migrated_read_and_sound(fleet: Fleet) -> None:
     assert fleet.check().drives == DRIVES
     (rows,) = fleet.sql("SELECT count(*) FROM log").fetchall()
     assert rows == (ROWS,)
-    assert not fleet.verify(full=True).damage
+    assert not fleet.verify(full=True).findings
     assert not fleet.quality().findings
 
 
