@@ -138,7 +138,7 @@ class DocumentFolder:
             raise StorageError(
                 f"{file}: a copy of document {place['number']} of {place['folder']}. {_RESTORE}"
             )
-        if not place and number >= min(_numbers_in(self._anchors.names(), "sha256"), default=10**9):
+        if not place and number >= min(self._anchored(), default=10**MAX_DIGITS):
             raise StorageError(
                 f"{file}: in the format of release 0.2, but the folder is of a later one; the file "
                 f"came from another place. {_RESTORE}"
@@ -149,16 +149,16 @@ class DocumentFolder:
         """Return the problems of the files of the folder, by file, down to the last byte."""
         inventory = self.inventory()
         problems = {self.file(number): self._loss(number) for number in inventory.lost}
-        anchored = _numbers_in(self._anchors.names(), "sha256")
+        anchored = sorted(self._anchored())
+        texts = self._anchors.read_many(list(map(_anchor, anchored)))  # None: removed meanwhile
+        anchors = {number: text for number, text in zip(anchored, texts, strict=True) if text}
         for number in inventory.present:
             file = self.file(number)
             try:
                 document, is_exact = self._read(number)
                 if not is_exact:
                     problems[file] = "its layout was changed"
-                elif number in anchored and self._anchors.read(_anchor(number)) != _text_of(
-                    document
-                ):
+                elif anchors.get(number, _text_of(document)) != _text_of(document):
                     problems[file] = f"its anchor has another checksum: it was replaced. {_RESTORE}"
             except StorageError as error:
                 problems[file] = str(error).removeprefix(f"{file}: ")
@@ -195,15 +195,13 @@ class DocumentFolder:
         """Record that a document exists, and remove the anchors between the first and the last."""
         self._anchors.create(_anchor(document.number), _text_of(document))
         with contextlib.suppress(StorageError):  # without the right to delete, they stay
-            for number in sorted(_numbers_in(self._anchors.names(), "sha256"))[1:-1]:
+            for number in sorted(self._anchored())[1:-1]:
                 self._anchors.delete(_anchor(number))
 
     def needs_seal(self) -> bool:
         """Return True if `seal` has something to do."""
         numbers = self.inventory().present
-        return bool(numbers) and not {numbers[0], numbers[-1]} <= _numbers_in(
-            self._anchors.names(), "sha256"
-        )
+        return bool(numbers) and not {numbers[0], numbers[-1]} <= self._anchored()
 
     def seal(self) -> bool:
         """Rewrite documents of release 0.2 in the present format, and anchor the folder.
@@ -229,6 +227,10 @@ class DocumentFolder:
     def file(self, number: int) -> str:
         """Return the path of a document."""
         return f"{self.folder}/{document_file(number)}"
+
+    def _anchored(self) -> set[int]:
+        """Return the numbers of the anchors."""
+        return _numbers_in(self._anchors.names(), "sha256")
 
     def _loss(self, number: int) -> str:
         return (
