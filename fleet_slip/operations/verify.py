@@ -463,7 +463,7 @@ def _list_unreferenced(
 ) -> None:
     for snapshot in snapshots.values():
         try:
-            known, files = snapshot.removed(), find_unreferenced(snapshot.table)
+            known, files = snapshot.removals, find_unreferenced(snapshot.table)
         except StorageError:  # its log is damaged, as is reported: it says of no file what that is
             continue
         for file in files:

@@ -110,9 +110,10 @@ def test_a_query_that_began_before_is_not_disturbed_by_compaction_and_vacuum(
 def test_vacuum_removes_replaced_files_after_the_retention(
     six: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fleet_slip.storage.table._now_ms", lambda: 1000)
     before = answers(six)
-    compact(six)
+    with monkeypatch.context() as patch:
+        patch.setattr("fleet_slip.storage.table._now_ms", lambda: 1000)
+        compact(six)
     grow_old(six)
     planned = vacuum(six, dry_run=True)
     assert len(planned.files) == 7  # six log files and the Gram file that named them
@@ -173,13 +174,11 @@ def test_a_clock_that_was_wrong_removes_nothing_that_is_referred_to(
     six: Warehouse, monkeypatch: pytest.MonkeyPatch, hours: int
 ) -> None:
     before = answers(six)
-    tables = (six.logs, six.grams)
-    replaced = {f"{t.folder.name}/{f.path}" for t in tables for f in t.snapshot().files}
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 3600 * hours)
     monkeypatch.setattr(time, "time_ns", lambda: int((real() + 3600 * hours) * 1e9))
     compact(six)
     removed = vacuum(six).files
     monkeypatch.undo()
-    assert set(removed) == (replaced if hours > 0 else set())
+    assert not removed  # the same clock says that they were just replaced
     assert answers(six) == before
