@@ -7,6 +7,7 @@ that have not seen it conflict. Then Gram rows are fenced, against those that ha
 logs. What such jobs have written is deleted by them or here.
 """
 
+import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import date, timedelta
@@ -45,7 +46,7 @@ from fleet_slip.operations.rewriting import (
     write_without,
 )
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.resources import config_file, find_config
+from fleet_slip.resources import cache_folder, config_file, find_config
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
@@ -203,8 +204,11 @@ def _find_pending(
 ) -> list[str]:
     """Return runs, and files outside the tables, that have or may have rows of a subject.
 
-    With `now`, first delete temporary files, unless a run that may write them is under way.
+    With `now`, first delete the cache of sensor checks, which has hashes of names, and temporary
+    files, unless a run that may write them is under way.
     """
+    if now:
+        shutil.rmtree(cache_folder("examined"), ignore_errors=True)
     runs = [f"{RUN}{run}" for run in runs_under_way(warehouse.root)] if now else []
     if now and not runs:
         for file in half_written(warehouse):

@@ -288,10 +288,9 @@ def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[s
     options = [f"--vehicle {shlex.quote(printable(name))}" for name in sorted(erased.vehicles)]
     options += [f"--drive {shlex.quote(printable(name))}" for name in sorted(erased.drives)]
     if options:
-        commands = "; ".join(f"fleet-slip forget {one} --now" for one in options[:RETURNED_SHOWN])
+        commands = "; ".join(f"fleet-slip forget {name} --now" for name in options[:RETURNED_SHOWN])
         yield (
-            f"{number_of(len(erased.vehicles), 'erased car')} and "
-            f"{number_of(len(erased.drives), 'erased drive')} are in the tables again, as after "
+            f"the tables have rows of {number_of(len(options), 'erased name')} again, as after "
             f"restoring an old backup. Views and models leave them out. Erase them: {commands}"
         )
 

@@ -16,6 +16,7 @@ import fleet_slip
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import find_expired, find_unreferenced, vacuum
 from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
@@ -154,6 +155,17 @@ def test_a_folder_that_is_gone_before_it_is_listed_is_passed_over(
     monkeypatch.setattr(os, "scandir", late)
     assert not vacuum(six).files
     assert not spill.exists()
+
+
+def test_verify_says_of_files_dated_in_the_future_that_compact_keeps_them(six: Warehouse) -> None:
+    compact(six)
+    (path, *_) = sorted(file.path for file in find_unreferenced(six.logs))
+    future = time.time() + 86_400
+    os.utime(path_of(six.logs.folder) / path, (future, future))
+    assert f"logs/{path}" not in vacuum(six, 0).files
+    (finding,) = verify(six).findings
+    assert finding.path == f"logs/{path}"
+    assert "its date is in the future, so compact keeps it: check the clocks" in finding.problem
 
 
 def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse) -> None:

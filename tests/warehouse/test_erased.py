@@ -92,7 +92,7 @@ def test_status_reports_restored_rows_until_they_are_erased_again(
     found = run_command("status")
     assert found.exit_code == 10
     command = "fleet-slip forget --vehicle beta --now"
-    assert "1 erased car and 0 erased drives are in the tables again" in found.stderr
+    assert "the tables have rows of 1 erased name again" in found.stderr
     assert command in found.stderr
     assert run_command(*command.split()[1:]).exit_code == 0
     assert run_command("status").exit_code == 0
