@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import fleet_slip
@@ -13,7 +14,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Table
+from fleet_slip.storage.table import Change, Table
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import TABLE_VIEWS, Warehouse
 from tests.support.commands import RunCommand
@@ -83,6 +84,16 @@ def test_rows_without_a_name_of_a_car_stay(tmp_path: Path) -> None:
     land(warehouse, "b", log_rows("beta-0", random_counts(rng, 50), vehicle_id="beta"))
     Audit(warehouse.root).begin(Forgettable("vehicle", "beta"), 1, [])
     assert ask(warehouse.root, "SELECT drive_id FROM drives") == [("anonymous",)]
+
+
+def test_refused_rows_of_an_erased_car_are_not_shown(tmp_path: Path) -> None:
+    warehouse = filled(tmp_path)
+    rows = [{"vehicle_id": "beta", "drive_id": "x"}, {"vehicle_id": None, "drive_id": None}]
+    table = pa.Table.from_pylist(rows, schema=warehouse.quarantine.schema)
+    action = warehouse.quarantine.write_file("refused", table)
+    warehouse.quarantine.snapshot().commit(Change(add=[action]))
+    Audit(warehouse.root).begin(Forgettable("vehicle", "beta"), 2, [])
+    assert ask(warehouse.root, "SELECT vehicle_id FROM quarantine") == [(None,)]
 
 
 def test_status_reports_restored_rows_until_they_are_erased_again(
