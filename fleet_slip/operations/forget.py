@@ -209,9 +209,10 @@ def _find_pending(
     """
     if now:
         shutil.rmtree(cache_folder("examined"), ignore_errors=True)
+    files = half_written(warehouse)  # listed before the runs: a run that begins later has none
     runs = [f"{RUN}{run}" for run in runs_under_way(warehouse.root)] if now else []
     if now and not runs:
-        for file in half_written(warehouse):
+        for file in files:
             file.folder.remove(file)
     temporary = [path_below(warehouse, file) for file in half_written(warehouse)]
     remains = find_remains(warehouse, subject, drives) if now else ()
