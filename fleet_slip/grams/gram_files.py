@@ -264,7 +264,7 @@ def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
         for file in logs.table.folder.files()
         if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
     }
-    return written - logs.removed() if written else set()
+    return written.difference(logs.removals) if written else set()
 
 
 def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:

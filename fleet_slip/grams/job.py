@@ -175,7 +175,7 @@ def _update_once(
     late, again = None, frozenset[str]()
     if features().feature_set(feature_set).in_time:
         active = {file.path: file for file in logs.files}
-        late = course_delays(grams, frozenset(active))
+        late = course_delays(warehouse, grams, frozenset(active))
         again = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
         missing += tuple(active[path] for path in sorted(again))
     if among is not None:
@@ -269,7 +269,8 @@ def land_ahead(
         require_active(logs, replaced)
         late = None
         if features().feature_set(name).in_time:
-            late = course_delays(grams, frozenset(file.path for file in logs.files))
+            active = frozenset(file.path for file in logs.files)
+            late = course_delays(warehouse, grams, active)
         rows = aggregate(warehouse, missing, feature_set=name, late=late)
         _land(grams, logs, identity, write_rows(warehouse, [rows]))
 

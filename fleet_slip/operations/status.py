@@ -1,6 +1,7 @@
 """The health of a warehouse: freshness, backlog, last runs, disk, champions."""
 
 import contextlib
+import shlex
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from fleet_slip.errors import (
     QuestionError,
     RefusedError,
     StorageError,
+    printable,
 )
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
@@ -30,12 +32,16 @@ from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.erased import find_erased
 from fleet_slip.warehouse.tables import Warehouse
 
 SECONDS_PER_HOUR = 3600
 LEAST_MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 _FULL = "disk {:.1%} free, below {:.0%}"
+
+RETURNED_SHOWN = 5
+"""Maximum number of commands shown for erased cars and drives."""
 
 REMEMBERED = timedelta(days=366)
 """Commands that last ran before that are not shown, so that old runs need not be read."""
@@ -154,6 +160,7 @@ def status_of(
     least = thresholds().status.min_free_fraction
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
+        *_returned(warehouse, tuple(snapshots.values())),
         *_failed(last_runs),
         *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
@@ -274,6 +281,19 @@ def _stale(age: float | None, backlog_age: float | None, limit: float | None) ->
     if backlog_age is not None and backlog_age > limit:
         problems.append(f"a log file has had no Gram rows for {backlog_age:.1f} h")
     return problems
+
+
+def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[str]:
+    """Yield the erased cars and drives that the tables have again, and what to run."""
+    erased = find_erased(warehouse.root, warehouse.grams, snapshots, ended=True)
+    options = [f"--vehicle {shlex.quote(printable(name))}" for name in sorted(erased.vehicles)]
+    options += [f"--drive {shlex.quote(printable(name))}" for name in sorted(erased.drives)]
+    if options:
+        commands = "; ".join(f"fleet-slip forget {name} --now" for name in options[:RETURNED_SHOWN])
+        yield (
+            f"the tables have rows of {number_of(len(options), 'erased name')} again, as after "
+            f"restoring an old backup. Views and models leave them out. Erase them: {commands}"
+        )
 
 
 def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:

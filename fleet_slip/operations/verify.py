@@ -7,6 +7,7 @@ tables; names with the record of what was forgotten. What can be rebuilt is rebu
 
 import contextlib
 import os
+import time
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -467,12 +468,15 @@ def _list_unreferenced(
 ) -> None:
     for snapshot in snapshots.values():
         try:
-            known, files = snapshot.removed(), find_unreferenced(snapshot.table)
+            known, files = snapshot.removals, find_unreferenced(snapshot.table)
         except StorageError:  # its log is damaged, as is reported: it says of no file what that is
             continue
         for file in files:
             what = "replaced" if file.path in known else "never committed"
             then = "fleet-slip compact removes it in time"
+            removed_ns = snapshot.removals.get(file.path, 0) * 10**6
+            if max(file.modified_ns, removed_ns) > time.time_ns():
+                then = "its date is in the future, so compact keeps it: check the clocks"
             if snapshot.version is None:
                 then = "if the table had a Delta log, restore that from a backup"
             _remark(warehouse, file, f"{what}; {then}", report)

@@ -329,7 +329,8 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
 
 
 def runs_under_way(root: Folder) -> list[str]:
-    """Return other runs of the last day that have no end, but for dead ones of this machine."""
+    """Return other runs that have no end: live ones of this machine, those of others for a day."""
+    host = socket.gethostname()
     since = datetime.now(UTC) - timedelta(days=1)
     begun: dict[str, dict[str, Any]] = defaultdict(dict)
     for record in _intact_records(root, f"{since:%Y-%m}"):
@@ -338,7 +339,7 @@ def runs_under_way(root: Folder) -> list[str]:
         run_id
         for run_id, run in sorted(begun.items())
         if run_id != current_run_id()
-        and f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}"
+        and (run.get("host") == host or f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}")
         and state_of({"outcome": None, "host": None, "process": None, **run}) == RUNNING
     ]
 

@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import json
-import math
 import random
 import re
 import time
@@ -28,6 +27,7 @@ from fleet_slip.storage.commits import (
     NOTE,
     checked_note,
     read_landed_units,
+    read_removals,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.storage.folder import Folder
@@ -362,15 +362,18 @@ class Snapshot:
         newest = self.table.snapshot()
         return self if newest.version == version else newest
 
-    def removed(self, before_hours: float = 0) -> set[str]:
-        """Return the paths of files removed so many hours ago or earlier; of a week at least."""
-        if self.delta is None:
-            return set()
+    @cached_property
+    def removals(self) -> Mapping[str, int]:
+        """Removed files of a week at least, with the time of removal in ms since 1970."""
+        if self.version is None:
+            return {}
         with storage_errors(self.table.folder):
-            found = self.delta.vacuum(
-                math.ceil(before_hours), dry_run=True, enforce_retention_duration=False, full=False
-            )
-        return set(found)
+            return read_removals(self.table.folder, self.version)
+
+    def removed_before(self, hours: float) -> set[str]:
+        """Return the files that were removed so many hours ago or earlier, by this clock."""
+        newest = _now_ms() - hours * 3.6e6
+        return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
 
     def landed(self, unit_name: str) -> int | None:
         """Return the version of a unit of work that has landed, or None."""

@@ -24,7 +24,7 @@ from fleet_slip.errors import (
 )
 from fleet_slip.limits import data_needed, memory_bytes
 from fleet_slip.storage.checksums import check_local_files, gone
-from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.folder import SPILL_PREFIX, Folder
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -52,7 +52,7 @@ def open_database(
     process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
     otherwise such a query fails.
     """
-    aside = reading.spill / f".spill-{uuid.uuid4().hex}" if reading and spill else ""
+    aside = reading.spill / f"{SPILL_PREFIX}{uuid.uuid4().hex}" if reading and spill else ""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,

@@ -25,6 +25,7 @@ from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
 from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.erased import find_erased, names_by_column, without_erased
 
 QUARANTINE_SCHEMA = pa.schema(
     [
@@ -276,7 +277,8 @@ def open_tables(
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection, to be locked yet, with some views on snapshots of their tables.
 
-    Logs and Gram rows are `of` the drives that satisfy this SQL condition.
+    Logs and Gram rows are `of` the drives that satisfy this SQL condition. No view has rows of
+    erased cars and drives, even if the tables have them again.
     """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
     tables = {snapshot.table.folder.name: snapshot for snapshot in snapshots}
@@ -288,6 +290,10 @@ def open_tables(
     if of != ALL_DRIVES:
         for name in sources.keys() - {"stored_quarantine"}:
             sources[name] = f"(FROM {sources[name]} WHERE {of})"
+    erased = find_erased(warehouse.root, warehouse.grams, snapshots)
+    for column, names in names_by_column(erased).items():
+        database.execute(f"SET VARIABLE erased_{column} = $names", {"names": names})
+    sources = {name: without_erased(rows, erased) for name, rows in sources.items()}
     columns = _generated_columns()
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:

@@ -288,6 +288,18 @@ def test_a_killed_run_whose_number_another_process_has_is_not_under_way(tmp_path
     assert runs_under_way(LocalFolder(tmp_path)) == names[1:]
 
 
+def test_a_live_run_of_this_machine_is_under_way_whatever_the_clock_says(tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    began = f"{now - timedelta(hours=30):%Y%m%dT%H%M%S.%fZ}"
+    lines = [
+        write_line(run_of(run_id=f"{began}-{host}", command="learn", host=host))
+        for host in (socket.gethostname(), "elsewhere")
+    ]
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / f"{now:%Y-%m}.jsonl").write_bytes(b"\n".join(lines) + b"\n")
+    assert runs_under_way(LocalFolder(tmp_path)) == [f"{began}-{socket.gethostname()}"]
+
+
 def runs_in(root: Folder) -> list[tuple[object, ...]]:
     with connect(root, query="runs") as database:
         return database.execute(

@@ -16,8 +16,15 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalogue.facts import DELAY
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.grams.receiver_delay import ReceiverDelay, receiver_delays, with_pooled, with_types
+from fleet_slip.grams.receiver_delay import (
+    ReceiverDelay,
+    course_delays,
+    receiver_delays,
+    with_pooled,
+    with_types,
+)
 from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.forgotten import Audit, Forgettable
 
 CAMPAIGN = """
 name = "late"
@@ -202,6 +209,15 @@ def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
     for name in ("signals", "course"):
         other.gram(name)
     assert corrected_rows(other) == kept
+
+
+def test_an_erased_car_has_no_delay(late_fleet: LateFleet, tmp_path: Path) -> None:
+    warehouse = late_fleet(tmp_path, 0.087).warehouse
+    grams = warehouse.grams.snapshot()
+    active = frozenset(file.path for file in warehouse.logs.snapshot().files)
+    (car,) = course_delays(warehouse, grams, active)
+    Audit(warehouse.root).begin(Forgettable("vehicle", car), 1, [])
+    assert not course_delays(warehouse, grams, active)
 
 
 def test_what_a_course_of_unknown_delay_taught_is_not_published(
