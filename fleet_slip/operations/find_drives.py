@@ -107,7 +107,8 @@ def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
         return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
-    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
+    names = rows[subject.column].cast(pa.string())
+    return pc.is_in(names, pa.array(subject.select(names.unique().to_pylist()), pa.string()))
 
 
 def quarantined_of(
@@ -117,9 +118,9 @@ def quarantined_of(
 
     Rows refused before a cut at a gap name the whole drive.
     """
-    if subject.kind == "drive":
-        drives = {*drives, subject.value}
     ids = rows["drive_id"].cast(pa.string())
+    if subject.kind == "drive":
+        drives = {*drives, subject.value, *subject.select(ids.unique().to_pylist())}
     concerned = {
         name
         for name in ids.unique().to_pylist()
@@ -128,7 +129,7 @@ def quarantined_of(
     of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
     if subject.kind != "vehicle":
         return of_drives
-    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
+    return pc.or_(of_drives, rows_of(rows, subject))
 
 
 @dataclass(frozen=True)
