@@ -14,7 +14,8 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue, digest_counts
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
+from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
@@ -204,7 +205,14 @@ def half_written(warehouse: Warehouse) -> list[str]:
 
 
 def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
-    """Yield what tells a subject's drives by their counts, file by file of the logs."""
+    """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
+    grams = warehouse.grams.snapshot()
+    for file in grams.files:
+        names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
+        if pc.any(selected := rows_of(names, subject)).as_py():
+            rows = read_rows(warehouse.grams, file).filter(selected)
+            on_board = pc.is_in(rows["feature_set"], pa.array(list(counted_sets()), pa.string()))
+            yield from gram_digests(rows.filter(on_board))[0]
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
     for file in logs.files:
