@@ -19,7 +19,7 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.base import date_of, number_of
+from fleet_slip.base import date_of, normalize_name, number_of
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -293,11 +293,11 @@ class HealthAndUpkeep(JudgedModels):
 
 
 def _subject(vehicle: str | None, drive: str | None) -> "Forgettable":
-    """Return the one that is given. Raises `UsageError` for none and for both."""
+    """Return the one that is given. Raises `UsageError` for none, for both and for a blank name."""
     from fleet_slip.warehouse.forgotten import Forgettable
 
-    if vehicle is not None and drive is None:
-        return Forgettable("vehicle", vehicle)
-    if drive is not None and vehicle is None:
-        return Forgettable("drive", drive)
-    raise UsageError("give a vehicle or a drive.")
+    names = {"vehicle": vehicle, "drive": drive}
+    match [(kind, normalize_name(name)) for kind, name in names.items() if name is not None]:
+        case [("vehicle" | "drive" as kind, name)] if name:
+            return Forgettable(kind, name)
+    raise UsageError("give a vehicle or a drive by its name.")

@@ -7,14 +7,14 @@ for a pattern, or be anything but a name.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import polars as pl
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import shown
+from fleet_slip.base import find_name_fault, normalize_name, shown
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
@@ -203,7 +203,7 @@ def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
 # What a mapping takes from each row: values in SI units and their faults.
 
 LONGEST_TEXT = 200
-"""Characters of metadata that are accepted, and of offending values that are kept."""
+"""Characters of offending values that are kept."""
 
 
 def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
@@ -297,9 +297,24 @@ def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
 
 
 def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
-    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
-    return RowField(name, "key", pl.col(RAW + column), as_text(column, schema, mapping), problem)
+    text = as_text(column, schema, mapping)
+    value = text.map_batches(partial(_map_texts, normalize_name, pl.String), pl.String)
+    faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
+    problem = find_problems((pl.col(name).is_null(), "missing"), (faulty, "out_of_range"))
+    return RowField(name, "key", pl.col(RAW + column), value, problem)
+
+
+def _is_faulty(name: str) -> bool:
+    return find_name_fault(name) is not None
+
+
+def _map_texts(
+    function: Callable[[str], object], kind: pl.datatypes.DataTypeClass, texts: pl.Series
+) -> pl.Series:
+    """Return what a function makes of each text, called once for each different one."""
+    different = texts.drop_nulls().unique()
+    values = pl.Series([function(text) for text in different], dtype=kind)
+    return texts.replace_strict(different, values, default=None, return_dtype=kind)
 
 
 _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.base import canonical_ascii, shown
+from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, shown
 from fleet_slip.catalogue.course import COURSE
 from fleet_slip.catalogue.signals import Identifier, catalogue
 from fleet_slip.config import (
@@ -134,8 +134,19 @@ class FromPath(Config):
 
 Elsewhere = FromColumn | FromPath
 
+
+def _valid_name(text: str) -> str:
+    name = normalize_name(text)
+    if fault := find_name_fault(name):
+        raise ValueError(fault)
+    return name
+
+
+DriveText = Annotated[str, AfterValidator(_valid_name)]
+"""Name of a car, a track or another fact of a drive."""
+
 OptionalFact = Annotated[
-    Annotated[Name | Elsewhere, AfterValidator(require_drive_column)] | None,
+    Annotated[DriveText | Elsewhere, AfterValidator(require_drive_column)] | None,
     added(None),
 ]
 
@@ -147,9 +158,9 @@ class DriveMetadata(Config):
     """Every value of this column is a drive of its own."""
     day: date | Elsewhere | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
-    vehicle_id: Name | Elsewhere
-    vehicle_model: Name | Elsewhere
-    track: Name | Elsewhere | None = None
+    vehicle_id: DriveText | Elsewhere
+    vehicle_model: DriveText | Elsewhere
+    track: DriveText | Elsewhere | None = None
     mass_kg: PositiveFloat | Elsewhere | None = None
     tyres: OptionalFact = None
     receiver: OptionalFact = None

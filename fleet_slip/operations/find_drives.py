@@ -14,7 +14,8 @@ from fleet_slip.base import number_of
 from fleet_slip.catalogue.features import PLAIN, features
 from fleet_slip.catalogue.signals import catalogue, digest_counts
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
+from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
@@ -119,7 +120,8 @@ def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
         return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
-    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
+    names = rows[subject.column].cast(pa.string())
+    return pc.is_in(names, pa.array(subject.select(names.unique().to_pylist()), pa.string()))
 
 
 def quarantined_of(
@@ -129,9 +131,9 @@ def quarantined_of(
 
     Rows refused before a cut at a gap name the whole drive.
     """
-    if subject.kind == "drive":
-        drives = {*drives, subject.value}
     ids = rows["drive_id"].cast(pa.string())
+    if subject.kind == "drive":
+        drives = {*drives, subject.value, *subject.select(ids.unique().to_pylist())}
     concerned = {
         name
         for name in ids.unique().to_pylist()
@@ -140,7 +142,7 @@ def quarantined_of(
     of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
     if subject.kind != "vehicle":
         return of_drives
-    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
+    return pc.or_(of_drives, rows_of(rows, subject))
 
 
 @dataclass(frozen=True)
@@ -257,7 +259,14 @@ def path_below(warehouse: Warehouse, file: StoredFile) -> str:
 
 
 def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
-    """Yield what tells a subject's drives by their counts, file by file of the logs."""
+    """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
+    grams = warehouse.grams.snapshot()
+    for file in grams.files:
+        names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
+        if pc.any(selected := rows_of(names, subject)).as_py():
+            rows = read_rows(warehouse.grams, file).filter(selected)
+            on_board = pc.is_in(rows["feature_set"], pa.array(list(counted_sets()), pa.string()))
+            yield from gram_digests(rows.filter(on_board))[0]
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
     for file in logs.files:

@@ -68,6 +68,11 @@ def test_columns_are_listed_once(tmp_path: Path) -> None:
     assert load(tmp_path, text).time_bases() == {"t": ["t", "run", "a", "steer_fl_deg"]}
 
 
+def test_names_of_drives_are_normalized(tmp_path: Path) -> None:
+    text = GOOD.replace('"v"', '" Zoe\\u0308\\t"')
+    assert load(tmp_path, text).drive.vehicle_id == "Zo\u00eb"
+
+
 def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
     head, ax, steer = GOOD.rpartition("ax =")[0], *GOOD.splitlines()[-2:]
     turned = f"# a comment\n{head}{steer}\n{ax.replace('0.5', '0.50')}"
@@ -96,6 +101,9 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('unit = "s"', 'unit = "s", longest_gap_s = nan', "time.longest_gap_s"),
         ("day = 2024-05-31, ", "", "drive.day is missing"),
         ("2024-05-31", '"tomorrow"', "drive.day"),
+        ('"v"', '"  "', "drive.vehicle_id: is empty"),
+        ('"v"', f'"{"v" * 201}"', "drive.vehicle_id: has more than 200 characters"),
+        ('"v"', '"v\\u001b"', "drive.vehicle_id: has characters that cannot be printed"),
         (
             'vehicle_id = "v"',
             "mass_kg = -1",

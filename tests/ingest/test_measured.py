@@ -176,6 +176,16 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
     assert log.drives["drive_id"].to_pylist() == sorted(log.drives["drive_id"].to_pylist())
 
 
+def test_names_are_normalized_and_checked(tmp_path: Path) -> None:
+    columns = good_columns(16)
+    names = [" Zoe\u0308 ", "Zo\u00eb", "V\x1b[2J", "V" * 201]
+    columns["car"] = [name for name in names for _ in range(4)]
+    log = read_columns(tmp_path, columns, a_mapping(drive={"vehicle_id": {"column": "car"}}))
+    assert set(log.drives["vehicle_id"].to_pylist()) == {"Zo\u00eb"}
+    assert len(set(log.drives["drive_id"].to_pylist())) == 1
+    assert reasons(log) == [(row, "out_of_range", "vehicle_id") for row in range(9, 17)]
+
+
 def test_the_column_of_drives_may_hold_numbers(tmp_path: Path) -> None:
     table = {
         "t": np.arange(6) / 100,
