@@ -63,6 +63,7 @@ _SAID = {
     "less_than": "must be less than {lt}",
     "less_than_equal": "must be at most {le}",
     "finite_number": "must be a finite number",
+    "too_long": "has more than {max_length} entries",
 }
 """What is said of a fault, by its type in pydantic; what is not listed keeps pydantic's words."""
 

@@ -238,7 +238,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
 
 def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
-    met = pl.lit(value=True)
+    met = []
     for condition in mapping.where:
         of = condition.signal
         name = find_held(
@@ -251,8 +251,8 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
             value = as_text(name, schema, mapping)
         else:
             value = as_number(name, schema, mapping)[0]
-        met &= condition.is_met(value)
-    return met
+        met.append(condition.is_met(value))
+    return pl.all_horizontal(met)
 
 
 def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> RowField:

@@ -49,6 +49,8 @@ from fleet_slip.storage.folder import Folder
 
 OWN_SPEEDS = ("vx", "vehicle_speed")
 FRONT_WHEELS = ("steer_fl", "steer_fr")
+MAX_CONDITIONS = 64
+"""Conditions of one mapping. Evaluating them takes more than linear time and memory."""
 
 
 class LabelSensor(Config):
@@ -124,12 +126,45 @@ class FromPath(Config):
 
     def find(self, file: Path) -> str:
         """Return what stands there in a file's path. Raises `InputError` for another path."""
-        known = {"{}": "([^/]+?)", "*": "[^/]*"}
-        parts = (known.get(part, re.escape(part)) for part in re.split(r"(\{\}|\*)", self.path))
+        components = self.path.split("/")
         path = os.path.abspath(file)  # noqa: PTH100 - follows no link
-        if not (found := re.search(f"/{''.join(parts)}$", path)):
-            raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
-        return found[1]
+        names = path.split("/")[1:][-len(components) :]
+        if len(names) == len(components):
+            matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
+            if None not in matches:
+                return "".join(value for value in matches if value is not None)
+        raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
+
+
+def match_name(pattern: str, name: str) -> str | None:
+    """Return the text that `{}` matches in a file's name, empty without one; None if none matches.
+
+    The time is that of the product of both lengths. A `*` takes as much as it can, the first one
+    first, and `{}` as little as it can, but one character.
+    """
+    elements = [element for element in re.split(r"(\{\}|\*)", pattern) if element]
+    positions = {len(name)}  # where the elements after the present one can begin
+    starts = [positions]
+    for element in reversed(elements):
+        if element in {"*", "{}"}:
+            positions = set(range(max(positions, default=-1) + (element == "*")))
+        else:
+            size = len(element)
+            ends = (end for end in positions if name.endswith(element, 0, end))
+            positions = {end - size for end in ends}
+        starts.insert(0, positions)
+    if 0 not in positions:
+        return None
+    position, value = 0, ""
+    for element, following in zip(elements, starts[1:], strict=True):
+        if element == "*":
+            position = max(following)
+        elif element == "{}":
+            end = min(start for start in following if start > position)
+            position, value = end, name[position:end]
+        else:
+            position += len(element)
+    return value
 
 
 Elsewhere = FromColumn | FromPath
@@ -182,7 +217,7 @@ class Mapping(Config):
     ]
     label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
-    where: tuple[RowCondition, ...] = added(())
+    where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
     """Conditions that a row meets, all of them, or is left out and only counted."""
 
     @field_validator("where", mode="before")

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from fleet_slip.base import number_of
 from fleet_slip.errors import (
+    HIDDEN,
     AlarmError,
     DataError,
     FleetSlipError,
@@ -301,7 +302,9 @@ def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     for run in runs:
         when = f"{run['command']} of {run['started_at']:%Y-%m-%d %H:%M}"
         if run["state"] == "failed":
-            problems.append(f"{when} failed with exit code {run['exit_code']}: {run['error']}")
+            why = f" ({HIDDEN}: a name that is not recorded)" if HIDDEN in str(run["error"]) else ""
+            code, error = run["exit_code"], run["error"]
+            problems.append(f"{when} failed with exit code {code}: {error}{why}")
         elif run["state"] in ("killed", "interrupted"):
             problems.append(f"{when} was {run['state']}")
     return problems

@@ -2,6 +2,7 @@
 
 import os
 import re
+import time
 from os import environ
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -29,8 +30,11 @@ def data_root(root: Folder | Path | str | None = None) -> Folder:
     """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
 
     With `://` it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, `file:///PATH`.
-    Raises `StorageError` for another, for what Delta or DuckDB misread, and inside a table.
+    Raises `StorageError` for another, for what Delta or DuckDB misread, inside a table, and where
+    the clock is before 1970, which Delta cannot write.
     """
+    if time.time() < 0:
+        raise StorageError("the clock of this machine is before 1970. Set it, and repeat.")
     if root is not None and not isinstance(root, Path | str):
         return root
     where = root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT

@@ -271,8 +271,9 @@ def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
     """Return a message with the arguments that are not shown replaced, wherever it quotes them."""
     for argument, instead in zip(arguments, shown, strict=True):
         if argument != instead:
-            secret = argument.partition("=")[2] if instead.endswith(f"={HIDDEN}") else argument
-            text = text.replace(secret, HIDDEN) if secret else text
+            is_option = instead.endswith(f"={HIDDEN}")
+            secret = argument.partition("=")[2] if is_option else argument
+            text = text.replace(secret, HIDDEN if is_option else instead) if secret else text
     return text
 
 

@@ -21,6 +21,7 @@ from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.models.acceptance import Floor
 from fleet_slip.models.registry import Registry
 from fleet_slip.resources import CONFIG_VARIABLE, config_file, find_config
+from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from fleet_slip.warehouse.tables import Warehouse
@@ -205,6 +206,21 @@ def test_a_pipe_given_to_a_command_is_refused_at_once(
     done = run_command("ingest", str(tmp_path / "pipe"))
     assert done.exit_code == InputError.exit_code
     assert "pipe" in done.stderr
+
+
+@pytest.mark.timeout(60)
+def test_a_sparse_file_is_refused_before_it_is_read(warehouse: Warehouse, tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text("t,ax\n")
+    os.truncate(file, 10**11)
+    with pytest.raises(InputError, match="100,000,000,000 bytes, but only"):
+        ingest_file(warehouse, file, a_mapping())
+
+
+def test_a_clock_before_1970_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time", lambda: -86400.0)
+    with pytest.raises(StorageError, match="before 1970"):
+        data_root(tmp_path)
 
 
 def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(

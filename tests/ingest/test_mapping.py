@@ -9,14 +9,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
 from fleet_slip.ingest.resampling import build_resampler
 from fleet_slip.ingest.suspicion import RADIUS_M
 from fleet_slip.resources import config_file, config_names
@@ -361,6 +361,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         ([{"column": "speed"}], "needs 'at_least', 'at_most' or 'one_of'"),
         ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "and not both"),
         ([{"column": "speed", "at_least": float("nan")}], "finite number"),
+        ([{"column": "speed", "at_least": 1}] * 65, "at most 64 items"),
     ],
 )
 def test_what_a_condition_cannot_be(where: Any, message: str) -> None:
@@ -405,3 +406,46 @@ def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
     short = {"longest_gap_s": 0.2, "split_gap_s": 2}
     whole = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=short))
     assert whole.counts.drives == 1
+
+
+PATTERN = st.text("*ab_.", max_size=9).flatmap(
+    lambda text: st.integers(0, len(text)).map(lambda place: f"{text[:place]}{{}}{text[place:]}")
+)
+
+
+@given(PATTERN, st.text("ab_.", max_size=14))
+@example("*a{}a*", "aaaaa")
+@example("{}*_", "a__")
+def test_a_pattern_matches_a_name_as_a_regular_expression_does(pattern: str, name: str) -> None:
+    meanings = {"{}": "(.+?)", "*": ".*"}
+    tokens = re.split(r"(\{\}|\*)", pattern)
+    expression = "".join(meanings.get(token, re.escape(token)) for token in tokens)
+    match = re.fullmatch(expression, name)
+    assert match_name(pattern, name) == (match and match[1])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path", "value"),
+    [
+        ("{}/*", "/logs/golf7/monday.csv", "golf7"),
+        ("{}/*", "/monday.csv", None),
+        ("golf*/{}.csv", "/logs/golf7/monday.csv", "monday"),
+        ("golf*/{}.csv", "/logs/polo/monday.csv", None),
+        ("*_{}.csv", "/logs/a_b_c.csv", "c"),
+        ("{}_*", "/logs/a_b_c.csv", "a"),
+        ("logs/{}", "/old_logs/monday.csv", None),
+        ("{}", "/logs/monday.csv", "monday.csv"),
+    ],
+)
+def test_a_pattern_matches_the_end_of_a_path(pattern: str, path: str, value: str | None) -> None:
+    if value is None:
+        with pytest.raises(InputError, match="does not end as in"):
+            FromPath(path=pattern).find(Path(path))
+    else:
+        assert FromPath(path=pattern).find(Path(path)) == value
+
+
+@pytest.mark.timeout(60)
+def test_a_pattern_of_many_stars_ends() -> None:
+    with pytest.raises(InputError, match="does not end as in"):
+        FromPath(path="*_" * 60 + "{}.csv").find(Path("/" + "_" * 205 + ".txt"))

@@ -78,7 +78,7 @@ def test_a_failure_is_recorded_with_its_exit_code_and_raised(tmp_path: Path) -> 
         raise KeyboardInterrupt
     failed, interrupted = runs(tmp_path)
     assert (failed["outcome"], failed["exit_code"]) == ("failed", 4)
-    assert failed["error"] == f"{HIDDEN}: no such file."
+    assert failed["error"] == f"{HIDDEN}.csv: no such file."
     assert [one["name"] for one in failed["steps"]] == ["ingest"]
     assert (interrupted["outcome"], interrupted["exit_code"]) == ("interrupted", 130)
 
