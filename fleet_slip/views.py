@@ -7,7 +7,6 @@ import duckdb
 
 from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
-from fleet_slip.storage.data_root import open_warehouse
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
 from fleet_slip.warehouse.tables import (
@@ -17,6 +16,7 @@ from fleet_slip.warehouse.tables import (
     describe_columns,
     lock,
     open_tables,
+    open_warehouse,
     paths_of,
     table_snapshots,
     views_in,

@@ -310,8 +310,8 @@ def column_query(catalog: Catalog, name: str) -> str:
     definition = catalog.definition(name)
     if definition is not None and definition.number is not None:
         raise QuestionError(
-            f"{name} is {catalog.calibrated[name].of} times {definition.number.name} of each car, in "
-            "counts: see fleet-slip features --sql of the one, and the view calibration."
+            f"{name} is {catalog.calibrated[name].of} times {definition.number.name} of each car, "
+            "in counts: see fleet-slip features --sql of the one, and the view calibration."
         )
     if definition is not None and name not in catalog.features:
         rows = with_columns("log_counts", {}, {name: definition})

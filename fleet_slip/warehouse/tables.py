@@ -1,10 +1,12 @@
 """The warehouse of one data root: which tables it holds and how they are encoded."""
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -21,6 +23,7 @@ from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs, folder, read_sql
+from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
@@ -177,6 +180,23 @@ class Warehouse:
     def tables(self) -> tuple[Table, ...]:
         """All tables."""
         return (self.logs, self.grams, self.quarantine)
+
+
+ROOT_VARIABLE, CONFIG_VARIABLE = "FLEET_SLIP_ROOT", "FLEET_SLIP_CONFIG"
+"""Environment variables that stand for `root` and `config` of `open_warehouse`."""
+
+
+def open_warehouse(
+    root: Folder | Path | str | None = None, config: Path | str | None = None
+) -> Warehouse:
+    """Return the warehouse that arguments, else the environment, else the defaults name.
+
+    `fleet_slip.open` and the command line call this; no other function reads the environment.
+    Raises `StorageError` for an unusable root and `ConfigError` for an unusable folder of configs.
+    """
+    chosen = config or os.environ.get(CONFIG_VARIABLE)
+    configs = Configs(Path(chosen)) if chosen else SHIPPED_CONFIGS
+    return Warehouse(data_root(root or os.environ.get(ROOT_VARIABLE)), configs)
 
 
 def stored_schema(signals: SignalCatalogue) -> pa.Schema:
