@@ -85,7 +85,7 @@ class FeatureSet:
     @property
     def inputs(self) -> tuple[str, ...]:
         """What a model of this set may use."""
-        return (*self.signals, *self.features, *self.features.windows, *self.features.calibrated)
+        return (*self.signals, *self.features, *self.windows, *self.calibrated)
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -105,8 +105,7 @@ class FirstStageModels(Protocol):
 class Catalog:
     """Everything that a data root's columns can be made of.
 
-    A `Warehouse` owns it; functions receive it. It reads no environment and shares no state with
-    another catalog.
+    A `Warehouse` owns it; functions receive it. It reads no environment and does not change.
 
     Attributes
     ----------
@@ -125,7 +124,9 @@ class Catalog:
     configs: Configs = SHIPPED_CONFIGS
     first_stage_models: FirstStageModels | None = None
     _identities: dict[str, str] = field(default_factory=dict, repr=False, compare=False)
-    """Checksums by name, which follow from the content alone: copies may share them."""
+    _estimates: dict[str, str | None] = field(default_factory=dict, repr=False, compare=False)
+    """Identity of each set, and the estimate that it needs: computed once, shared by copies, as
+    they follow from the content alone."""
 
     @property
     def features(self) -> Mapping[str, Feature]:
@@ -223,14 +224,17 @@ class Catalog:
     @cached_property
     def stacked_sets(self) -> Mapping[str, str]:
         """Sets whose columns need a first-stage model, and the estimate that each needs."""
-        stacked = {}
-        for name in self.sets:
+        estimates = {name: self._estimate_of(name) for name in self.sets}
+        return {name: estimate for name, estimate in estimates.items() if estimate}
+
+    def _estimate_of(self, name: str) -> str | None:
+        """Return the estimate that a set's columns are made of; None without one."""
+        if name not in self._estimates:
             seen = set[int]()
             windows = (self.time_columns[w].definition for w in self.feature_set(name).windows)
             rows = (row.of for definition in windows for row in definition.rows(seen))
-            if estimate := next((row for row in rows if row in self.estimates), None):
-                stacked[name] = estimate
-        return stacked
+            self._estimates[name] = next((row for row in rows if row in self.estimates), None)
+        return self._estimates[name]
 
     def feature_set(self, name: str) -> FeatureSet:
         """Return a feature set, its families replaced by their members.
@@ -349,6 +353,7 @@ class Catalog:
         """
         if name == PLAIN:
             return PLAIN
+        self.first_stage_model(name)  # raises without the model, which another root may have
         if name not in self._identities:
             self._identities[name] = self._identity(name)
         return self._identities[name]

@@ -20,8 +20,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES, RECEIVER
-from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
@@ -248,13 +248,15 @@ GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 """What a delay is a whole number of, s."""
 
 
-def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
+def course_delays(
+    catalog: Catalog, grams: Snapshot, active: frozenset[str]
+) -> dict[str, int]:
     """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
     counted = pa.array(sorted(active), pa.string())
     columns = ("file", "day", "vehicle_id", "drive_id", RECEIVER)
 
     def batches() -> Iterator[pa.RecordBatch]:
-        identity = features().identity(DELAY)
+        identity = catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
             counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
             yield from rows.filter(counts).to_batches()

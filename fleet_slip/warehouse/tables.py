@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
+from fleet_slip.warehouse.connections import ConnectionCache
 from fleet_slip.warehouse.database import database_errors, open_database
 
 QUARANTINE_SCHEMA = pa.schema(
@@ -79,6 +80,10 @@ class StackedModels:
         documents = DocumentFolder(self.folder / model.digest)
         documents.create(1, {"line": model.model_dump(mode="json")})
 
+    def clear(self) -> None:
+        """Forget the models that were read; they are read again when needed."""
+        self._models.clear()
+
 
 @dataclass(frozen=True)
 class Warehouse:
@@ -90,10 +95,24 @@ class Warehouse:
         Folder of the data root.
     configs
         Configuration files that the catalog is loaded from.
+    connections
+        The idle connection to the Gram rows.
     """
 
     root: Folder
     configs: Configs = SHIPPED_CONFIGS
+    connections: ConnectionCache = field(
+        default_factory=ConnectionCache, init=False, repr=False, compare=False
+    )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with the catalog: a worker elsewhere need not have the folder of configs."""
+        return _unpickle, (self.root, self.configs, self.catalog)
+
+    def close(self) -> None:
+        """Release the idle connection and the first-stage models that were read."""
+        self.connections.close()
+        self.stacked_models.clear()
 
     @cached_property
     def catalog(self) -> Catalog:
@@ -180,6 +199,13 @@ class Warehouse:
     def tables(self) -> tuple[Table, ...]:
         """All tables."""
         return (self.logs, self.grams, self.quarantine)
+
+
+def _unpickle(root: Folder, configs: Configs, catalog: Catalog) -> Warehouse:
+    warehouse = Warehouse(root, configs)
+    models = warehouse.stacked_models
+    warehouse.__dict__["catalog"] = replace(catalog, first_stage_models=models)
+    return warehouse
 
 
 ROOT_VARIABLE, CONFIG_VARIABLE = "FLEET_SLIP_ROOT", "FLEET_SLIP_CONFIG"
