@@ -25,9 +25,8 @@ def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    _ = Predictor.of(
-        catalog.signals, manifest
-    ).plan.program  # raises for what the kernel could not compute
+    # Raises for what the kernel could not compute.
+    _ = Predictor.of(catalog.signals, manifest).plan.program
     return write_program(catalog, manifest)
 
 

@@ -122,8 +122,8 @@ def _of_list(version: ModelVersion) -> SelectionRequest:
         load_model_list(version.catalog, name)
     except ConfigError:
         raise QuestionError(
-            f"{version.reference} was chosen from {name!r}, which is no model list here. Say what to "
-            "compare, such as models = estimator."
+            f"{version.reference} was chosen from {name!r}, which is no model list here. "
+            "Say what to compare, such as models = estimator."
         ) from None
     return SelectionRequest(models=name)
 

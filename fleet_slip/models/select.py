@@ -429,8 +429,8 @@ def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelL
     inputs = catalog.feature_set(named).inputs
     if model_list and (absent := model_list.absent_from(inputs)):
         raise QuestionError(
-            f"the feature set {named} lacks columns of {request.models}: {name_inputs(catalog, absent)}. "
-            "Take another one, or another list of models."
+            f"the feature set {named} lacks columns of {request.models}: "
+            f"{name_inputs(catalog, absent)}. Take another one, or another list of models."
         )
     return named
 

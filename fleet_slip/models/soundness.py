@@ -52,11 +52,8 @@ def require_sound_drives(
     over.
     """
     found, looked_at, measured = _look(warehouse, manifest, made)
-    if (
-        measured
-        and len(manifest.terms) > settled
-        and (lacks := find_lacks(load_floor(warehouse.configs), manifest))
-    ):
+    lacks = find_lacks(load_floor(warehouse.configs), manifest)
+    if measured and len(manifest.terms) > settled and lacks:
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "
             "fewer columns. To publish it anyway: --force"
