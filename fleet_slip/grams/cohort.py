@@ -307,8 +307,8 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     feature_set = opened.catalog.feature_set(opened.catalog.name_of(opened.identity))
     if feature_set.change_s:
         return DataError(
-            f"no drive of the cohort {condition.shown} has satellite fixes {feature_set.change_text} "
-            "apart, so there is no course to learn from. Choose another cohort, or map the "
+            f"no drive of the cohort {condition.shown} has satellite fixes "
+            f"{feature_set.change_text} apart, so there is no course to learn from. Choose another cohort, or map the "
             "course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(

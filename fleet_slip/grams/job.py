@@ -270,7 +270,9 @@ def land_ahead(
         require_active(logs, replaced)
         late = None
         if warehouse.catalog.feature_set(name).in_time:
-            late = course_delays(warehouse.catalog, grams, frozenset(file.path for file in logs.files))
+            late = course_delays(
+                warehouse.catalog, grams, frozenset(file.path for file in logs.files)
+            )
         rows = aggregate(warehouse, missing, feature_set=name, late=late)
         _land(grams, logs, identity, write_rows(warehouse, [rows]))
 

@@ -19,8 +19,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES, RECEIVER
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
@@ -248,9 +248,7 @@ GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 """What a delay is a whole number of, s."""
 
 
-def course_delays(
-    catalog: Catalog, grams: Snapshot, active: frozenset[str]
-) -> dict[str, int]:
+def course_delays(catalog: Catalog, grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
     """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
     counted = pa.array(sorted(active), pa.string())
     columns = ("file", "day", "vehicle_id", "drive_id", RECEIVER)

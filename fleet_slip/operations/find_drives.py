@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue, digest_counts
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import digest_counts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
 from fleet_slip.rendering import Remark
@@ -146,7 +146,7 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
     columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
     for file in grams.files:
         rows = grams.table.read(file.path, columns)
-        whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
+        whole = pc.equal(rows["feature_set"], PLAIN)
         known.update(rows["file"].filter(whole).unique().to_pylist())
         found = rows.filter(rows_of(rows, subject))
         for path, drive in zip(
@@ -209,7 +209,7 @@ def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
     for file in logs.files:
         if file.path not in drives:
             continue
-        signals = [name for name in catalogue().signals if name in file.null_counts]
+        signals = [name for name in warehouse.catalog.signals.signals if name in file.null_counts]
         rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
         ids = rows["drive_id"].cast(pa.string())
         for name in sorted(drives[file.path]):
