@@ -1,4 +1,4 @@
-"""The shipped catalog, for tests that need one outside a data root."""
+"""The catalog of the shipped configs, which most tests use."""
 
 from fleet_slip.catalogue.catalog import load_catalog
 
