@@ -107,11 +107,10 @@ def features(
 
     Example: fleet-slip features --sql ay_mean_16
     """
-    warehouse = context.obj().warehouse
+    catalog: Catalog = context.obj().warehouse.catalog
     if files:
-        _print_files(warehouse.configs, json)
+        _print_files(catalog.configs, json)
         return
-    catalog = warehouse.catalog
     named = {name: catalog.feature_set(name) for name in (PLAIN, *catalog.sets)}
     if sql is not None:
         typer.echo(column_query(catalog, sql))
