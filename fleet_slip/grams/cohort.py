@@ -308,8 +308,8 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     if feature_set.change_s:
         return DataError(
             f"no drive of the cohort {condition.shown} has satellite fixes "
-            f"{feature_set.change_text} apart, so there is no course to learn from. Choose another cohort, or map the "
-            "course and ingest again: docs/course.md."
+            f"{feature_set.change_text} apart, so there is no course to learn from. Choose another "
+            "cohort, or map the course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(
         "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
