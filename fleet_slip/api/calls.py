@@ -183,17 +183,15 @@ def unless_local(executor: Executor) -> Executor | None:
 
 
 def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
-    """Return the warehouse as the workers of an executor find it, with its catalog loaded.
+    """Return the warehouse as the workers of an executor find it.
 
-    Workers may not have the folder of configs: tasks carry the catalog.
+    It is pickled with its catalog: a worker need not have the folder of configs.
     """
     from fleet_slip.warehouse.tables import Warehouse
 
     if unless_local(executor) is None:
         return warehouse
-    reachable = Warehouse(absolute(warehouse.root), warehouse.configs)
-    _ = reachable.catalog
-    return reachable
+    return Warehouse(absolute(warehouse.root), warehouse.configs)
 
 
 # What is said of parameters of several methods; with a `Doc` they are options of commands, too.

@@ -214,7 +214,9 @@ def received_rows(
     """The Gram rows that the messages of a drive become."""
     root.mkdir()
     fleet = fleet_slip.open(root / "data", configs.folder)
-    fleet.ingest_counted(write_counted(root / "rows", rows_of_messages(content)))
+    fleet.ingest_counted(
+        write_counted(root / "rows", rows_of_messages(content, fleet.warehouse.catalog))
+    )
     found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()
     return found
 

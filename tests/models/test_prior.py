@@ -9,6 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.evaluation import measured as module
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured
 from fleet_slip.evaluation.measured import identified_prior
@@ -157,7 +158,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
         fitted = Fitted(stiffness_rear=1.0 + len(seen) / 100)
         return Identified(measured.car(fitted), fitted.noise, 0.0)
 
-    def simulate(campaign: object, feature_set: str, executor: object) -> object:
+    def simulate(_: Catalog, campaign: object, feature_set: str, executor: object) -> object:
         vehicle = identified_prior(campaign)  # type: ignore[arg-type]
         assert vehicle is not None
         simulated.append(vehicle.suspension.rear_stiffness_factor)

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -237,7 +238,7 @@ def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
     batches = [Batch("smoke", DAY, i, (drive,)) for i, drive in enumerate(whole.drives)]
     one_by_one = [simulate_batch(SIGNALS, batch) for batch in batches]
     with ThreadPoolExecutor(4) as threads:
-        backwards = list(threads.map(simulate_batch, reversed(batches)))
+        backwards = list(threads.map(partial(simulate_batch, SIGNALS), reversed(batches)))
     for here, there in zip(one_by_one, reversed(backwards), strict=True):
         assert here.equals(there)
     unified = pa.concat_tables(one_by_one).unify_dictionaries().combine_chunks()

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.arrays import IntArray
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.grams.on_board import COLUMNS, counted_sets
 from fleet_slip.regression.gram import Gram
 from tests.support.catalog import CATALOG, SIGNALS
@@ -56,12 +57,13 @@ def _reading() -> dict[str, Any]:
     return found
 
 
-def rows_of_messages(content: bytes) -> list[dict[str, Any]]:
+def rows_of_messages(content: bytes, catalog: Catalog = CATALOG) -> list[dict[str, Any]]:
     """The rows that the page makes of messages one behind the other."""
     rows: list[dict[str, Any]] = []
+    sets = {one.definition: one for one in counted_sets(catalog).values()}
     while content:
         size = int.from_bytes(content[6:8], "little")
-        rows.append(_reading()["row_of"](content[:size]))
+        rows.append(_reading()["row_of"](content[:size], sets))
         content = content[size:]
     return rows
 
