@@ -102,7 +102,8 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.grams.calibration import calibrate
         from fleet_slip.warehouse.condition import parse_cohort
 
-        return calibrate(self.warehouse, parse_cohort(cohort), receivers=True)
+        condition = parse_cohort(self.warehouse.catalog.signals, cohort)
+        return calibrate(self.warehouse, condition, receivers=True)
 
     def monitor(
         self,
@@ -287,7 +288,8 @@ class HealthAndUpkeep(JudgedModels):
 
         told = count_from_start(progress)
         with step("retain") as figures:
-            report = retain(self.warehouse, load_retention(config), date.today(), told)
+            retention = load_retention(config, self.warehouse.configs)
+            report = retain(self.warehouse, retention, date.today(), told)
             figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
         return report
 

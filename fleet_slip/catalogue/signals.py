@@ -3,10 +3,8 @@
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cached_property
 from hashlib import blake2b
-from os import environ
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,10 +15,7 @@ from pydantic import Field, StringConstraints, model_validator
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
-from fleet_slip.resources import config_file
-
-CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
-"""Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""
+from fleet_slip.resources import Configs
 
 COUNT_MAX = 2**15 - 1
 """Largest count. The range is symmetric, so that mirroring a drive never overflows."""
@@ -154,8 +149,8 @@ class SignalCatalogue(Config):
         try:
             return self.signals[name]
         except KeyError:
-            known = ", ".join(self.signals)
-            raise QuestionError(f"unknown signal {name!r}. Known signals: {known}.") from None
+            names = ", ".join(self.signals)
+            raise QuestionError(f"unknown signal {name!r}. Known signals: {names}.") from None
 
     @cached_property
     def label(self) -> str:
@@ -218,11 +213,9 @@ class SignalCatalogue(Config):
         )
 
 
-@cache
-def catalogue() -> SignalCatalogue:
-    """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
-    chosen = environ.get(CATALOGUE_VARIABLE)
-    return load_config(Path(chosen) if chosen else config_file("signals.toml"), SignalCatalogue)
+def load_signals(configs: Configs) -> SignalCatalogue:
+    """Return the signal catalogue `signals.toml` of a folder of configs. Raises `ConfigError`."""
+    return load_config(configs.file("signals.toml"), SignalCatalogue)
 
 
 # From physical values to counts, as the cars' sensors and measured logs make them.

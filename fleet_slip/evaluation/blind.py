@@ -12,11 +12,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.catalogue.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge
-from fleet_slip.resources import config_file
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name
@@ -102,18 +103,23 @@ class BlindSet(Config):
         return Scenario.model_validate(content)
 
 
-def blind_scenarios(sha256: str) -> tuple[Scenario, ...]:
+def blind_scenarios(sha256: str, configs: Configs) -> tuple[Scenario, ...]:
     """Return the drives that the model version with this hash is judged on."""
-    return load_config(config_file("blind.toml"), BlindSet).scenarios(int(sha256[:15], 16))
+    blind = load_config(configs.file("blind.toml"), BlindSet, configs)
+    return blind.scenarios(int(sha256[:15], 16))
 
 
-def judge_blindly(sha256: str, estimators: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+def judge_blindly(
+    catalog: Catalog, sha256: str, estimators: Mapping[str, Estimate]
+) -> list[dict[str, Any]]:
     """Judge estimators on the drives that belong to a model version.
 
     Returns `results` by estimator over all drives together, then by class of road, by weather and
     by drive. The truth is the simulator's own, not what a log would keep of it.
     """
-    runs = [evaluate_drive(one, estimators) for one in simulate_drives(blind_scenarios(sha256))]
+    scenarios = blind_scenarios(sha256, catalog.configs)
+    drives = simulate_drives(catalog.signals, scenarios)
+    runs = [evaluate_drive(drive, estimators) for drive in drives]
     groups = {"all": runs}
     for place in (0, -1):
         for run in runs:

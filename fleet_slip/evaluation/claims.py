@@ -92,7 +92,7 @@ class Facts:
             "signals": len(self._evaluated.estimators[self.data.choice]["signals"]),
             "drives": version.manifest.trained_on.drives,
             "version": version.reference,
-            "costs": describe_costs(version.manifest),
+            "costs": describe_costs(version),
         }
 
     def training(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.job import (
@@ -77,9 +77,9 @@ class EvaluatedDrive:
         return self.vx_mps > SLOWEST_MPS
 
 
-def visible_signals() -> tuple[str, ...]:
+def visible_signals(signals: SignalCatalogue) -> tuple[str, ...]:
     """Return the names of the signals that an estimator may see: never a truth."""
-    return (*catalogue().inputs, *GPS_SIGNALS)
+    return (*signals.inputs, *GPS_SIGNALS)
 
 
 def simulate_scenarios(
@@ -96,30 +96,32 @@ def simulate_scenarios(
     return report
 
 
-def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[EvaluatedDrive, ...]:
+def simulate_drives(
+    signals: SignalCatalogue, scenarios: Sequence[Scenario]
+) -> tuple[EvaluatedDrive, ...]:
     """Simulate the drives of scenarios, failures applied; nothing is written.
 
     Estimators see what the log holds; the truth is exact. A log keeps vy in steps of 0.005 m/s,
     which at 25 m/s is half of what good estimates err.
     """
     once = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
-    logs = dict(zip(once, simulate_logs(list(once.values()), MOTION), strict=True))
-    return tuple(_measured(scenario, logs[scenario.drive_id]) for scenario in scenarios)
+    logs = dict(zip(once, simulate_logs(signals, list(once.values()), MOTION), strict=True))
+    return tuple(_measured(signals, scenario, logs[scenario.drive_id]) for scenario in scenarios)
 
 
-def _measured(scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
+def _measured(signals: SignalCatalogue, scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
     time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
-    signals = {}
-    for name in visible_signals():
-        values = log.measurement.counts[name] * float(catalogue()[name].scale)
+    visible = {}
+    for name in visible_signals(signals):
+        values = log.measurement.counts[name] * float(signals[name].scale)
         missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
-        signals[name] = np.where(missing, np.nan, values)
+        visible[name] = np.where(missing, np.nan, values)
     for failure in scenario.failures:
-        signals = apply_failure(signals, time_s, failure)
+        visible = apply_failure(visible, time_s, failure)
     return EvaluatedDrive(
         scenario=scenario,
         time_s=time_s,
-        signals={catalogue()[name].column: values for name, values in signals.items()},
+        signals={signals[name].column: values for name, values in visible.items()},
         **log.motion,
         lost_control_s=log.lost_control_s,
     )

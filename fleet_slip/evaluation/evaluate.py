@@ -39,11 +39,10 @@ def train_competitors(
     bank: Bank = {}
     for one in trained:
         bank |= one.bank()
-    weighed = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
+    weighed = "mass_kg" in Predictor.of(warehouse.catalog.signals, one_car.manifest).plan.facts
     drives = TuningDrives.of(warehouse, trained[0].selection.cohort, weighed=weighed)
-    return trained, bank | filter_bank(
-        drives, load_scenario("nominal").car, executor, weighed=weighed
-    )
+    car = load_scenario("nominal", warehouse.configs).car
+    return trained, bank | filter_bank(drives, car, executor, weighed=weighed)
 
 
 def evaluate(
@@ -59,7 +58,8 @@ def evaluate(
     """
     (first, *others), bank = train_competitors(warehouse, one_car, fleets, executor)
     estimators = {name: one for name, (one, _) in bank.items()}
-    runs = [evaluate_drive(one, estimators) for one in simulate_drives(scenarios)]
+    drives = simulate_drives(warehouse.catalog.signals, scenarios)
+    runs = [evaluate_drive(drive, estimators) for drive in drives]
     gps = {name for name, (_, about) in bank.items() if about.get("gps")}
     return {
         "format": 1,
@@ -90,7 +90,9 @@ def evaluate_blindly(
         "package_version": package_version("fleet-slip"),
         "model": model.reference,
         "estimators": {name: about for name, (_, about) in bank.items()},
-        "drives": judge_blindly(model.sha256, {name: one for name, (one, _) in bank.items()}),
+        "drives": judge_blindly(
+            warehouse.catalog, model.sha256, {name: one for name, (one, _) in bank.items()}
+        ),
     }
     return Evaluation(content)
 

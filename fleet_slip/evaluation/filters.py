@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.signals import SignalCatalogue
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
@@ -40,11 +40,12 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import Selection, select
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 TABLE_ONE = "table1"
@@ -73,9 +74,10 @@ class PublishedEstimate:
     """A published model, sample by sample as a car drives.
 
     It sees counts, as an ECU does: the columns are the integers that its Gram rows are made of.
-    `facts` are what the car knows of itself.
+    `facts` are what the car knows of itself; `catalogue` has the scales of the counts.
     """
 
+    catalogue: SignalCatalogue
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
 
@@ -85,7 +87,8 @@ class PublishedEstimate:
 
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""
-        return self.predictor(as_counts(signals, self.predictor.plan.signals, self.facts))
+        names = self.predictor.plan.signals
+        return self.predictor(as_counts(self.catalogue, signals, names, self.facts))
 
 
 @dataclass(frozen=True)
@@ -110,9 +113,10 @@ class TrainedModels:
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }
+        signals = version.catalog.signals
         bank: Bank = {}
         for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
-            weights = {catalogue()[name].column: one for name, one in model.model.weights.items()}
+            weights = {signals[name].column: one for name, one in model.model.weights.items()}
             fitted = LinearEstimate(model.model.offset, weights)
             about = {
                 **trained,
@@ -139,14 +143,15 @@ class TrainedModels:
                 if not term.logged
             },
         }
-        bank[version.reference] = PublishedEstimate(Predictor.of(manifest)), about
+        published = PublishedEstimate(signals, Predictor.of(signals, manifest))
+        bank[version.reference] = published, about
         return bank
 
 
 def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
     """Fit Table I on a published model's cohort as it is now. Raises `DataError` if it is empty."""
     cohort = load_cohort(warehouse, version.manifest.trained_on.cohort)
-    models = load_model_list(TABLE_ONE)
+    models = load_model_list(warehouse.catalog, TABLE_ONE)
     return TrainedModels(version, select(cohort, models.model, models.folds))
 
 
@@ -406,22 +411,25 @@ class TuningDrives:
                 of_class.setdefault(model, []).append(replace(drive, car=None))
         for model, own in sorted(of_class.items()):
             some = choose_evenly(own, DRIVES_OF_A_CLASS)
-            yield model, identify(Measured.of(load_vehicle(model)), some, executor)
+            car = load_vehicle(model, self.warehouse.configs)
+            yield model, identify(Measured.of(car), some, executor)
 
     def read(self) -> Sequence[LabelledDrive]:
         """Return the beginning of each drive, as filters meet it: they know no bias yet."""
         if not self._read:
-            with connect(self.warehouse.root, query="SELECT 1 FROM log") as database:
+            signals, configs = self.warehouse.catalog.signals, self.warehouse.configs
+            with open_views(self.warehouse, "SELECT 1 FROM log") as database:
                 for name, model, mass_kg in self.known:
-                    drive = read_drive(database, name).beginning(TUNING_S * SAMPLE_RATE_HZ)
-                    self._read.append(replace(drive, car=class_car(model, mass_kg)))
+                    drive = read_drive(signals, database, name)
+                    drive = drive.beginning(TUNING_S * SAMPLE_RATE_HZ)
+                    self._read.append(replace(drive, car=class_car(model, mass_kg, configs)))
         return self._read
 
 
-def class_car(model: str, mass_kg: float | None) -> VehicleParameters | None:
+def class_car(model: str, mass_kg: float | None, configs: Configs) -> VehicleParameters | None:
     """Return what a fleet knows of a car: its class's file, and its mass; None without a file."""
     try:
-        car = load_vehicle(model)
+        car = load_vehicle(model, configs)
     except ConfigError:
         return None
     return car if mass_kg is None else car.with_sprung_mass(mass_kg)

@@ -10,8 +10,8 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.drives import CRITERION, EvaluatedDrive, find_unstable
-from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Gps
 
 Signals = Mapping[str, FloatArray]
 """One drive at 100 Hz: an array of shape (ticks,) for each SI column; NaN where null."""
@@ -275,13 +275,14 @@ def _stand(run: EvaluatedScenario, estimator: str, gps: Collection[str]) -> dict
 
 def _same_as(scenario: Scenario, runs: Sequence[EvaluatedScenario]) -> str | None:
     """Return the first of some drives that is the same for whoever does not see GPS."""
-    seen = _without_gps(scenario)
-    return next((run.name for run in runs if _without_gps(run.scenario) == seen), None)
+    gps = scenario.sensors.gps
+    seen = _with_gps(gps, scenario)
+    return next((run.name for run in runs if _with_gps(gps, run.scenario) == seen), None)
 
 
-def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
-    """Return what of a scenario matters to who does not see GPS."""
-    sensors = scenario.sensors.model_copy(update={"gps": load_scenario("nominal").sensors.gps})
+def _with_gps(gps: Gps, scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
+    """Return what of a scenario matters to an estimator without GPS, all with the same GPS."""
+    sensors = scenario.sensors.model_copy(update={"gps": gps})
     drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
     failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
     return drive.digest, failures

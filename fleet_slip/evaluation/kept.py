@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.evaluate import evaluations_of
 from fleet_slip.evaluation.filters import TrainedModels
@@ -179,7 +178,7 @@ class Ordering:
 
 def compare_orders(cohort: Cohort, signals: Sequence[str]) -> Ordering:
     """Rank signals in every way beside all subsets. Raises `DataError` if no drive has them all."""
-    label = catalogue().label
+    label = cohort.catalog.signals.label
     total = cohort.serving(signals).table.total()
     best = best_subsets(total, signals, label, count=1)
     enough = best[-1].best.r_squared - CLOSE

@@ -14,8 +14,6 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
@@ -30,7 +28,7 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import Selection, SelectionPlan
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 # What is left out: units of a drive and a quarter of its time, of which all four are a whole drive.
@@ -154,24 +152,25 @@ class Learner:
 
         Raises as `load_cohort`.
         """
-        plan = SelectionPlan.of(request)
+        plan = SelectionPlan.of(warehouse.catalog, request)
         cohort = load_cohort(warehouse, condition, plan.feature_set)
         return cls(plan, cohort, drives, warehouse)
 
     @cached_property
     def divided(self) -> Cohort:
         """The Gram rows of each quarter by itself, as if it were a drive."""
-        name = self.plan.feature_set
-        if features().feature_set(name).change_ticks:
+        catalog, name = self.warehouse.catalog, self.plan.feature_set
+        feature_set, label = catalog.feature_set(name), catalog.signals.label
+        if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
-        workspace = Workspace(ColumnPlan.of_set(features(), name))
-        parts = Parts.of_set(features().feature_set(name))
+        workspace = Workspace(ColumnPlan.of_set(catalog, name))
+        parts = Parts.of_set(feature_set)
         lines = {line["drive_id"]: line for line in self.cohort.drives.to_pylist()}
         found = [
             row
             for one in self.drives
             for quarter in range(QUARTERS)
-            for row in _gram_rows(workspace, parts, one, quarter, lines[one.drive.drive_id])
+            for row in _gram_rows(label, workspace, parts, one, quarter, lines[one.drive.drive_id])
         ]
         stored = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
         return with_gram_rows(self.cohort, pa.Table.from_pylist(found, schema=stored))
@@ -201,7 +200,8 @@ class Learner:
         """Return the columns that are chosen without some parts, and an estimate of all drives."""
         selection = self.choose(left_out, prior)
         manifest = manifest_of(selection, "left_out")
-        model = Predictor.of(with_straight_intercept(self.warehouse, manifest))
+        manifest = with_straight_intercept(self.warehouse, manifest)
+        model = Predictor.of(self.warehouse.catalog.signals, manifest)
         apart = {i for i, _ in left_out}
         return [*selection.winner.model.signals], [
             predict_drive(model, one, cars) if i in apart else np.full(len(one.rows), np.nan)
@@ -217,10 +217,14 @@ def _quarter_of(drive_id: str, quarter: int) -> str:
 
 
 def _gram_rows(
-    workspace: Workspace, parts: Parts, one: HeldOutDrive, quarter: int, line: Mapping[str, Any]
+    label: str,
+    workspace: Workspace,
+    parts: Parts,
+    one: HeldOutDrive,
+    quarter: int,
+    line: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return the Gram rows of the labelled rows of a quarter; columns look back beyond it."""
-    label = catalogue().label
     counts = counts_of(one.rows, workspace.plan, line)
     labelled = counts.present.get(label, np.ones(len(one.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (one.quarter == quarter)}
@@ -243,9 +247,9 @@ def read_measured_drives(warehouse: Warehouse, cohort: Cohort) -> list[HeldOutDr
     trips = {one["drive_id"]: one["trip"] for one in cohort.drives.to_pylist()}
     drives: list[HeldOutDrive] = []
     query = "SELECT * FROM log_counts WHERE drive_id = $drive ORDER BY tick"
-    with connect(warehouse.root, query="SELECT 1 FROM log, log_counts") as database:
+    with open_views(warehouse, "SELECT 1 FROM log, log_counts") as database:
         for name in choose_evenly(sorted(trips), DRIVES_AT_MOST):
-            drive = read_drive(database, name)
+            drive = read_drive(warehouse.catalog.signals, database, name)
             if np.isfinite(drive.sideslip_rad).any():
                 rows = database.sql(query, params={"drive": name}).to_arrow_table()
                 drives.append(HeldOutDrive(drive, rows, trips[name]))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.belief import YawRateNoise
@@ -83,7 +83,7 @@ def evaluate_measured(
     """
     cohort = load_cohort(warehouse, condition)
     drives = read_measured_drives(warehouse, cohort)
-    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
+    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None, warehouse.configs)
     car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
     competition = Competition.of(warehouse, versions, condition, drives, car, executor)
     parts, kinds = parts_to_leave_out(drives), kinds_to_leave_out(drives)
@@ -157,6 +157,7 @@ class Competition:
         told: what each estimator knows, in words.
     """
 
+    catalog: Catalog
     drives: Sequence[HeldOutDrive]
     published: Mapping[str, Predictor]
     learners: Mapping[str, Learner]
@@ -181,10 +182,10 @@ class Competition:
         executor: Executor,
     ) -> "Competition":
         """Return who competes: Table I, versions, and filters in a car if there is one."""
-        registry = Registry.of(warehouse)
+        catalog, registry = warehouse.catalog, Registry.of(warehouse)
         recipes = {
             f"table1/{one.name}": SelectionRequest(model=",".join(one.signals))
-            for one in load_model_list(TABLE_ONE).model
+            for one in load_model_list(catalog, TABLE_ONE).model
         }
         told = dict.fromkeys(recipes, FITTED)
         published: dict[str, Predictor] = {}
@@ -192,7 +193,8 @@ class Competition:
             manifest, name = version.manifest, version.reference
             of_course = manifest.learned_from is not None
             if of_course or find_seen(warehouse, registry, manifest, condition).trained == 0:
-                published[name], told[name] = Predictor.of(manifest), "as published"
+                published[name] = Predictor.of(catalog.signals, manifest)
+                told[name] = "as published"
             else:
                 recipes[name], told[name] = recipe_of(version)[0], CHOSEN
         learners = {
@@ -200,7 +202,7 @@ class Competition:
             for name, request in recipes.items()
         }
         numbered = any(one.plan.numbers for one in published.values()) or any(
-            features().feature_set(one.plan.feature_set).calibrated for one in learners.values()
+            catalog.feature_set(one.plan.feature_set).calibrated for one in learners.values()
         )
         vehicle = car if isinstance(car, VehicleParameters) else None
         measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
@@ -210,7 +212,7 @@ class Competition:
                 replace(one, drive=_judged(accelerated(one.drive, measured), measured))
                 for one in drives
             ]
-        return cls(drives, published, learners, vehicle, measured, cars, executor, told)
+        return cls(catalog, drives, published, learners, vehicle, measured, cars, executor, told)
 
     def judge_without(self, parts: Sequence[LeftOut]) -> list[JudgedDrive]:
         """Return the drives with what everybody makes of each part without having seen it."""
@@ -263,14 +265,14 @@ class Competition:
         name, feature_set = learner.plan.request.prior, learner.plan.feature_set
         if name is None:
             return None
-        campaign = load_campaign(name)
+        campaign = load_campaign(name, self.catalog.configs)
         if (measured := self.measured) and identified_prior(campaign):
             vehicles = (self.identified(measured, left_out).car,)
             plan = campaign.plan.model_copy(update={"vehicles": vehicles})
             campaign = campaign.model_copy(update={"plan": plan})
         key = campaign.digest, feature_set
         if key not in self._priors:
-            self._priors[key] = simulate_prior(campaign, feature_set, self.executor)
+            self._priors[key] = simulate_prior(self.catalog, campaign, feature_set, self.executor)
         return self._priors[key]
 
     def identified(self, measured: Measured, left_out: LeftOut) -> Identified:
@@ -343,7 +345,7 @@ class Competition:
 def prior_of(version: ModelVersion) -> Campaign | None:
     """Return the campaign of a version's prior, if it has one. Raises `ConfigError`."""
     name = recipe_of(version)[0].prior if version.manifest.prior else None
-    return load_campaign(name) if name else None
+    return load_campaign(name, version.catalog.configs) if name else None
 
 
 def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:

@@ -32,7 +32,8 @@ from fleet_slip.pages.page import (
     number,
     percent,
 )
-from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+from fleet_slip.resources import Configs
+from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -49,11 +50,12 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     evaluated = latest_of(warehouse, version)
     trained = train_models(warehouse, version)
     evaluated.require_models(trained)
-    shipped = shipped_scenarios()
+    shipped = load_scenarios(warehouse.configs)
     wanted = DRAWN_SCENARIOS.intersection(evaluated.scenarios)
     drawn = [one for one in shipped if one.name in wanted]
-    estimators = _drawn(evaluated)
-    runs = {one.scenario.name: evaluate_drive(one, estimators) for one in simulate_drives(drawn)}
+    estimators = _drawn(evaluated, warehouse.configs)
+    drives = simulate_drives(warehouse.catalog.signals, drawn)
+    runs = {drive.scenario.name: evaluate_drive(drive, estimators) for drive in drives}
     evaluated.require_figures(runs)
     cohort, models = trained.selection.cohort, trained.selection.models
     signals = tuple(dict.fromkeys(models[-1].signals))
@@ -70,9 +72,9 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     )
 
 
-def _drawn(evaluated: Evaluated) -> dict[str, Estimate]:
+def _drawn(evaluated: Evaluated, configs: Configs) -> dict[str, Estimate]:
     """Return the estimators that figures show, rebuilt from what the evaluation says of them."""
-    about, car = evaluated.estimators, load_scenario("nominal").car
+    about, car = evaluated.estimators, load_scenario("nominal", configs).car
     models = {
         name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
         for name in evaluated.models.values()

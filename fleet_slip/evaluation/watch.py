@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray, float_column
 from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
@@ -22,13 +22,13 @@ from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
-from fleet_slip.resources import config_names
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import MOTION
 from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -93,19 +93,19 @@ class DriveFrames:
         return replace(self, **changed)
 
 
-def is_scenario(what: str) -> bool:
+def is_scenario(what: str, configs: Configs) -> bool:
     """Whether a name or path is that of a scenario, not of a drive."""
-    return what.endswith(".toml") or what in config_names("scenarios")
+    return what.endswith(".toml") or what in configs.names("scenarios")
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError`."""
-    names = [one.column for one in catalogue().signals.values()]
+    names = [one.column for one in warehouse.catalog.signals.signals.values()]
     query = (
         "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
         f"{', '.join(names)} FROM log"
     )
-    with connect(warehouse.root, query=query) as database:
+    with open_views(warehouse, query) as database:
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:
@@ -113,17 +113,20 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
             f"{drive_id!r} is neither a drive nor a scenario. See: "
             'fleet-slip sql "SELECT drive_id FROM drives"'
         )
-    traffic = _traffic_of(drive_id, rows["campaign"][0].as_py(), rows["day"][0].as_py())
+    campaign, day = rows["campaign"][0].as_py(), rows["day"][0].as_py()
+    traffic = _traffic_of(drive_id, campaign, day, warehouse.configs)
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
     return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
 
 
-def _traffic_of(drive_id: str, campaign: str | None, day: date) -> "TrafficDrive | None":
-    """Return what highway-env decided of a drive of a shipped campaign, computed again."""
+def _traffic_of(
+    drive_id: str, campaign: str | None, day: date, configs: Configs
+) -> "TrafficDrive | None":
+    """Return what highway-env decided of a drive of a campaign, computed again."""
     try:
-        drives = load_campaign(campaign or "").drives(day)
+        drives = load_campaign(campaign or "", configs).drives(day)
     except ConfigError:
         return None
     return next((one.in_traffic for one in drives if one.drive_id == drive_id), None)
@@ -148,8 +151,8 @@ def frames_of(
     known = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
     estimate = version.predict(pa.table({**known, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
-    x, y, heading, track = _places(columns, facts, time_s, vx, vy, traffic)
-    gates = gates_on(version.manifest, columns, facts)
+    x, y, heading, track = _places(version.catalog.configs, columns, facts, time_s, vx, vy, traffic)
+    gates = gates_on(version.catalog.signals, version.manifest, columns, facts)
     return DriveFrames(
         title=title,
         model=version.reference,
@@ -191,6 +194,7 @@ def _smooth(values: FloatArray) -> FloatArray:
 
 
 def _places(
+    configs: Configs,
     columns: Mapping[str, FloatArray],
     facts: Mapping[str, Any],
     time_s: FloatArray,
@@ -201,7 +205,7 @@ def _places(
     """Return x, y and heading of the car, and the line of the track, if that is known."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    track = traffic.profile.track if traffic else _known_track(facts.get("track"))
+    track = traffic.profile.track if traffic else _find_track(facts.get("track"), configs)
     if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
@@ -218,10 +222,10 @@ def _places(
     return x, y, heading, (empty, empty)
 
 
-def _known_track(name: str | None) -> Track | None:
+def _find_track(name: str | None, configs: Configs) -> Track | None:
     """Return a track by name; None if its file is not here, as of a campaign by path."""
     try:
-        return load_track(name) if name else None
+        return load_track(name, configs) if name else None
     except ConfigError:
         return None
 
@@ -246,7 +250,10 @@ def _others(
 
 
 def gates_on(
-    manifest: Manifest, signals: Mapping[str, FloatArray], facts: Mapping[str, Any]
+    signals: SignalCatalogue,
+    manifest: Manifest,
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
 ) -> Mapping[str, FloatArray]:
     """Return by gate how far it is open at each tick, shape (ticks,): 0 at the first knot, 1 at
     the last, and equally far from knot to knot."""
@@ -265,10 +272,10 @@ def gates_on(
         {},
         {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},
     )
-    columns = compute_columns(plan, as_counts(signals, plan.signals, facts))
+    opening = compute_columns(plan, as_counts(signals, columns, plan.signals, facts))
     return {
         name: np.interp(column, sorted(knots), np.linspace(0, 1, len(knots)))
-        for (name, (_, knots)), column in zip(gates.items(), columns, strict=True)
+        for (name, (_, knots)), column in zip(gates.items(), opening, strict=True)
     }
 
 
@@ -315,8 +322,8 @@ def _listed(values: FloatArray, digits: int) -> list[float | None]:
 
 def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a test drive, which is simulated. Raises `ConfigError`."""
-    scenario = load_scenario(name)
-    (drive,) = simulate_drives([scenario])
+    scenario = load_scenario(name, version.catalog.configs)
+    (drive,) = simulate_drives(version.catalog.signals, [scenario])
     traffic = scenario.batch().drives[0].in_traffic
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
     facts = {**drive.facts, "track": scenario.way.name, "drive_id": scenario.drive_id}

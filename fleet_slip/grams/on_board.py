@@ -8,7 +8,6 @@ instead of a log file the row names `received/` and the digest of the table's fi
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -27,6 +26,7 @@ from fleet_slip.base import (
     sha256_of,
     shown,
 )
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.catalogue.course import (
     BESIDE,
     COARSER,
@@ -42,8 +42,8 @@ from fleet_slip.catalogue.course import (
 )
 from fleet_slip.catalogue.definitions import limit_of
 from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal, catalogue
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
 from fleet_slip.catalogue.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
@@ -119,24 +119,22 @@ class CountedSet:
         return tuple(self.ranges)
 
 
-@cache
-def counted_sets() -> dict[str, CountedSet]:
+def counted_sets(catalog: Catalog) -> dict[str, CountedSet]:
     """Return the sets by their identities, which Gram rows carry, the logged signals first."""
-    known = features()
-    found = {}
-    for name in (PLAIN, *known.sets):
-        one = known.feature_set(name)
-        if not one.block_ticks and len(one.columns) <= MOST_COLUMNS:
-            found[known.identity(name)] = _counted(name, known.identity(name))
-    return found
+    sets = {}
+    for name in (PLAIN, *catalog.sets):
+        feature_set = catalog.feature_set(name)
+        if not feature_set.block_ticks and len(feature_set.columns) <= MOST_COLUMNS:
+            identity = catalog.identity(name)
+            sets[identity] = _counted(catalog, name, identity)
+    return sets
 
 
-def _counted(name: str, identity: str) -> CountedSet:
-    known, signals = features(), catalogue()
-    one = known.feature_set(name)
-    used = {*one.signals, *([COURSE, YAW_RATE] if one.change_ticks else [signals.label])}
-    used |= {signal for f in one.features for signal in known.features[f].inputs}
-    used |= {signal for d in known.definitions(name).values() for signal in d.signals}
+def _counted(catalog: Catalog, name: str, identity: str) -> CountedSet:
+    signals, resolved = catalog.signals, catalog.feature_set(name)
+    used = {*resolved.signals, *([COURSE, YAW_RATE] if resolved.change_ticks else [signals.label])}
+    used |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
+    used |= {signal for d in catalog.definitions(name).values() for signal in d.signals}
     made_of = {signal: about for signal, about in signals.signals.items() if signal in used}
     defined: list[Any] = [
         [signal, f"{about.scale:f}", about.min_count, about.max_count]
@@ -147,26 +145,26 @@ def _counted(name: str, identity: str) -> CountedSet:
     return CountedSet(
         name,
         identity,
-        {column: _range(column, one.change_ticks) for column in one.columns},
+        {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
         tuple(made_of),
-        one.change_ticks,
-        Parts.of_set(one).times or (None,),
-        one.in_time,
+        resolved.change_ticks,
+        Parts.of_set(resolved).times or (None,),
+        resolved.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )
 
 
-def _range(column: str, times: Sequence[int]) -> Range:
-    label = catalogue().label
+def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
+    signals, label = catalog.signals, catalog.signals.label
     if times and column in (*BESIDE, label):
         if column == STRAIGHT:
             return 0, 1
-        units = course_units()
+        units = course_units(signals)
         most = units.largest // units.divisor + 1
         if column == TURNED:
             most = 2 * max(times) * COUNT_MAX // COARSER + 1
         return -most, most
-    of = catalogue()[column] if column == label else features().of(column)
+    of = signals[column] if column == label else catalog.input(column)
     if isinstance(of, Signal):
         least, most = of.min_count, of.max_count
     else:
@@ -313,8 +311,9 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
     report = CountedReport(str(file), new, len(table), drives, rows or 0)
     if not new:
         return report
-    _require_possible(file, table)
-    new_rows = _gram_rows(table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
+    sets = counted_sets(warehouse.catalog)
+    _require_possible(sets, file, table)
+    new_rows = _gram_rows(sets, table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
     numbered = _numbered(_with_digests(new_rows))
     _require_different(file, numbered)
 
@@ -468,11 +467,13 @@ MAX_PAGES = 2**18
 """Pages of a file; a header takes some 10 µs to read."""
 
 
-def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
+def _gram_rows(
+    sets: Mapping[str, CountedSet], table: pa.Table, schema: pa.Schema, name: str
+) -> pa.Table:
     """Return rows of `grams`."""
-    identities = {one.key: identity for identity, one in counted_sets().items()}
-    sets = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
-    rows = table.set_column(table.column_names.index("feature_set"), "feature_set", sets)
+    identities = {counted.key: identity for identity, counted in sets.items()}
+    names = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
+    rows = table.set_column(table.column_names.index("feature_set"), "feature_set", names)
     rows = rows.append_column("file", pa.repeat(name, len(table)))
     return in_schema(rows.append_column("clipped", pa.repeat(0, len(table))), schema)
 
@@ -505,23 +506,23 @@ def _require_different(file: Path, rows: pa.Table) -> None:
             _refuse(file, row, drive, f"is there twice, first as {shown(other)}")
 
 
-def _require_possible(file: Path, table: pa.Table) -> None:
+def _require_possible(sets: Mapping[str, CountedSet], file: Path, table: pa.Table) -> None:
     """Raise `InputError` for the first row that no drive can have."""
-    sets = {one.key: one for one in counted_sets().values()}
-    known = [
-        {"columns": one.columns, "parts": [part or "" for part in one.parts]}
-        | {"key": key, "in_time": one.in_time}
-        for key, one in sets.items()
+    by_key = {counted.key: counted for counted in sets.values()}
+    described = [
+        {"columns": counted.columns, "parts": [part or "" for part in counted.parts]}
+        | {"key": key, "in_time": counted.in_time}
+        for key, counted in by_key.items()
     ]
     late = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
     with open_database() as database, database_errors("checking Gram rows"):
         database.register("counted", _numbered(table))
-        database.register("known", pa.Table.from_pylist(known))
+        database.register("known", pa.Table.from_pylist(described))
         statement = read_sql("jobs", "counted_wrong.sql")
         wrong = database.execute(statement, {**late, "longest": LONGEST_ROWS}).fetchone()
     if wrong:
         _refuse(file, *wrong)
-    for row, reason in impossible_rows(_numbered(table), sets):
+    for row, reason in impossible_rows(_numbered(table), by_key):
         _refuse(file, row["number"], row["drive_id"], reason)
 
 

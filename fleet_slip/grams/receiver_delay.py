@@ -21,7 +21,6 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
 from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES, RECEIVER
-from fleet_slip.catalogue.features import features
 from fleet_slip.catalogue.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
@@ -260,7 +259,7 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
     columns = ("file", "day", "vehicle_id", "drive_id", RECEIVER)
 
     def batches() -> Iterator[pa.RecordBatch]:
-        identity = features().identity(DELAY)
+        identity = warehouse.catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
             counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
             for column, names in names_by_column(erased).items():

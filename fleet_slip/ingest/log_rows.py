@@ -15,7 +15,6 @@ import polars as pl
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, shown
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
     DateColumn,
@@ -225,7 +224,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
             reasons = ("time_backwards", "time_duplicate", "isolated")
             cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
             fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
-    names = [name for name in catalogue().signals if name in mapping.signals]
+    names = [name for name in mapping.catalogue.signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
@@ -246,7 +245,7 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
         )
         if of is not None:
             source = mapping.signals[of]
-            value = _si_value(of, source, _signed(source, name, schema, mapping)[0])
+            value = _si_value(mapping, of, source, _signed(source, name, schema, mapping)[0])
         elif condition.one_of:
             value = as_text(name, schema, mapping)
         else:
@@ -264,11 +263,11 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
-    (signal, least, most), value = count_range(name, source), pl.col(name)
+    (signal, least, most), value = count_range(mapping.catalogue, name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = _number_problems(name, present, (outside, "out_of_range"))
-    return RowField(name, "signal", raw, _si_value(name, source, number), problem)
+    return RowField(name, "signal", raw, _si_value(mapping, name, source, number), problem)
 
 
 def _signed(
@@ -284,8 +283,8 @@ def _signed(
     return signed, present & sign.is_not_null()
 
 
-def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
-    gain, bias = source.linear(catalogue()[name].unit)
+def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
+    gain, bias = source.linear(mapping.catalogue[name].unit)
     # Otherwise it would change nothing but the sign of zero.
     return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
 

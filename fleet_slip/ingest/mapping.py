@@ -11,6 +11,7 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
+    PrivateAttr,
     ValidationError,
     ValidationInfo,
     field_validator,
@@ -18,8 +19,9 @@ from pydantic import (
 )
 
 from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, shown
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.catalogue.course import COURSE
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalogue.signals import Identifier, SignalCatalogue
 from fleet_slip.config import (
     Config,
     Name,
@@ -43,7 +45,6 @@ from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.suspicion import RADIUS_M
-from fleet_slip.resources import find_config
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
@@ -72,9 +73,8 @@ class LabelSensor(Config):
         """Whether it is not at the centre of gravity."""
         return bool(self.sensor_x_m or self.sensor_y_m)
 
-    def require_signals(self, signals: Container[str]) -> None:
+    def require_signals(self, signals: Container[str], label: str) -> None:
         """Raise `ValueError` for a mapping that lacks what the label is computed from."""
-        label = catalogue().label
         if self.from_velocities and label in signals:
             raise ValueError(f"label: from_velocities computes {label}: remove its column")
         needed = ["vx", "vy"] if self.from_velocities else [label]
@@ -92,9 +92,16 @@ class LabelSensor(Config):
 Fact = TypeVar("Fact")
 
 
+def signals_of(info: ValidationInfo) -> SignalCatalogue:
+    """Return the signals that a mapping is validated against: the context of the validation."""
+    if not isinstance(info.context, SignalCatalogue):
+        raise TypeError("a mapping is validated with a SignalCatalogue as context")
+    return info.context
+
+
 def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
     """Return a fact of a drive. Raises `ValueError` if the catalogue has no such column."""
-    if info.field_name not in catalogue().drive:
+    if info.field_name not in signals_of(info).drive:
         raise ValueError(
             "the catalogue has no such drive column. Copy it from the shipped one: "
             "configs/signals.toml"
@@ -203,8 +210,12 @@ class DriveMetadata(Config):
 
 
 class Mapping(Config):
-    """How one kind of measured file becomes drives. Identifies itself by `name`."""
+    """How one kind of measured file becomes drives. Identifies itself by `name`.
 
+    It is validated with the signals of a catalog as context, and keeps them.
+    """
+
+    _catalogue: SignalCatalogue = PrivateAttr()
     name: Identifier
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
@@ -229,23 +240,24 @@ class Mapping(Config):
         return where
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Mapping":
+    def _consistent(self, info: ValidationInfo) -> "Mapping":
+        self._catalogue = signals_of(info)
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
                 raise ValueError(f"where: {condition.signal!r} is not a signal of this mapping")
             if condition.signal is not None and self.signals[condition.signal].component:
                 raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
-        known = catalogue().signals
+        signals = self._catalogue.signals
         for name, column in self.signals.items():
-            if name not in known:
-                raise ValueError(describe_unknown(name, known))
+            if name not in signals:
+                raise ValueError(describe_unknown(name, signals))
             try:
-                column.require_unit_of(name, known[name].unit)
+                column.require_unit_of(name, signals[name].unit)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         require_satellites(self.signals)
         if self.label is not None:
-            self.label.require_signals(self.signals)
+            self.label.require_signals(self.signals, self._catalogue.label)
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError(
                 "drive.day is missing, and the time has no date. Set a date, a column or a path"
@@ -259,6 +271,11 @@ class Mapping(Config):
         """Return the hash of what identifies it."""
         return hash(self.canonical_json())
 
+    @property
+    def catalogue(self) -> SignalCatalogue:
+        """The signals and drive columns that it was validated against."""
+        return self._catalogue
+
     def for_file(self, file: Path) -> "Mapping":
         """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
         given = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
@@ -266,7 +283,7 @@ class Mapping(Config):
         if not found:
             return self
         try:
-            drive = DriveMetadata.model_validate({**given, **found})
+            drive = DriveMetadata.model_validate({**given, **found}, context=self._catalogue)
         except ValidationError as error:
             raise InputError(f"{shown(file)}: drive: {faults_of(error)}") from None
         return self.model_copy(update={"drive": drive})
@@ -300,14 +317,14 @@ class Mapping(Config):
     def signal_names(self) -> tuple[str, ...]:
         """All signals that drives have, those computed from others too."""
         derived = self.label is not None and self.label.from_velocities
-        label = [catalogue().label] if derived else []
+        label = [self._catalogue.label] if derived else []
         return (*self.signals, *label, *self.front_wheels)
 
     @property
     def front_wheels(self) -> tuple[str, ...]:
         """The signals that one angle of both front wheels stands for, where it is all there is."""
         alone = "steer" in self.signals and not set(FRONT_WHEELS) & set(self.signals)
-        return tuple(name for name in FRONT_WHEELS if alone and name in catalogue().signals)
+        return tuple(name for name in FRONT_WHEELS if alone and name in self._catalogue.signals)
 
     @property
     def formats(self) -> FileFormats:
@@ -339,10 +356,10 @@ def is_number(text: str) -> bool:
     return True
 
 
-def load_mapping(name_or_path: str) -> Mapping:
+def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:
     """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
-    file = find_config("mappings", name_or_path)
-    mapping = load_config(file, Mapping)
+    file = catalog.configs.find("mappings", name_or_path)
+    mapping = load_config(file, Mapping, catalog.signals)
     if mapping.can is not None:
         database = read_can_database(mapping.can, Path(str(file)).parent)
         mapping = mapping.model_copy(update={"can": database})
@@ -359,8 +376,8 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return what stands for whatever a mapping does not say, each with the key that says it."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
     wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEEL_PREFIX)}
-    label, course = signals.get(catalogue().label), signals.get(COURSE)
-    labelled = catalogue().label in mapping.signal_names
+    label, course = signals.get(mapping.catalogue.label), signals.get(COURSE)
+    labelled = mapping.catalogue.label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere
     unknown_radius = RADIUS_M in wheels.values() or (moved and None in wheels.values())
     naive = time.format is not None and "%z" not in time.format and time.is_dated

@@ -7,7 +7,7 @@ models/<name>/history/1.json, 2.json, ...      every move of an alias, with its 
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from html import escape
@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
@@ -185,11 +186,12 @@ class PandasFrame(Protocol):
 
 @dataclass(frozen=True)
 class ModelVersion:
-    """A manifest with its number and verified checksum."""
+    """A manifest with its number, its verified checksum, and the catalog of its data root."""
 
     version: int
     manifest: Manifest
     sha256: str
+    catalog: Catalog = field(repr=False, compare=False)
 
     def __repr__(self) -> str:
         figures = self.manifest.cross_validation
@@ -212,7 +214,7 @@ class ModelVersion:
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns in SI units that `predict` needs, named as in the view `log`."""
-        return self.manifest.columns
+        return self.manifest.columns(self.catalog.signals)
 
     @overload
     def predict(self, frame: "pl.DataFrame") -> "pl.Series": ...
@@ -249,13 +251,13 @@ class ModelVersion:
         """
         from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
-        return predict(self.manifest, frame, self._predictor)
+        return predict(self.catalog.signals, self.manifest, frame, self._predictor)
 
     @cached_property
     def _predictor(self) -> "Predictor":
         from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
 
-        return Predictor.of(self.manifest)
+        return Predictor.of(self.catalog.signals, self.manifest)
 
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
@@ -263,14 +265,15 @@ _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
 @dataclass(frozen=True)
 class Registry:
-    """All models of a data root."""
+    """All models of a data root, and the catalog of their columns."""
 
     root: Folder
+    catalog: Catalog
 
     @classmethod
     def of(cls, warehouse: "Warehouse") -> "Registry":
         """Return the models of a data root."""
-        return cls(warehouse.root)
+        return cls(warehouse.root, warehouse.catalog)
 
     @property
     def folder(self) -> Folder:
@@ -312,13 +315,19 @@ class Registry:
             if version in numbers:
                 raise
             raise _unknown(name, str(version), numbers) from None
-        manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
+        manifest = parse_document(
+            document.content,
+            Manifest,
+            f"{name}@{version}",
+            "its manifest",
+            self.catalog.signals,
+        )
         if manifest.name != name:
             raise StorageError(
                 f"{name}@{version}: its manifest names the model {manifest.name}. Restore the "
                 "file from a backup, or publish again."
             )
-        return ModelVersion(version, manifest, document.sha256)
+        return ModelVersion(version, manifest, document.sha256, self.catalog)
 
     def only(self, or_else: str = "") -> str:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue, digest_counts
+from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalogue.signals import digest_counts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
 from fleet_slip.grams.on_board import counted_sets
@@ -160,7 +160,7 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
     columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
     for file in grams.files:
         rows = grams.table.read(file.path, columns)
-        whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
+        whole = pc.equal(rows["feature_set"], PLAIN)
         known.update(rows["file"].filter(whole).unique().to_pylist())
         found = rows.filter(rows_of(rows, subject))
         for path, drive in zip(
@@ -265,14 +265,16 @@ def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
         names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
         if pc.any(selected := rows_of(names, subject)).as_py():
             rows = read_rows(warehouse.grams, file).filter(selected)
-            on_board = pc.is_in(rows["feature_set"], pa.array(list(counted_sets()), pa.string()))
+            on_board = pc.is_in(
+                rows["feature_set"], pa.array(list(counted_sets(warehouse.catalog)), pa.string())
+            )
             yield from gram_digests(rows.filter(on_board))[0]
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
     for file in logs.files:
         if file.path not in drives:
             continue
-        signals = [name for name in catalogue().signals if name in file.null_counts]
+        signals = [name for name in warehouse.catalog.signals.signals if name in file.null_counts]
         rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
         ids = rows["drive_id"].cast(pa.string())
         for name in sorted(drives[file.path]):

@@ -46,7 +46,7 @@ from fleet_slip.operations.rewriting import (
     write_without,
 )
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.resources import cache_folder, config_file, find_config
+from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
@@ -317,9 +317,9 @@ class RetentionReport(Answer):
         yield self.vacuumed.remark
 
 
-def load_retention(path: str | None) -> Retention:
-    """Read a retention file, the one that ships by default. Raises `ConfigError`."""
-    file = config_file("retention.toml") if path is None else find_config("retention", path)
+def load_retention(path: str | None, configs: Configs) -> Retention:
+    """Read a retention file, by default `retention.toml` of the configs. Raises `ConfigError`."""
+    file = configs.file("retention.toml") if path is None else configs.find("retention", path)
     return load_config(file, Retention)
 
 

@@ -158,7 +158,7 @@ def status_of(
     changed = list(find_changed_lines(warehouse.root, since))
     last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
     age = _age_hours(tables["logs"].committed_at, now)
-    least = thresholds().status.min_free_fraction
+    least = thresholds(warehouse.configs).status.min_free_fraction
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
         *_returned(warehouse, tuple(snapshots.values())),

@@ -24,6 +24,7 @@ from fleet_slip.export.program import Car, Program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.models import CARS, MODELS, hostile_drive, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
@@ -33,7 +34,7 @@ MANIFEST = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
 
 @pytest.fixture(scope="module")
 def archives() -> dict[str, bytes]:
-    return export_files(ModelVersion(1, MANIFEST, "0123" * 16), None, "fmu")
+    return export_files(ModelVersion(1, MANIFEST, "0123" * 16, CATALOG), None, "fmu")
 
 
 def unpack(content: bytes, folder: Path) -> tuple[Any, ElementTree.Element]:
@@ -123,10 +124,10 @@ def test_hostile_drives_give_the_angles_of_the_kernel(
     archives: dict[str, bytes], fmi: int, tmp_path: Path
 ) -> None:
     one = Fmu(*unpack(archives[f"sideslip_any_fmi{fmi}.fmu"], tmp_path))
-    program = compile_program(MANIFEST)
+    program = compile_program(CATALOG, MANIFEST)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
-        expected = angles_by_kernel(MANIFEST, program, car, samples)
+        expected = angles_by_kernel(SIGNALS, MANIFEST, program, car, samples)
         assert drive(one, program, car, samples) == expected
 
 
@@ -141,7 +142,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(
     assert not one.instantiate(b"{another}")
     state = c_void_p()
     name = "FMUstate" if fmi == 2 else "FMUState"
-    program = compile_program(MANIFEST)
+    program = compile_program(CATALOG, MANIFEST)
     samples = hostile_drive(program, 60, 1)
     before = drive(one, program, CARS[1], samples)
     assert one.call(f"Get{name}", byref(state)) == 0
@@ -159,11 +160,11 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(
 
 
 def test_it_says_what_it_is_of_and_is_the_same_again(archives: dict[str, bytes]) -> None:
-    version = ModelVersion(1, MANIFEST, "0123" * 16)
+    version = ModelVersion(1, MANIFEST, "0123" * 16, CATALOG)
     again = archives["sideslip_any_fmi2.fmu"]
     with zipfile.ZipFile(BytesIO(again)) as archive:
         table = archive.read("resources/checks.csv").decode()
-    assert fmu.fmu(version, compile_program(MANIFEST), table, 2) == again
+    assert fmu.fmu(version, compile_program(CATALOG, MANIFEST), table, 2) == again
     with zipfile.ZipFile(BytesIO(archives["sideslip_any_fmi2.fmu"])) as archive:
         text = archive.read("modelDescription.xml").decode()
         assert "any@1, SHA-256 01230123" in text
@@ -173,7 +174,7 @@ def test_it_says_what_it_is_of_and_is_the_same_again(archives: dict[str, bytes])
 
 def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fmu, "COMPILER", "no-such-compiler")
-    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
+    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
     with pytest.raises(ConfigError, match="the C compiler no-such-compiler"):
         export_files(version, None, "fmu")
 
@@ -183,7 +184,7 @@ def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_fmpy_finds_no_problem(name: str, tmp_path: Path) -> None:
     """Of FMI 2 in two models, which have all that the others have."""
     manifest = model_of(MODELS[name], Fraction(-1, 700), "any")
-    content = export_files(ModelVersion(1, manifest, "0" * 64), None, "fmu")
+    content = export_files(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "fmu")
     for fmi in (2, 3) if name in ("every_kind", "learning") else (3,):
         file = tmp_path / f"any{fmi}.fmu"
         file.write_bytes(content[f"sideslip_any_fmi{fmi}.fmu"])
@@ -202,7 +203,7 @@ def run_fmpy(*words: str) -> str:
 def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")
-    program = compile_program(version.manifest)
+    program = compile_program(CATALOG, version.manifest)
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick").pl()
     fleet.export(version, "fmu", tmp_path)
     columns = [one.column for one in program.signals]

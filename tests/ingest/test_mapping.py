@@ -13,13 +13,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalogue.catalog import Catalog, load_catalog
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
 from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
 from fleet_slip.ingest.resampling import build_resampler
 from fleet_slip.ingest.suspicion import RADIUS_M
-from fleet_slip.resources import config_file, config_names
+from fleet_slip.resources import SHIPPED_CONFIGS
+from tests.support.catalog import CATALOG, configs_with
 from tests.support.measured import (
     a_mapping,
     good_columns,
@@ -45,16 +46,16 @@ STEER = 'steer_fl = { column = "steer_fl_deg", unit = "deg" }'
 WHEEL = 'wheel_fl = { column = "v", unit = "km/h", radius_m = 0.3 }'
 
 
-def load(folder: Path, text: str) -> Any:
+def load(folder: Path, text: str, catalog: Catalog = CATALOG) -> Any:
     file = folder / "m.toml"
     file.write_text(text, encoding="utf-8")
-    return load_mapping(str(file))
+    return load_mapping(str(file), catalog)
 
 
 def test_shipped_mappings_load() -> None:
-    names = config_names("mappings")
+    names = SHIPPED_CONFIGS.names("mappings")
     assert "race_car_250lm" in names
-    assert [load_mapping(name).name for name in names] == names
+    assert [load_mapping(name, CATALOG).name for name in names] == names
 
 
 def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
@@ -150,24 +151,17 @@ def test_mistakes_are_named_by_file_key_and_reason(
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="race_car_250lm"):
-        load_mapping("no_such_mapping")
+        load_mapping("no_such_mapping", CATALOG)
 
 
-def test_tyres_need_a_column_of_the_catalogue(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shipped = config_file("signals.toml").read_text(encoding="utf-8")
+def test_tyres_need_a_column_of_the_catalogue(tmp_path: Path) -> None:
+    shipped = SHIPPED_CONFIGS.file("signals.toml").read_text(encoding="utf-8")
     start = shipped.index("[drive.tyres]")
     own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
-    (tmp_path / "signals.toml").write_text(own, encoding="utf-8")
-    monkeypatch.setenv("FLEET_SLIP_SIGNALS", str(tmp_path / "signals.toml"))
-    catalogue.cache_clear()
-    try:
-        with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
-            load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'))
-        assert load(tmp_path, GOOD)
-    finally:
-        catalogue.cache_clear()
+    catalog = load_catalog(configs_with(tmp_path / "configs", signals=own))
+    with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
+        load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'), catalog)
+    assert load(tmp_path, GOOD, catalog)
 
 
 @pytest.mark.parametrize("fact", ["tyres", "receiver"])

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, stream
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (
     a_mapping,
@@ -32,7 +32,7 @@ from tests.support.measured import (
 
 def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
     log = read_columns(tmp_path, good_columns())
-    table = log.drives.cast(schema_without(catalogue().extras))
+    table = log.drives.cast(schema_without(SIGNALS.extras))
     first = table.slice(0, 1).to_pylist()[0]
     known = {
         "day": date(2024, 5, 31),
@@ -162,7 +162,7 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
     ]
     assert log.quarantine["drive_id"].null_count == 3
     drives = (
-        log.drives.cast(schema_without(catalogue().extras))
+        log.drives.cast(schema_without(SIGNALS.extras))
         .group_by(["drive_id", "day", "vehicle_id", "mass_kg"])
         .aggregate([("tick", "count"), ("ax", "min")])
     )
@@ -374,7 +374,7 @@ def test_the_worked_example_of_the_docs(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "ingest.md").read_text(encoding="utf-8")
     log_text, mapping_text = (block.partition("\n")[2] for block in text.split("```")[1:4:2])
     (tmp_path / "m.toml").write_text(mapping_text)
-    log = read_text(tmp_path, log_text, load_mapping(str(tmp_path / "m.toml")))
+    log = read_text(tmp_path, log_text, load_mapping(str(tmp_path / "m.toml"), CATALOG))
     assert reasons(log) == [(4, "out_of_range", "ay")]
     assert set(log.drives["vehicle_id"].to_pylist()) == {"A7"}
     g = 9.80665

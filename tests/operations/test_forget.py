@@ -16,7 +16,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
@@ -36,6 +35,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
@@ -68,7 +68,7 @@ def _filled(cars: tuple[str, ...]) -> TemporaryDirectory[str]:
 def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:
     cohort = load_cohort(warehouse)
     (table,) = cohort.tables
-    model = fit(table.total(), catalogue().inputs, catalogue().label).model
+    model = fit(table.total(), SIGNALS.inputs, SIGNALS.label).model
     return {
         "intercept": model.intercept,
         **dict(zip(model.signals, model.coefficients, strict=True)),

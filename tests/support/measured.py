@@ -12,11 +12,13 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.base import shown
+from fleet_slip.catalogue.catalog import Catalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 
 TIME = {"column": "t", "unit": "s"}
@@ -86,6 +88,7 @@ def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestRep
 
 def a_mapping(**changes: Any) -> Mapping:
     """A mapping of t, ax and beta; `time` and `drive` add keys, the rest replaces."""
+    catalog: Catalog = changes.pop("catalog", CATALOG)
     time = changes.pop("time", {})
     drive = changes.pop("drive", {})
     whole = {
@@ -95,7 +98,7 @@ def a_mapping(**changes: Any) -> Mapping:
         "signals": SIGNALS,
         **changes,
     }
-    return Mapping.model_validate(whole)
+    return Mapping.model_validate(whole, context=catalog.signals)
 
 
 def own_clock(**changes: Any) -> Mapping:

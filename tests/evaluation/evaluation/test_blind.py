@@ -8,15 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation import blind
 from fleet_slip.evaluation.blind import blind_scenarios, judge_blindly
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.evaluate import Evaluation
 from fleet_slip.evaluation.judge import Signals
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import Scenario, load_scenario
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.reported import answer
 
 HASH = "5e" * 32
@@ -25,13 +26,13 @@ HASH = "5e" * 32
 @pytest.fixture(scope="module")
 def scenarios() -> tuple[Scenario, ...]:
     """Those of one hash."""
-    return blind_scenarios(HASH)
+    return blind_scenarios(HASH, SHIPPED_CONFIGS)
 
 
 @given(drawn=st.binary(min_size=32, max_size=32))
 @settings(max_examples=3, deadline=None)  # half a second each
 def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn: bytes) -> None:
-    others = blind_scenarios(drawn.hex())
+    others = blind_scenarios(drawn.hex(), SHIPPED_CONFIGS)
     assert len({one.name for one in others}) == len(others) == 24
     assert len({one.track.name for one in others}) == 8
     assert {one.seed for one in others}.isdisjoint(one.seed for one in scenarios)
@@ -40,22 +41,23 @@ def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn:
 
 def test_the_same_hash_has_the_same_set(scenarios: tuple[Scenario, ...]) -> None:
     first, again = (
-        [one.model_dump() for one in some] for some in (scenarios, blind_scenarios(HASH))
+        [one.model_dump() for one in some]
+        for some in (scenarios, blind_scenarios(HASH, SHIPPED_CONFIGS))
     )
     assert str(first) == str(again)
 
 
 def test_estimators_see_what_a_log_would_hold_and_the_truth_is_exact() -> None:
-    scenario = load_scenario("imperfect")
-    (drive,) = simulate_drives([scenario])
-    (log,) = simulate_logs(scenario.batch().drives)
-    for name in catalogue().inputs:
-        one = catalogue()[name]
+    scenario = load_scenario("imperfect", SHIPPED_CONFIGS)
+    (drive,) = simulate_drives(SIGNALS, [scenario])
+    (log,) = simulate_logs(SIGNALS, scenario.batch().drives)
+    for name in SIGNALS.inputs:
+        one = SIGNALS[name]
         np.testing.assert_array_equal(
             np.rint(drive.signals[one.column] / float(one.scale)), log.measurement.counts[name]
         )
     np.testing.assert_array_equal(np.isfinite(drive.signals["gps_vx_mps"]), log.measurement.gps_fix)
-    scale = float(catalogue()["vy"].scale)
+    scale = float(SIGNALS["vy"].scale)
     assert np.abs(drive.vy_mps - scale * log.measurement.counts["vy"]).max() <= scale / 2 + 1e-12
     assert len(np.unique(drive.vy_mps)) > 0.99 * len(drive.vy_mps), "no counts"
 
@@ -67,10 +69,10 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
 ) -> None:
     """On the first road and the last, in all weathers."""
     some = (*scenarios[:3], *scenarios[-3:])
-    monkeypatch.setattr(blind, "blind_scenarios", {HASH: some}.__getitem__)
-    drives = simulate_drives(some)
+    monkeypatch.setattr(blind, "blind_scenarios", lambda sha256, _: {HASH: some}[sha256])
+    drives = simulate_drives(SIGNALS, some)
     truths = iter([drive.sideslip_rad for drive in drives])
-    monkeypatch.setattr(blind, "simulate_drives", lambda scenarios: drives)  # the same again
+    monkeypatch.setattr(blind, "simulate_drives", lambda _, scenarios: drives)  # the same again
 
     def right(signals: Signals) -> np.ndarray:
         return next(truths)
@@ -82,7 +84,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
         return np.full_like(signals["ay_mps2"], np.nan)
 
     estimators = {"right": right, "zero": zero, "silent@1": silent}
-    judged = judge_blindly(HASH, estimators)
+    judged = judge_blindly(CATALOG, HASH, estimators)
     rows = {row["name"]: row for row in judged}
     assert rows["all"]["drives"] == 6
     assert [rows[name]["drives"] for name in ("dry", "wet", "ice")] == [2, 2, 2]

@@ -10,6 +10,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.drives import apply_failure, join, peak_slip
 from fleet_slip.evaluation.filters import LinearEstimate
 from fleet_slip.evaluation.judge import error_figures
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Failure
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -72,7 +73,7 @@ def test_a_failure_after_the_drives_end_is_an_error() -> None:
 
 
 def test_the_peak_of_a_tyre_whose_friction_does_not_fall_is_full_sliding() -> None:
-    car = load_vehicle("d_class_sedan")
+    car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     tyre = car.tyre.model_copy(update={"friction_decay_speed_mps": 1e9})
     steady = car.model_copy(update={"tyre": tyre})
     for adhesion in (1.0, 0.4):
@@ -85,7 +86,7 @@ def test_the_peak_of_a_tyre_whose_friction_does_not_fall_is_full_sliding() -> No
 
 
 def test_the_peak_moves_inwards_when_friction_falls_with_sliding() -> None:
-    car = load_vehicle("d_class_sedan")
+    car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     tyre = car.tyre.model_copy(update={"friction_decay_speed_mps": 1e9})
     steady = car.model_copy(update={"tyre": tyre})
     assert peak_slip(car, 1.0).front_rad < peak_slip(steady, 1.0).front_rad

@@ -35,7 +35,7 @@ from fleet_slip.evaluation.kept import PAPER_TABLE_TWO, ReportData, blocks_won, 
 from fleet_slip.evaluation.report import render, standings, table_two
 from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.page import Cell, number
-from fleet_slip.resources import config_names
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -151,7 +151,7 @@ NOISE_IS_SLIGHT = CLAIMS["noise_is_slight"]
 
 def test_claims_name_nothing_but_scenarios_facts_and_limits() -> None:
     """A scenario that is misspelt would pass for one that was not evaluated."""
-    known = {*NAMES, *LIMITS, *config_names("scenarios")}
+    known = {*NAMES, *LIMITS, *SHIPPED_CONFIGS.names("scenarios")}
     for claim in CLAIMS.values():
         texts = (claim.criterion, f"{{{{ {claim.holds} }}}}", claim.figure, claim.why)
         for text in texts:
