@@ -286,11 +286,8 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
 
 
 def _fmu(subject: Subject) -> dict[str, bytes]:
-    version, program = subject.version, subject.program
-    return {
-        f"{file_prefix(version)}_fmi{fmi}.fmu": fmu(version, program, subject.table, fmi)
-        for fmi in (2, 3)
-    }
+    archive = fmu(subject.version, subject.program, subject.table)
+    return {f"{file_prefix(subject.version)}_fmi2.fmu": archive}
 
 
 def render(content: Mapping[str, Any]) -> str:

@@ -2,7 +2,7 @@
 
 #define TOKEN "${token}"
 #define SIGNALS ${program.signals|length}U
-#define TOLD ${told|length}U
+#define TOLD ${parameters|length}U
 #define TICK_S ${tick_s}
 #define ANGLE_SCALE ${angle.scale|decimal}
 #define model_step ${prefix}_step
