@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 import fleet_slip
 from benchmarks.interleave_roots import ADDED, CAR, FIRST_DAY, ROWS
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.operations.marked_models import marked_models

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from benchmarks.harness import add_options, durations, simulated
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import gram_statement
 from fleet_slip.grams.gram_files import write_rows
@@ -50,7 +50,7 @@ def line(what: str, seconds: float, rows: int, remark: str = "") -> None:
 
 
 def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
-    """Return the columns of the catalogue that no log file has."""
+    """Return the columns of the catalog that no log file has."""
     return absent_columns(warehouse.logs.snapshot().files, CATALOG.signals.stored_columns)
 
 

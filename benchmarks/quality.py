@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.operations.quality import QualityReport, examine, find_wrong_labels
 from fleet_slip.regression.gram import Gram, GramTable

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.catalog.definitions import Definition
 from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Unpack
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import CarMeasures, Rooted, open_workers, takes
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import (

@@ -33,8 +33,8 @@ from fleet_slip.api.calls import (
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.base import last_day
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.runs import LOGGER, step
@@ -299,7 +299,7 @@ class Fleet(HealthAndUpkeep):
 
     @record_call
     def migrate(self) -> "MigrationReport":
-        """Bring the tables to this program and its catalogue (`docs/configuration.md`).
+        """Bring the tables to this program and its catalog (`docs/configuration.md`).
 
         Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
         """

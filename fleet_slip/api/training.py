@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import ShowStep, Workers, of_step
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import COURSE
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.course import COURSE
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, ConfigError, FleetSlipError, InputError, RefusedError
 from fleet_slip.models.request import COURSE_MODELS, DEFAULT_MODELS, Label, load_model_list
 from fleet_slip.rendering import Answer, Part, Remark
@@ -39,7 +39,7 @@ class Training:
 
         Raises `ConfigError` for a mapping without either.
         """
-        cohort, label = f"campaign = '{mapping.name}'", mapping.catalogue.label
+        cohort, label = f"campaign = '{mapping.name}'", mapping.signal_catalog.label
         if label in mapping.signal_names:
             return cls(name, cohort, DEFAULT_MODELS)
         if COURSE not in mapping.signals:

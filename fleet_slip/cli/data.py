@@ -10,7 +10,7 @@ import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.cli.options import Cluster, command
 from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -211,7 +211,7 @@ def mapping(
         print_parts(["\n" + text])
 
 
-def _draft(signals: SignalCatalogue, file: str, can: Path | None) -> "tuple[Draft, str]":
+def _draft(signals: SignalCatalog, file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415

@@ -9,9 +9,9 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.catalog import Catalog, FeatureSet
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.catalog import Catalog, FeatureSet
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress

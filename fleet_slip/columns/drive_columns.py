@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.definitions import limit_of
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.kernel import GAPS, run
 from fleet_slip.columns.operations import CarFact
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region
@@ -55,7 +55,7 @@ class DriveCounts:
 
 
 def as_counts(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     values: Mapping[str, FloatArray],
     names: Sequence[str],
     facts: Mapping[str, Any],

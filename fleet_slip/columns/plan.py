@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import COURSE, YAW_RATE
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COURSE, YAW_RATE
+from fleet_slip.catalog.definitions import (
     Definition,
     Slope,
     limit_of,

@@ -7,10 +7,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.catalogue.arithmetic import nearest_sql
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.definitions import LARGEST_FACT, Definition, rows_behind
-from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
+from fleet_slip.catalog.arithmetic import nearest_sql
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import LARGEST_FACT, Definition, rows_behind
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
@@ -254,7 +254,7 @@ def _clips(steps: tuple[Step, ...], of: int, ends: Iterable[int]) -> set[int]:
 _SEPARATOR = ",\n            "
 
 
-def with_absent(signals: SignalCatalogue, rows: str, absent: Sequence[str]) -> str:
+def with_absent(signals: SignalCatalog, rows: str, absent: Sequence[str]) -> str:
     """Return a table expression with stored columns that none of its files has, as nulls."""
     if not absent:
         return rows

@@ -12,8 +12,8 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.evaluation.drives import simulate_drives
 from fleet_slip.evaluation.judge import Estimate, EvaluatedScenario, evaluate_drive, judge

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.job import (
@@ -38,7 +38,7 @@ class EvaluatedDrive:
     Attributes:
         scenario: what it is a test of.
         time_s: time since the drive began.
-        signals: what an estimator may see, by SI column: the inputs of the catalogue and satellite
+        signals: what an estimator may see, by SI column: the inputs of the catalog and satellite
             navigation; NaN where null.
         vx_mps, vy_mps: true velocity of the centre of gravity.
         station_m: distance along the track within the lap.
@@ -77,7 +77,7 @@ class EvaluatedDrive:
         return self.vx_mps > SLOWEST_MPS
 
 
-def visible_signals(signals: SignalCatalogue) -> tuple[str, ...]:
+def visible_signals(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the names of the signals that an estimator may see: never a truth."""
     return (*signals.inputs, *GPS_SIGNALS)
 
@@ -97,7 +97,7 @@ def simulate_scenarios(
 
 
 def simulate_drives(
-    signals: SignalCatalogue, scenarios: Sequence[Scenario]
+    signals: SignalCatalog, scenarios: Sequence[Scenario]
 ) -> tuple[EvaluatedDrive, ...]:
     """Simulate the drives of scenarios, failures applied; nothing is written.
 
@@ -109,7 +109,7 @@ def simulate_drives(
     return tuple(_measured(signals, scenario, logs[scenario.drive_id]) for scenario in scenarios)
 
 
-def _measured(signals: SignalCatalogue, scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
+def _measured(signals: SignalCatalog, scenario: Scenario, log: DriveLog) -> EvaluatedDrive:
     time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
     visible = {}
     for name in visible_signals(signals):

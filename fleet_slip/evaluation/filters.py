@@ -14,7 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
@@ -74,10 +74,10 @@ class PublishedEstimate:
     """A published model, sample by sample as a car drives.
 
     It sees counts, as an ECU does: the columns are the integers that its Gram rows are made of.
-    `facts` are what the car knows of itself; `catalogue` has the scales of the counts.
+    `facts` are what the car knows of itself; `signal_catalog` has the scales of the counts.
     """
 
-    catalogue: SignalCatalogue
+    signal_catalog: SignalCatalog
     predictor: Predictor
     facts: Mapping[str, Any] = field(default_factory=dict)
 
@@ -88,7 +88,7 @@ class PublishedEstimate:
     def __call__(self, signals: Signals) -> FloatArray:
         """Return the estimate at each tick; there is one row for every tick."""
         names = self.predictor.plan.signals
-        return self.predictor(as_counts(self.catalogue, signals, names, self.facts))
+        return self.predictor(as_counts(self.signal_catalog, signals, names, self.facts))
 
 
 @dataclass(frozen=True)

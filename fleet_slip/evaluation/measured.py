@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.belief import YawRateNoise

@@ -13,7 +13,7 @@ import duckdb
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
@@ -74,7 +74,7 @@ class LabelledDrive:
 
 
 def read_drive(
-    signals: SignalCatalogue, database: duckdb.DuckDBPyConnection, drive_id: str
+    signals: SignalCatalog, database: duckdb.DuckDBPyConnection, drive_id: str
 ) -> LabelledDrive:
     """Read a drive from the view `log`. Raises `QuestionError` if there is no such drive."""
     label = signals[signals.label].column

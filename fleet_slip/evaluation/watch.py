@@ -13,8 +13,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray, float_column
-from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.definitions import Definition
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
@@ -142,7 +142,7 @@ def frames_of(
 ) -> DriveFrames:
     """Return the frames of a drive. Raises `DataError` if nothing of it can be shown.
 
-    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` are the model
+    The columns are those of the catalog, shape (ticks,), NaN where null; `facts` are the model
     and mass of the car, its `drive_id`, and its `track` if that is known.
     """
     seen = np.flatnonzero(np.diff(np.floor((time_s - time_s[0]) * FRAMES_PER_S + 1e-6), prepend=-1))
@@ -250,7 +250,7 @@ def _others(
 
 
 def gates_on(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     manifest: Manifest,
     columns: Mapping[str, FloatArray],
     facts: Mapping[str, Any],

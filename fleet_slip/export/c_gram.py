@@ -29,8 +29,8 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     BESIDE,
     COARSER,
     COLUMNS,
@@ -41,10 +41,10 @@ from fleet_slip.catalogue.course import (
     YAW_RATE,
     course_units,
 )
-from fleet_slip.catalogue.definitions import plain_column
-from fleet_slip.catalogue.facts import CALIBRATION, DELAY
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.definitions import plain_column
+from fleet_slip.catalog.facts import CALIBRATION, DELAY
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.operations import Lowering
 from fleet_slip.columns.sql import rows_of
 from fleet_slip.errors import RefusedError
@@ -264,7 +264,7 @@ def _counted(
 
 
 def _words_of_changes(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     steps: Steps,
     writer: StepWriter,
     places: Mapping[str, int],

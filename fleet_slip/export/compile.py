@@ -10,8 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
@@ -63,9 +63,7 @@ class Check:
     angles: tuple[int | None, ...]
 
 
-def make_checks(
-    signals: SignalCatalogue, manifest: Manifest, program: Program
-) -> tuple[Check, ...]:
+def make_checks(signals: SignalCatalog, manifest: Manifest, program: Program) -> tuple[Check, ...]:
     """Return a smooth drive and hostile ones, each with the angle at every tick."""
     hostile = _hostile_car(program)
     drives: dict[str, tuple[Car, Iterable[Sample]]] = {
@@ -81,7 +79,7 @@ def make_checks(
 
 
 def angles_by_kernel(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     manifest: Manifest,
     program: Program,
     car: Car,
@@ -129,7 +127,7 @@ def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
 
 
 def _check(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     manifest: Manifest,
     program: Program,
     name: str,

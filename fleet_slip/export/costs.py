@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c import StepWriter, state_bytes, step_lines
 from fleet_slip.export.program import Program, write_program

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.definitions import LARGEST_FACT
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.definitions import LARGEST_FACT
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.columns.operations import CarFact
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source

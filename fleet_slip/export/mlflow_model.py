@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import predict
@@ -19,7 +19,7 @@ class LoggedVersion:
         manifest: of the version.
     """
 
-    def __init__(self, signals: SignalCatalogue, manifest: Manifest) -> None:
+    def __init__(self, signals: SignalCatalog, manifest: Manifest) -> None:
         """Take the signals and a manifest."""
         self.signals = signals
         self.manifest = manifest

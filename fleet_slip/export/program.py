@@ -13,10 +13,10 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
-from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.definitions import plain_column
-from fleet_slip.catalogue.signals import COUNT_MAX, SignalCatalogue
+from fleet_slip.catalog.arithmetic import parse
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import plain_column
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
     CarCount,
     CarFact,
@@ -280,7 +280,7 @@ def write_program(catalog: Catalog, manifest: Manifest) -> Program:
     return Program(signals, facts, numbers, steps, angle)
 
 
-def _inputs(signals: SignalCatalogue, manifest: Manifest) -> tuple[Input, ...]:
+def _inputs(signals: SignalCatalog, manifest: Manifest) -> tuple[Input, ...]:
     used: set[str] = set()
     for term in manifest.terms:
         parts = term.definition.parts if term.definition else (term,)

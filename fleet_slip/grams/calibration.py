@@ -22,9 +22,9 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import COLUMNS, TURNED, turned_scale
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COLUMNS, TURNED, turned_scale
+from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import (
     KINDS,

@@ -14,15 +14,15 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     FEWEST_CHANGES,
     LEAST_TURNED_RAD,
     LEVERS_M,
     TURNED,
     turned_scale,
 )
-from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
+from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, NumberName
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
 
@@ -300,7 +300,7 @@ def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
 # bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
 # the side-slip angle does, which on roads is l r/v + K ay: the rear axle is l behind the centre of
-# gravity, and gives way by K (`catalogue/course.py`). Both are of speeds by wheels of .31
+# gravity, and gives way by K (`catalog/course.py`). Both are of speeds by wheels of .31
 # m.
 
 SATELLITE = "satellite_speed"

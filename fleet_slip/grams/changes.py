@@ -1,4 +1,4 @@
-"""The changes from fix to fix of one drive, as `catalogue/course.py` defines them.
+"""The changes from fix to fix of one drive, as `catalog/course.py` defines them.
 
 Only rows with a fix are kept, at most one in ten: they fit into memory.
 """
@@ -6,8 +6,8 @@ Only rows with a fix are kept, at most one in ten: they fit into memory.
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.course import COARSER, COURSE, CourseUnits, split_late
-from fleet_slip.catalogue.signals import HALF_TURN
+from fleet_slip.catalog.course import COARSER, COURSE, CourseUnits, split_late
+from fleet_slip.catalog.signals import HALF_TURN
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 
 

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received

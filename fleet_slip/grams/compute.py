@@ -19,11 +19,11 @@ from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.catalog import Catalog, FeatureSet
-from fleet_slip.catalogue.course import COURSE_LATE, course_units
-from fleet_slip.catalogue.definitions import COUNT_BITS, Slope, rows_behind
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.catalog import Catalog, FeatureSet
+from fleet_slip.catalog.course import COURSE_LATE, course_units
+from fleet_slip.catalog.definitions import COUNT_BITS, Slope, rows_behind
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
@@ -379,7 +379,7 @@ def wide_grams(
 
 
 def _rows_of_drive(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     workspace: Workspace,
     feature_set: FeatureSet,
     drive: DriveCounts,
@@ -458,7 +458,7 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
 
 
 def change_sums(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     workspace: Workspace,
     counts: DriveCounts,
     times: Sequence[int],

@@ -13,9 +13,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.course import BESIDE, TURNED
-from fleet_slip.catalogue.definitions import Number
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION
+from fleet_slip.catalog.course import BESIDE, TURNED
+from fleet_slip.catalog.definitions import Number
+from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION
 from fleet_slip.grams.calibration import calibration_of
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import OpenedGrams

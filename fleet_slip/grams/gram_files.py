@@ -16,8 +16,8 @@ from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import ConflictError
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql

@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.facts import DELAY
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import DELAY
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (

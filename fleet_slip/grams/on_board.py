@@ -26,8 +26,8 @@ from fleet_slip.base import (
     sha256_of,
     shown,
 )
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     BESIDE,
     COARSER,
     COURSE,
@@ -40,11 +40,11 @@ from fleet_slip.catalogue.course import (
     YAW_RATE,
     course_units,
 )
-from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
-from fleet_slip.catalogue.time_columns import Feature
+from fleet_slip.catalog.definitions import limit_of
+from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
+from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.compute import Parts
@@ -92,7 +92,7 @@ class CountedSet:
     Attributes:
         name, identity: of the set.
         ranges: the smallest and the largest count of each column of its Gram rows, in order.
-        signals: what a car must know to count it, in catalogue order.
+        signals: what a car must know to count it, in catalog order.
         times: over how many ticks columns change; none where they stand for themselves.
         parts: what those parts of a drive are called; None alone where it is not divided.
         in_time: whether the course is moved by its delay.

@@ -14,16 +14,16 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import TURNED
-from fleet_slip.catalogue.facts import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import TURNED
+from fleet_slip.catalog.facts import (
     ALL_DRIVES,
     CALIBRATION,
     LONGEST_PAUSE_S,
     RECEIVER,
     TRAINING_DRIVES,
 )
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table
 from fleet_slip.regression.gram import GramTable, packed_size

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import shown
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.guess import (
@@ -50,7 +50,7 @@ class Draft:
     """What only a person knows, and what of the file was not read."""
 
 
-def draft_mapping(signals: SignalCatalogue, file: Path, profile: FileProfile) -> Draft:
+def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> Draft:
     """Guess a mapping. Raises `InputError` if nothing in the file looks like a signal."""
     guesses = guess_signals(signals, profile.profiles)
     if not guesses:

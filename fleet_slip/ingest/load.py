@@ -22,8 +22,8 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import SignalCatalogue, as_arrow
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import SignalCatalog, as_arrow
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
@@ -107,7 +107,7 @@ class IngestReport(_Judged):
 
 @dataclass(frozen=True)
 class SignalRange:
-    """The values of a signal in a file, in the catalogue's unit."""
+    """The values of a signal in a file, in the catalog's unit."""
 
     signal: str
     unit: str
@@ -200,7 +200,7 @@ def ingest_files(
     where all of these are there already; `ClusterError` for files that workers died of; and
     `ConfigError` for a mapping of other signals.
     """
-    if mapping.catalogue != warehouse.catalog.signals:  # counts would have another scale
+    if mapping.signal_catalog != warehouse.catalog.signals:  # counts would have another scale
         raise ConfigError(
             f"the mapping {mapping.name!r} was loaded with other signals than those of "
             f"{warehouse.root}. Load it with the configs of this data root."
@@ -313,13 +313,13 @@ def write_batch(
                 written.append(one)
                 if one.report.new:
                     longest.append((one.report, stream.longest))
-        _judge_longest(mapping.catalogue, longest)
+        _judge_longest(mapping.signal_catalog, longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
 
 
 def _judge_longest(
-    signals: SignalCatalogue, results: Iterable[tuple[_Judged, MeasuredDrive | None]]
+    signals: SignalCatalog, results: Iterable[tuple[_Judged, MeasuredDrive | None]]
 ) -> None:
     """Add what looks wrong in the longest drive of files to the report of its file.
 
@@ -423,7 +423,7 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     previews: list[Preview] = []
     for batch in _batches(map(AskedFile, logs)):
         results = [preview_log(task.file, mapping) for task in batch]
-        _judge_longest(mapping.catalogue, results)
+        _judge_longest(mapping.signal_catalog, results)
         previews += [preview for preview, _ in results]
     return previews
 
@@ -441,7 +441,7 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
         of_rows = stream.suspicions()  # which may look into the file again
     ranges = []
     for name, some in ends.items():
-        signal = mapping.catalogue[name]
+        signal = mapping.signal_catalog[name]
         scale = float(signal.scale)
         low, high = (scale * min(some), scale * max(some)) if some else (np.nan, np.nan)
         missing = 1 - values[name] / max(stream.counts.ticks, 1)
@@ -453,7 +453,7 @@ MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""
 
 
-def signals_of(signals: SignalCatalogue, drive: MeasuredDrive) -> Signals:
+def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
     """Return the signals of the beginning of a drive, as `find_suspicions` takes them."""
     selected = drive.ticks - drive.ticks[0] < MOST_TICKS
     counts = {  # by Polars: Arrow's own would load pandas
@@ -552,16 +552,16 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     drive_of_row = np.repeat(np.arange(len(drives)), [drive.ticks.size for drive in drives])
-    columns, catalogue = {}, mapping.catalogue
-    for column in catalogue.log_schema:
+    columns, signal_catalog = {}, mapping.signal_catalog
+    for column in signal_catalog.log_schema:
         if column.name == "tick":
             ticks = [as_arrow(drive.ticks) for drive in drives]
             columns[column.name] = pa.chunked_array(ticks, column.type)
         elif column.name in mapping.signal_names:
             columns[column.name] = pa.chunked_array([drive.counts[column.name] for drive in drives])
-        elif column.name in catalogue.extras:
+        elif column.name in signal_catalog.extras:
             continue
-        elif column.name in catalogue.signals:
+        elif column.name in signal_catalog.signals:
             columns[column.name] = pa.nulls(drive_of_row.size, column.type)
         else:
             values = [drive.metadata.get(column.name) for drive in drives]

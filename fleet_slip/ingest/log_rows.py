@@ -224,7 +224,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
             reasons = ("time_backwards", "time_duplicate", "isolated")
             cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
             fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
-    names = [name for name in mapping.catalogue.signals if name in mapping.signals]
+    names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
@@ -263,7 +263,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
-    (signal, least, most), value = count_range(mapping.catalogue, name, source), pl.col(name)
+    (signal, least, most), value = count_range(mapping.signal_catalog, name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = _number_problems(name, present, (outside, "out_of_range"))
@@ -284,7 +284,7 @@ def _signed(
 
 
 def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
-    gain, bias = source.linear(mapping.catalogue[name].unit)
+    gain, bias = source.linear(mapping.signal_catalog[name].unit)
     # Otherwise it would change nothing but the sign of zero.
     return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
 

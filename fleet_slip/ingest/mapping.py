@@ -19,9 +19,9 @@ from pydantic import (
 )
 
 from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, shown
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.course import COURSE
-from fleet_slip.catalogue.signals import Identifier, SignalCatalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COURSE
+from fleet_slip.catalog.signals import Identifier, SignalCatalog
 from fleet_slip.config import (
     Config,
     Name,
@@ -92,18 +92,18 @@ class LabelSensor(Config):
 Fact = TypeVar("Fact")
 
 
-def signals_of(info: ValidationInfo) -> SignalCatalogue:
+def signals_of(info: ValidationInfo) -> SignalCatalog:
     """Return the signals that a mapping is validated against: the context of the validation."""
-    if not isinstance(info.context, SignalCatalogue):
-        raise TypeError("a mapping is validated with a SignalCatalogue as context")
+    if not isinstance(info.context, SignalCatalog):
+        raise TypeError("a mapping is validated with a SignalCatalog as context")
     return info.context
 
 
 def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
-    """Return a fact of a drive. Raises `ValueError` if the catalogue has no such column."""
+    """Return a fact of a drive. Raises `ValueError` if the catalog has no such column."""
     if info.field_name not in signals_of(info).drive:
         raise ValueError(
-            "the catalogue has no such drive column. Copy it from the shipped one: "
+            "the catalog has no such drive column. Copy it from the shipped one: "
             "configs/signals.toml"
         )
     return fact
@@ -215,7 +215,7 @@ class Mapping(Config):
     It is validated with the signals of a catalog as context, and keeps them.
     """
 
-    _catalogue: SignalCatalogue = PrivateAttr()
+    _signal_catalog: SignalCatalog = PrivateAttr()
     name: Identifier
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
@@ -241,13 +241,13 @@ class Mapping(Config):
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Mapping":
-        self._catalogue = signals_of(info)
+        self._signal_catalog = signals_of(info)
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
                 raise ValueError(f"where: {condition.signal!r} is not a signal of this mapping")
             if condition.signal is not None and self.signals[condition.signal].component:
                 raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
-        signals = self._catalogue.signals
+        signals = self._signal_catalog.signals
         for name, column in self.signals.items():
             if name not in signals:
                 raise ValueError(describe_unknown(name, signals))
@@ -257,7 +257,7 @@ class Mapping(Config):
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         require_satellites(self.signals)
         if self.label is not None:
-            self.label.require_signals(self.signals, self._catalogue.label)
+            self.label.require_signals(self.signals, self._signal_catalog.label)
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError(
                 "drive.day is missing, and the time has no date. Set a date, a column or a path"
@@ -272,9 +272,9 @@ class Mapping(Config):
         return hash(self.canonical_json())
 
     @property
-    def catalogue(self) -> SignalCatalogue:
+    def signal_catalog(self) -> SignalCatalog:
         """The signals and drive columns that it was validated against."""
-        return self._catalogue
+        return self._signal_catalog
 
     def for_file(self, file: Path) -> "Mapping":
         """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
@@ -283,7 +283,7 @@ class Mapping(Config):
         if not found:
             return self
         try:
-            drive = DriveMetadata.model_validate({**given, **found}, context=self._catalogue)
+            drive = DriveMetadata.model_validate({**given, **found}, context=self._signal_catalog)
         except ValidationError as error:
             raise InputError(f"{shown(file)}: drive: {faults_of(error)}") from None
         return self.model_copy(update={"drive": drive})
@@ -317,14 +317,16 @@ class Mapping(Config):
     def signal_names(self) -> tuple[str, ...]:
         """All signals that drives have, those computed from others too."""
         derived = self.label is not None and self.label.from_velocities
-        label = [self._catalogue.label] if derived else []
+        label = [self._signal_catalog.label] if derived else []
         return (*self.signals, *label, *self.front_wheels)
 
     @property
     def front_wheels(self) -> tuple[str, ...]:
         """The signals that one angle of both front wheels stands for, where it is all there is."""
         alone = "steer" in self.signals and not set(FRONT_WHEELS) & set(self.signals)
-        return tuple(name for name in FRONT_WHEELS if alone and name in self._catalogue.signals)
+        return tuple(
+            name for name in FRONT_WHEELS if alone and name in self._signal_catalog.signals
+        )
 
     @property
     def formats(self) -> FileFormats:
@@ -376,8 +378,8 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return what stands for whatever a mapping does not say, each with the key that says it."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
     wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEEL_PREFIX)}
-    label, course = signals.get(mapping.catalogue.label), signals.get(COURSE)
-    labelled = mapping.catalogue.label in mapping.signal_names
+    label, course = signals.get(mapping.signal_catalog.label), signals.get(COURSE)
+    labelled = mapping.signal_catalog.label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere
     unknown_radius = RADIUS_M in wheels.values() or (moved and None in wheels.values())
     naive = time.format is not None and "%z" not in time.format and time.is_dated

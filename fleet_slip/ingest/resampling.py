@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, round_chunks
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, SECOND, wrapped
@@ -331,7 +331,7 @@ def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
 # its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
 
 
-def physical(signals: SignalCatalogue, counts: Named[str, pa.Array], name: str) -> FloatArray:
+def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) -> FloatArray:
     """Return a signal in SI units, NaN where there is none."""
     values = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
     return np.asarray(values * float(signals[name].scale))
@@ -339,7 +339,7 @@ def physical(signals: SignalCatalogue, counts: Named[str, pa.Array], name: str) 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
     """Return the counts of the label at the centre of gravity, and of velocities it is made of."""
-    sensor, signals = mapping.label, mapping.catalogue
+    sensor, signals = mapping.label, mapping.signal_catalog
     if sensor is None:
         return {}
     columns: dict[str, FloatArray] = {}
@@ -351,7 +351,7 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
 
 
 def _velocities(
-    signals: SignalCatalogue, sensor: LabelSensor, counts: Named[str, pa.Array]
+    signals: SignalCatalog, sensor: LabelSensor, counts: Named[str, pa.Array]
 ) -> dict[str, FloatArray]:
     vx, vy = physical(signals, counts, "vx"), physical(signals, counts, "vy")
     if sensor.is_elsewhere:
@@ -362,7 +362,7 @@ def _velocities(
 
 
 def _angle(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     sensor: LabelSensor,
     speed: FloatArray,
     counts: Named[str, pa.Array],
@@ -378,10 +378,11 @@ def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
     """Return the car's speed: as it is logged, or that of its wheels."""
     for name in OWN_SPEEDS:
         if name in counts:
-            return np.abs(physical(mapping.catalogue, counts, name))
+            return np.abs(physical(mapping.signal_catalog, counts, name))
     wheels = [name for name in counts if name.startswith(WHEEL_PREFIX)]
     speeds = [
-        physical(mapping.catalogue, counts, name) * (mapping.signals[name].radius_m or RADIUS_M)
+        physical(mapping.signal_catalog, counts, name)
+        * (mapping.signals[name].radius_m or RADIUS_M)
         for name in wheels
     ]
     return np.asarray(np.median(speeds, axis=0), dtype=np.float64)

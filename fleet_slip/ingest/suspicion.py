@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.course import (
     COURSE,
     LARGEST_RAD,
     SATELLITE_SPEED,
     CourseRelation,
     relate,
 )
-from fleet_slip.catalogue.faults import (
+from fleet_slip.catalog.faults import (
     WITNESSES,
     Fault,
     MeanMoments,
     axes_swapped,
     find_reversed_or_swapped,
 )
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 
 # How signals of a drive go with one another: slopes and fits.
 
@@ -203,23 +203,23 @@ _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s
 
 
 def on_every_tick(
-    catalogue: SignalCatalogue, ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]
+    catalog: SignalCatalog, ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]
 ) -> Signals:
     """Return counts at some ticks, NaN for none, in SI units on all ticks from the first."""
     signals = {}
     for name, values in counts.items():
         signals[name] = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
-        signals[name][ticks - ticks[0]] = values * float(catalogue[name].scale)
+        signals[name][ticks - ticks[0]] = values * float(catalog[name].scale)
     return signals
 
 
-def find_suspicions(catalogue: SignalCatalogue, signals: Signals) -> list[Fault]:
+def find_suspicions(catalog: SignalCatalog, signals: Signals) -> list[Fault]:
     """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
-    faults = list(_still(catalogue, signals))
+    faults = list(_still(catalog, signals))
     usual = _without(signals, faults)
     speed = speed_mps(usual)
     magnitudes = {fault.signals[0]: fault for fault in find_one_sided(usual, speed)}
-    sideslip = magnitudes.pop(catalogue.label, None)
+    sideslip = magnitudes.pop(catalog.label, None)
     faults += magnitudes.values()
     usual = _without(usual, faults)
     faults += _turning(usual, speed)
@@ -227,7 +227,7 @@ def find_suspicions(catalogue: SignalCatalogue, signals: Signals) -> list[Fault]
     if speed is not None:
         faults += [*_scales_differ(usual, speed), *_axles_swapped(usual, speed)]
         if not any({"ay", "yaw_rate"} & set(fault.signals) for fault in faults):
-            label = list(_label(catalogue.label, usual, speed))  # which is judged by them
+            label = list(_label(catalog.label, usual, speed))  # which is judged by them
     if sideslip and all(fault.kind != "biased" for fault in label):  # else it is off to one side
         label = [sideslip]
     if not any(SATELLITE_SPEED in fault.signals for fault in faults):
@@ -248,13 +248,13 @@ def speed_mps(signals: Signals) -> FloatArray | None:
     return signals.get("vx", signals.get("vehicle_speed"))
 
 
-def _still(catalogue: SignalCatalogue, signals: Signals) -> Iterator[Fault]:
+def _still(catalog: SignalCatalog, signals: Signals) -> Iterator[Fault]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]
         if not present.size:
             yield Fault("absent", (name,), "it has no value at all", "Map another column.")
         elif present.size >= FEWEST_TICKS and present.min() == present.max():
-            figure = f"it is constant: {present[0]:g} {catalogue[name].unit}"
+            figure = f"it is constant: {present[0]:g} {catalog[name].unit}"
             yield Fault("stuck", (name,), figure, "Map another column.")
 
 

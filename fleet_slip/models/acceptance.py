@@ -21,7 +21,7 @@ from pydantic import Field
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.cohort import Cohort, load_cohort

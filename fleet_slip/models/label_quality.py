@@ -7,7 +7,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
-from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED
+from fleet_slip.catalog.course import STRAIGHT, STRAIGHT_COURSE, TURNED
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import Cohort

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.definitions import Combination, Definition
-from fleet_slip.catalogue.lines import FittedLine, whole_line
+from fleet_slip.catalog.definitions import Combination, Definition
+from fleet_slip.catalog.lines import FittedLine, whole_line
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds

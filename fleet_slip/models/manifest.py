@@ -26,15 +26,15 @@ from pydantic import (
 )
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Made,
     integer_arithmetic,
     plain_column,
 )
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalogue
+from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.grams.gram_files import Hashes
@@ -258,7 +258,7 @@ _MADE: TypeAdapter[Made] = TypeAdapter(Made)
 class Manifest(Config):
     """One model version; `trained_on` of an imported one is about another data root's tables.
 
-    A document of unknown origin is validated with the `SignalCatalogue` as context.
+    A document of unknown origin is validated with the `SignalCatalog` as context.
     """
 
     format: Literal[1] = 1
@@ -364,7 +364,7 @@ class Manifest(Config):
             Fraction(0) if changes else self.intercept_exact / unit,
         )
 
-    def columns(self, signals: SignalCatalogue) -> tuple[str, ...]:
+    def columns(self, signals: SignalCatalog) -> tuple[str, ...]:
         """Return the columns in SI units that the model needs, each once, in term order."""
         columns = (
             column
@@ -380,14 +380,14 @@ class Manifest(Config):
         """Definition of each input that is a feature of 16 bits."""
         return {term.signal: plain_column(term.signal, term.sql) for term in self.terms if term.sql}
 
-    def require_same_counts(self, signals: SignalCatalogue) -> None:
+    def require_same_counts(self, signals: SignalCatalog) -> None:
         """Raise `RefusedError` if counts that a column looks back on mean something else now."""
         for term in self.terms:
             for name, scale in (term.signal_scales or {}).items():
                 if name not in signals.signals or signals[name].scale != scale:
                     raise RefusedError(
                         f"{self.name}: {term.signal} was defined when a count of {name} was worth "
-                        f"{scale}, and the signal catalogue says otherwise. Publish it again."
+                        f"{scale}, and the signal catalog says otherwise. Publish it again."
                     )
 
     @property

@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.facts import round_number
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, round_chunks, valid_values
+from fleet_slip.catalog.facts import round_number
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks, valid_values
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.compiling import kernel
@@ -43,7 +43,7 @@ class Predictor:
     scales: tuple[float, ...]
 
     @classmethod
-    def of(cls, signals: SignalCatalogue, manifest: Manifest) -> "Predictor":
+    def of(cls, signals: SignalCatalog, manifest: Manifest) -> "Predictor":
         """Return what a manifest publishes, by features of its own.
 
         Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
@@ -182,7 +182,7 @@ def _pandas(values: pa.Array, name: str, index: Any) -> Any:
 
 
 def predict(
-    signals: SignalCatalogue, manifest: Manifest, frame: Any, predictor: Predictor | None = None
+    signals: SignalCatalog, manifest: Manifest, frame: Any, predictor: Predictor | None = None
 ) -> Any:
     """Return the angle of each row in rad; see `ModelVersion.predict`."""
     predictor = predictor or Predictor.of(signals, manifest)

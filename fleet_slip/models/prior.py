@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams

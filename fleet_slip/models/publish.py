@@ -8,9 +8,9 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.facts import MEASURED, TRAINING_DRIVES
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import Definition
+from fleet_slip.catalog.facts import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams

@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives

@@ -17,9 +17,9 @@ from pydantic import (
 from typing_extensions import Doc
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.folding import Folding, FoldKey

@@ -8,8 +8,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
@@ -92,7 +92,7 @@ class Score(Answer):
             )
 
 
-def _si_rows(signals: SignalCatalogue) -> str:
+def _si_rows(signals: SignalCatalog) -> str:
     """Return a subquery: the rows of `log_counts` with the columns of the view `log`."""
     columns = [
         f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
@@ -123,7 +123,7 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     return _figures(estimate_rad, truth_rad, rows)
 
 
-def cohort_of_rows(signals: SignalCatalogue, condition: str | Condition) -> Condition:
+def cohort_of_rows(signals: SignalCatalog, condition: str | Condition) -> Condition:
     """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`."""
     if isinstance(condition, Condition):
         return condition

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.base import canonical_json, document_of, sha256_of
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, load_cohort
 from fleet_slip.grams.folding import PARTS, Folding, make_folding

@@ -11,10 +11,10 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY, MEASURED
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.course import relate
+from fleet_slip.catalog.facts import ALL_DRIVES, DELAY, MEASURED
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.gram_files import hash_names
@@ -102,7 +102,7 @@ def _look(
     return found, len(chosen), measured
 
 
-def _signals(signals: SignalCatalogue, columns: Mapping[str, Any]) -> Signals:
+def _signals(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
     """Return the signals of a drive that has values of them."""
     counts = {
         name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)

@@ -16,8 +16,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.facts import NumberName
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import NumberName
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import Calibration, calibrate
 from fleet_slip.grams.reader import DriveSums, collect_sums, open_grams

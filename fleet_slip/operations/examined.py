@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
-from fleet_slip.catalogue.facts import MEASURED, RECEIVED
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.facts import MEASURED, RECEIVED
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import update_grams
@@ -154,7 +154,7 @@ class _Piece(NamedTuple):
         drives, rows = self.drives + other.drives, self.rows + other.rows
         return _Piece(self.first, other.last, drives, rows)
 
-    def condition(self, signals: SignalCatalogue) -> Condition:
+    def condition(self, signals: SignalCatalog) -> Condition:
         days = f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'"
         return parse_condition(signals, days)
 

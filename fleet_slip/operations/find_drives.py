@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import digest_counts
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import digest_counts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
 from fleet_slip.grams.on_board import counted_sets

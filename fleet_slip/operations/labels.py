@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.faults import DriveBatches, Fault
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.faults import DriveBatches, Fault
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
@@ -131,7 +131,7 @@ LEAST_GAIN = 1e-3
 
 
 def find_odd_days(
-    signals: SignalCatalogue,
+    signals: SignalCatalog,
     table: GramTable,
     in_order: BoolArray,
     groups: Sequence[IntArray],

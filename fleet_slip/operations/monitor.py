@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from datetime import date
 from statistics import fmean, stdev
 
-from fleet_slip.catalogue.catalog import Catalog
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest

@@ -11,10 +11,10 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.course import relate
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.faults import DriveBatches, Fault, find_implausible
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training

@@ -1,4 +1,4 @@
-"""Writes rows again, to compact the logs, to forget drives, or for another catalogue.
+"""Writes rows again, to compact the logs, to forget drives, or for another catalog.
 
 Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
 from the drives.
@@ -20,7 +20,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
 from fleet_slip.grams.job import land_ahead, reconcile
@@ -326,7 +326,7 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
         yield pack
 
 
-# Brings the tables of a data root to this program and to the signal catalogue, step by step.
+# Brings the tables of a data root to this program and to the signal catalog, step by step.
 #
 # 1. Every table gets the columns that came later. No file is touched: there they are null.
 # 2. Files whose dictionaries have names that none of their rows has are written again.
@@ -334,7 +334,7 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
 
 @dataclass(frozen=True)
 class MigrationReport(Answer):
-    """What a migration did, and the columns of the logs that the catalogue has no longer."""
+    """What a migration did, and the columns of the logs that the catalog has no longer."""
 
     added: tuple[str, ...]
     retired: tuple[str, ...]
@@ -352,7 +352,7 @@ class MigrationReport(Answer):
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was added and written anew."""
         if not self.changed:
-            yield Remark("migrate: nothing to do, the logs agree with the signal catalogue")
+            yield Remark("migrate: nothing to do, the logs agree with the signal catalog")
         if self.added:
             yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
         if self.files_without_names:
@@ -363,7 +363,7 @@ class MigrationReport(Answer):
 
 
 def migrate(warehouse: Warehouse) -> MigrationReport:
-    """Make the tables agree with program and catalogue. Again, it does nothing.
+    """Make the tables agree with program and catalog. Again, it does nothing.
 
     Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
     """

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import (
     DamageError,

@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.catalog import Catalog, load_catalog
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.catalog import Catalog, load_catalog
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario

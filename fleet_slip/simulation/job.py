@@ -18,7 +18,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
 from fleet_slip.rendering import Answer, Part, Remark
@@ -68,7 +68,7 @@ class DriveLog:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """The columns of `SignalCatalogue.drive_schema`."""
+        """The columns of `SignalCatalog.drive_schema`."""
         spec = self.spec
         return {
             "drive_id": spec.drive_id,
@@ -123,10 +123,10 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
     require_agreement(perfect, spec.drive_id, TOLERANCE)
 
 
-def simulate_batch(signals: SignalCatalogue, batch: Batch) -> pa.Table:
+def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
     """Simulate and measure the drives of a batch, a function of the batch alone.
 
-    Columns are in the order of `SignalCatalogue.log_schema`, without unlogged extras, strings as
+    Columns are in the order of `SignalCatalog.log_schema`, without unlogged extras, strings as
     dictionaries; rows by drive, then tick.
     """
     logs: list[DriveLog] = []
@@ -140,7 +140,7 @@ MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
 
 
 def simulate_logs(
-    signals: SignalCatalogue, specs: Sequence[DriveSpec], channels: Sequence[str] = ()
+    signals: SignalCatalog, specs: Sequence[DriveSpec], channels: Sequence[str] = ()
 ) -> list[DriveLog]:
     """Simulate drives together, each measured block by block by its own sensors and generator.
 
@@ -182,7 +182,7 @@ def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[st
     return {**channels, "vy_mps": vy_mps, "sideslip_rad": angle_rad}
 
 
-def tabulate(signals: SignalCatalogue, batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
+def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     """Return the rows of the logs as one table."""
     rows = [log.rows for log in logs]
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}

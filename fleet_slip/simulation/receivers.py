@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import HALF_TURN, SignalCatalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import HALF_TURN, SignalCatalog
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
@@ -65,7 +65,7 @@ class ReceiverLog:
     """
 
     def __init__(
-        self, signals: SignalCatalogue, receiver: Receiver, generator: np.random.Generator
+        self, signals: SignalCatalog, receiver: Receiver, generator: np.random.Generator
     ) -> None:
         course, speed = (signals[name] for name in SATELLITE_SIGNALS)
         self._scales = float(course.scale), float(speed.scale)

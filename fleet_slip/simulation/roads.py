@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import Configs

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, SignalCatalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, Signal, SignalCatalog
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
 from fleet_slip.simulation.imperfections import Imperfections
@@ -389,7 +389,7 @@ class Sensors(Config):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One drive in counts: an int16 array per signal in catalogue order, one value a tick.
+    """One drive in counts: an int16 array per signal in catalog order, one value a tick.
 
     `gps_fix`: where GPS is valid; `saturated`: values clipped to the signal's valid range.
     """
@@ -408,7 +408,7 @@ class Recorder:
 
     def __init__(
         self,
-        signals: SignalCatalogue,
+        signals: SignalCatalog,
         sensors: Sensors,
         generator: np.random.Generator,
         distortion: Distortion | None = None,

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, ConfigT, load_config
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import Configs

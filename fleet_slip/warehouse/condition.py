@@ -20,8 +20,8 @@ from typing import Any
 import duckdb
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import SCENARIO, TRAINING_DRIVES
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.facts import SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,
@@ -112,7 +112,7 @@ def asking(
 
 
 def parse_condition(
-    signals: SignalCatalogue, text: str | Condition, columns: Collection[str] | None = None
+    signals: SignalCatalog, text: str | Condition, columns: Collection[str] | None = None
 ) -> Condition:
     """Return a condition on columns, by default of drives. Raises `QuestionError`."""
     if isinstance(text, Condition):
@@ -121,7 +121,7 @@ def parse_condition(
 
 
 def parse_cohort(
-    signals: SignalCatalogue, text: str | Condition, columns: Collection[str] | None = None
+    signals: SignalCatalog, text: str | Condition, columns: Collection[str] | None = None
 ) -> Condition:
     """Return the condition of a cohort of the fleet: without test drives, unless it asks for them.
 
@@ -133,12 +133,12 @@ def parse_cohort(
     return Condition(condition.text, f"({condition.sql} AND {TRAINING_DRIVES})")
 
 
-def drive_columns(signals: SignalCatalogue) -> tuple[str, ...]:
+def drive_columns(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the columns that the condition of a cohort may use: a drive's metadata and its day."""
     return (*signals.drive, "day")
 
 
-def row_columns(signals: SignalCatalogue) -> tuple[str, ...]:
+def row_columns(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the columns that a condition on the rows of the view `log` may use."""
     columns = (signal.column for signal in signals.signals.values())
     return (*drive_columns(signals), "tick", "time_s", *columns)

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import pyarrow.compute as pc
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import Snapshot, Table

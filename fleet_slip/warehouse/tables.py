@@ -13,12 +13,12 @@ import duckdb
 import pyarrow as pa
 from pydantic import Field, RootModel, ValidationError
 
-from fleet_slip.catalogue.catalog import Catalog, load_catalog
-from fleet_slip.catalogue.course import COURSE_LATE
-from fleet_slip.catalogue.facts import ALL_DRIVES
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.lines import FittedLine
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.catalog import Catalog, load_catalog
+from fleet_slip.catalog.course import COURSE_LATE
+from fleet_slip.catalog.facts import ALL_DRIVES
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.lines import FittedLine
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
@@ -230,7 +230,7 @@ def open_warehouse(
     return Warehouse(data_root(root or os.environ.get(ROOT_VARIABLE)), configs)
 
 
-def stored_schema(signals: SignalCatalogue) -> pa.Schema:
+def stored_schema(signals: SignalCatalog) -> pa.Schema:
     """Return the schema of the table `logs`, with each signal's scale in its field's metadata."""
     return pa.schema(
         [
@@ -242,7 +242,7 @@ def stored_schema(signals: SignalCatalogue) -> pa.Schema:
     )
 
 
-def gram_schema(signals: SignalCatalogue) -> pa.Schema:
+def gram_schema(signals: SignalCatalog) -> pa.Schema:
     """Return the Arrow schema of the table `grams`.
 
     `part` is null where a Gram row is of a whole drive, else which of its rows it is of. `clipped`
@@ -387,9 +387,7 @@ def add_table(database: duckdb.DuckDBPyConnection, name: str, rows: pa.Table) ->
     database.unregister("incoming")
 
 
-def _source(
-    database: duckdb.DuckDBPyConnection, snapshot: Snapshot, signals: SignalCatalogue
-) -> str:
+def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, signals: SignalCatalog) -> str:
     """Return what stands after FROM for a stored table, empty ones included."""
     variable = f"{snapshot.table.folder.name.removesuffix('s')}_files"
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
@@ -407,7 +405,7 @@ def _source(
     return empty
 
 
-def _generated_columns(signals: SignalCatalogue) -> Mapping[str, Any]:
+def _generated_columns(signals: SignalCatalog) -> Mapping[str, Any]:
     separator = ",\n    "
     return {
         "drive_columns": separator.join(signals.drive),
@@ -444,7 +442,7 @@ def column_descriptions() -> dict[str, dict[str, ColumnDescription]]:
     return _Descriptions.model_validate(load_toml(folder("warehouse") / "columns.toml")).root
 
 
-def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalogue) -> pa.Table:
+def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog) -> pa.Table:
     """Return the columns of all views with unit and description."""
     by_view = column_descriptions()
     common = {n: ColumnDescription(description=c.description) for n, c in signals.drive.items()}

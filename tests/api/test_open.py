@@ -38,7 +38,7 @@ column = "boost_share"
 min = 0
 max = 100
 role = "extra"
-description = "A signal that the shipped catalogue lacks"
+description = "A signal that the shipped catalog lacks"
 """
 
 

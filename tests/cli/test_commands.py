@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.registry import Registry
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.local import LocalFolder

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, counts, drive

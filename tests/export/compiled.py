@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import OnBoard, c_gram_header, c_gram_source, lower
 from fleet_slip.export.compile import Sample

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Equation,

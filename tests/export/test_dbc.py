@@ -53,7 +53,7 @@ def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
     assert len({*found}) > 10
 
 
-def test_signals_have_the_scales_units_and_ranges_of_the_catalogue(bus: Database) -> None:
+def test_signals_have_the_scales_units_and_ranges_of_the_catalog(bus: Database) -> None:
     by_name = {signal.name: signal for message in bus.messages for signal in message.signals}
     for one in PROGRAM.signals:
         signal = by_name[one.name]

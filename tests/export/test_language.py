@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Equation,
@@ -28,8 +28,8 @@ from fleet_slip.catalogue.definitions import (
     Product,
     Slope,
 )
-from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.time_columns import Feature
+from fleet_slip.catalog.facts import NumberName
+from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.export.compile import (
     Sample,

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.catalog.definitions import Definition
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.compile import compile_program, drive_counts
 from fleet_slip.export.files import export_files

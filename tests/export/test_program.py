@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.definitions import Combination, Definition
+from fleet_slip.catalog.definitions import Combination, Definition
 from fleet_slip.cli.app import app
 from fleet_slip.columns.operations import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError

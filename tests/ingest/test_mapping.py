@@ -13,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.catalog import Catalog, load_catalog
+from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
 from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
@@ -154,12 +154,12 @@ def test_an_unknown_name_lists_the_known_ones() -> None:
         load_mapping("no_such_mapping", CATALOG)
 
 
-def test_tyres_need_a_column_of_the_catalogue(tmp_path: Path) -> None:
+def test_tyres_need_a_column_of_the_catalog(tmp_path: Path) -> None:
     shipped = SHIPPED_CONFIGS.file("signals.toml").read_text(encoding="utf-8")
     start = shipped.index("[drive.tyres]")
     own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
     catalog = load_catalog(configs_with(tmp_path / "configs", signals=own))
-    with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
+    with pytest.raises(ConfigError, match=r"drive\.tyres: the catalog has no such drive"):
         load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'), catalog)
     assert load(tmp_path, GOOD, catalog)
 

@@ -12,7 +12,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalog.faults import Fault
 from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.stream import find_refusals, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions

@@ -9,7 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured as module
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured
 from fleet_slip.evaluation.measured import identified_prior

@@ -74,7 +74,7 @@ def test_the_same_drives_make_the_same_file_however_they_were_divided(
     ]
 
 
-def test_columns_that_the_catalogue_no_longer_has_are_kept(warehouse: Warehouse) -> None:
+def test_columns_that_the_catalog_no_longer_has_are_kept(warehouse: Warehouse) -> None:
     rng = np.random.default_rng(2)
     old = log_rows("a", random_counts(rng, 40)).append_column("retired", pa.array(range(40)))
     action = warehouse.logs.write_file("old", old, DAY)

@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalog.facts import TRAINING_DRIVES
 from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.operations import examined, quality

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalog.faults import Fault
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import Signal
+from fleet_slip.catalog.signals import Signal
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import (
     EXACT,

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from fleet_slip.catalogue.catalog import load_catalog
+from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.resources import Configs
 
 CATALOG = load_catalog()

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.grams.on_board import COLUMNS, counted_sets
 from fleet_slip.regression.gram import Gram
 from tests.support.catalog import CATALOG, SIGNALS

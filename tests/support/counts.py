@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.regression.gram import Gram, GramTable

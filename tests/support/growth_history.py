@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.job import unit_name
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.base import shown
-from fleet_slip.catalogue.catalog import Catalog
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
@@ -43,7 +43,7 @@ class MeasuredLog:
     """A measured file, ready for the warehouse."""
 
     drives: pa.Table
-    """The catalogue's `log_schema`, of extras those that are mapped, by drive_id, then tick.
+    """The catalog's `log_schema`, of extras those that are mapped, by drive_id, then tick.
 
     Strings are dictionary-encoded.
     """

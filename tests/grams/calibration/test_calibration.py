@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.course import TURNED, turned_scale
-from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, CAR_NUMBERS
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, CAR_NUMBERS
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence, calibrate, roads_of
 from fleet_slip.grams.car_estimates import (

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
 from fleet_slip.grams import reader
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.facts import CAR_NUMBERS
+from fleet_slip.catalog.facts import CAR_NUMBERS
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError
 from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.catalogue.course import LARGEST_RAD, TURNED, course_units
+from fleet_slip.catalog.course import LARGEST_RAD, TURNED, course_units
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.grams.changes import Fixes

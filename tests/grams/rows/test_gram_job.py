@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fleet_slip
-from fleet_slip.catalogue.features import FeatureFile
+from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files

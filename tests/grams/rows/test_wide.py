@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
+from fleet_slip.catalog.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_columns

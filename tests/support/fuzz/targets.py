@@ -20,8 +20,8 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import FeatureFile
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.features import FeatureFile
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
@@ -170,7 +170,7 @@ LOADERS: dict[str, Load] = {
     "scenarios": lambda path: load_scenario(path, SHIPPED_CONFIGS),
     "tracks": lambda path: load_track(path, SHIPPED_CONFIGS),
     "vehicles": lambda path: load_vehicle(path, SHIPPED_CONFIGS),
-    "signals.toml": lambda path: load_config(Path(path), SignalCatalogue),
+    "signals.toml": lambda path: load_config(Path(path), SignalCatalog),
     "features.toml": lambda path: load_config(Path(path), FeatureFile, SIGNALS),
     "retention.toml": lambda path: load_retention(path, SHIPPED_CONFIGS),
 }

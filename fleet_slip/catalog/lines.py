@@ -13,14 +13,14 @@ from fractions import Fraction
 from functools import cached_property
 
 from fleet_slip.base import canonical_json, hash_fold, sha256_of
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Made,
     Product,
     limit_of,
 )
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import SignalCatalogue
+from fleet_slip.catalog.signals import SignalCatalog
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
@@ -190,7 +190,7 @@ ONE_SIDED, TURNING_BOTH_WAYS = 0.5, 0.3
 
 
 def find_implausible(
-    table: "GramTable", signals: SignalCatalogue, min_correlation: float
+    table: "GramTable", signals: SignalCatalog, min_correlation: float
 ) -> dict[int, Fault]:
     """Return the drives whose sensors contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
@@ -316,7 +316,7 @@ def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
     }
 
 
-def steering_swapped(moments: MeanMoments, signals: SignalCatalogue) -> dict[int, Fault]:
+def steering_swapped(moments: MeanMoments, signals: SignalCatalog) -> dict[int, Fault]:
     """Return the drives in which the outer front wheel steers more than the inner one.
 
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that

@@ -8,23 +8,23 @@ from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.course import BESIDE, YAW_RATE, course_units
-from fleet_slip.catalogue.definitions import COUNT_BITS, Definition, parity, plain_column
-from fleet_slip.catalogue.facts import CALIBRATION, DELAY
-from fleet_slip.catalogue.features import (
+from fleet_slip.catalog.course import BESIDE, YAW_RATE, course_units
+from fleet_slip.catalog.definitions import COUNT_BITS, Definition, parity, plain_column
+from fleet_slip.catalog.facts import CALIBRATION, DELAY
+from fleet_slip.catalog.features import (
     PLAIN,
     FeatureFile,
     FeatureSetEntry,
     load_features,
 )
-from fleet_slip.catalogue.lines import FittedLine, Fitting
-from fleet_slip.catalogue.signals import (
+from fleet_slip.catalog.lines import FittedLine, Fitting
+from fleet_slip.catalog.signals import (
     SAMPLE_TIME_S,
     Signal,
-    SignalCatalogue,
+    SignalCatalog,
     load_signals,
 )
-from fleet_slip.catalogue.time_columns import (
+from fleet_slip.catalog.time_columns import (
     Calibrated,
     EstimateColumn,
     Feature,
@@ -119,7 +119,7 @@ class Catalog:
         Source of the first-stage models of a data root; None outside one.
     """
 
-    signals: SignalCatalogue
+    signals: SignalCatalog
     file: FeatureFile
     configs: Configs = SHIPPED_CONFIGS
     first_stage_models: FirstStageModels | None = None

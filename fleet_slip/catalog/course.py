@@ -26,8 +26,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalogue
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 
 COURSE, YAW_RATE, SATELLITE_SPEED = "course", "yaw_rate", "satellite_speed"
 TURNED = "turned"
@@ -71,8 +71,8 @@ class CourseUnits:
     unturned: int
 
 
-def course_units(signals: SignalCatalogue) -> CourseUnits:
-    """Return the numbers for the scales of a catalogue."""
+def course_units(signals: SignalCatalog) -> CourseUnits:
+    """Return the numbers for the scales of a catalog."""
     grain = signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2
     turn = round(Fraction(Decimal(2) * Decimal(math.pi)) / grain)
     divisor = round(2 * HALF_TURN * signals[signals.label].exact_scale / grain)
@@ -120,7 +120,7 @@ LEVERS_M = (0.6, 2.6)
 """From a small car with the engine behind to a van."""
 
 
-def turned_scale(signals: SignalCatalogue) -> float:
+def turned_scale(signals: SignalCatalog) -> float:
     """Return the rad of a count of `TURNED`."""
     return float(signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * COARSER
 

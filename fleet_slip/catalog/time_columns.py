@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from fleet_slip.catalogue.arithmetic import nearest_sql, parse
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.arithmetic import nearest_sql, parse
+from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     LARGEST_BITS,
     LONGEST_TICKS,
@@ -34,8 +34,8 @@ from fleet_slip.catalogue.definitions import (
     Slope,
     integer_arithmetic,
 )
-from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName, Unit
-from fleet_slip.catalogue.signals import Identifier, Scaled, Signal, SignalCatalogue, SIUnit
+from fleet_slip.catalog.facts import CAR_NUMBERS, NumberName, Unit
+from fleet_slip.catalog.signals import Identifier, Scaled, Signal, SignalCatalog, SIUnit
 from fleet_slip.config import Config
 
 # Features of `configs/features.toml` as types: integer functions of the counts of one row.
@@ -121,7 +121,7 @@ class KnownColumns:
     `missing` are the names of those that are to be made.
     """
 
-    signals: SignalCatalogue
+    signals: SignalCatalog
     features: Mapping[str, Feature]
     over_time: dict[str, TimeColumn] = field(default_factory=dict)
     missing: frozenset[str] = frozenset()

@@ -20,9 +20,9 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, ValidationInfo, model_validator
 
-from fleet_slip.catalogue.arithmetic import evaluate, parse
-from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, SignalCatalogue
+from fleet_slip.catalog.arithmetic import evaluate, parse
+from fleet_slip.catalog.facts import NumberName
+from fleet_slip.catalog.signals import COUNT_MAX, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
@@ -72,15 +72,15 @@ def _ratio(value: Fraction) -> Fraction:
     return value
 
 
-def _signals_of(info: ValidationInfo) -> SignalCatalogue | None:
+def _signals_of(info: ValidationInfo) -> SignalCatalog | None:
     """Return the signals to check names against: the context of a file or document that is read."""
-    return info.context if isinstance(info.context, SignalCatalogue) else None
+    return info.context if isinstance(info.context, SignalCatalog) else None
 
 
 def integer_arithmetic(sql: str, info: ValidationInfo) -> str:
     """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
 
-    With a `SignalCatalogue` as context it must also be of input signals.
+    With a `SignalCatalog` as context it must also be of input signals.
     """
     if not sql:
         return sql
@@ -97,7 +97,7 @@ def integer_arithmetic(sql: str, info: ValidationInfo) -> str:
 def _not_unknowable(name: str, info: ValidationInfo) -> str:
     signals = _signals_of(info)
     if name in NOT_FACTS or (signals and name not in signals.drive):
-        raise ValueError(f"{name} is not a property of the car that the catalogue has")
+        raise ValueError(f"{name} is not a property of the car that the catalog has")
     return name
 
 
@@ -174,7 +174,7 @@ class Gate(Config):
 
 
 class Number(Config):
-    """What a car's drives tell of it (`fleet_slip.catalogue.facts`): a factor of a column.
+    """What a car's drives tell of it (`fleet_slip.catalog.facts`): a factor of a column.
 
     The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
     number is not known takes the mean since its drive began, `running`, of the same grain; without

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.catalog import load_catalog
-from fleet_slip.catalogue.course import CourseRelation, relate
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import load_catalog
+from fleet_slip.catalog.course import CourseRelation, relate
+from fleet_slip.catalog.definitions import (
     EXCHANGED,
     OFFSETS,
     OPPOSITE,
@@ -27,8 +27,8 @@ from fleet_slip.catalogue.definitions import (
     limit_of,
     parity,
 )
-from fleet_slip.catalogue.facts import CAR_NUMBERS
-from fleet_slip.catalogue.features import FeatureFile, load_features_over
+from fleet_slip.catalog.facts import CAR_NUMBERS
+from fleet_slip.catalog.features import FeatureFile, load_features_over
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns

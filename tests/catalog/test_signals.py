@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import Signal, SignalCatalogue
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import Signal, SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams import check
@@ -63,14 +63,14 @@ def test_a_mistake_is_told_with_file_key_and_reason(
 ) -> None:
     file = edited(tmp_path, old, new)
     with pytest.raises(ConfigError) as caught:
-        load_config(file, SignalCatalogue)
+        load_config(file, SignalCatalog)
     assert str(file) in str(caught.value)
     assert fault in str(caught.value)
 
 
-def test_a_missing_catalogue_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
+def test_a_missing_catalog_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
-        load_config(tmp_path / "none.toml", SignalCatalogue)
+        load_config(tmp_path / "none.toml", SignalCatalog)
     with pytest.raises(QuestionError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
         SIGNALS["beta"]
 
@@ -92,7 +92,7 @@ def test_valid_counts_are_those_whose_physical_value_is_in_range(
 
 
 def reordered(text: str) -> str:
-    """Return a catalogue with its signals, and its drive columns, in reverse order."""
+    """Return a catalog with its signals, and its drive columns, in reverse order."""
     comment, *tables = re.split(r"(?m)^(?=\[)", text)
     kinds = ("[signals.", "[drive.")
     tables = [one if one.endswith("\n") else one + "\n" for one in tables]

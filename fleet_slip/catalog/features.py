@@ -14,10 +14,10 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.catalogue.course import BESIDE, LONGEST_TICKS
-from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Identifier, SignalCatalogue
-from fleet_slip.catalogue.time_columns import (
+from fleet_slip.catalog.course import BESIDE, LONGEST_TICKS
+from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, Identifier, SignalCatalog
+from fleet_slip.catalog.time_columns import (
     Calibrated,
     ColumnFamily,
     EstimateColumn,
@@ -36,7 +36,7 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.resources import Configs, folder
 
 PLAIN = "signals"
-"""The feature set whose columns are the catalogue's inputs and label themselves."""
+"""The feature set whose columns are the catalog's inputs and label themselves."""
 
 FAMILIES = ("windows", "products", "estimates", "slopes", "factors", "gates", "calibrated")
 """Tables of the file that make columns over time, in the order in which they stand."""
@@ -66,7 +66,7 @@ class FeatureSetEntry(Config):
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "FeatureSetEntry":
-        signals = info.context if isinstance(info.context, SignalCatalogue) else None
+        signals = info.context if isinstance(info.context, SignalCatalog) else None
         unknown = ", ".join(
             name for name in self.signals if signals and name not in signals.feature_inputs
         )
@@ -105,7 +105,7 @@ class FeatureSetEntry(Config):
 class FeatureFile(Config):
     """All features and feature sets, in the file's order.
 
-    Validation needs the `SignalCatalogue` as context.
+    Validation needs the `SignalCatalog` as context.
     """
 
     features: dict[Identifier, Feature]
@@ -122,7 +122,7 @@ class FeatureFile(Config):
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "FeatureFile":
         signals = info.context
-        if not isinstance(signals, SignalCatalogue):
+        if not isinstance(signals, SignalCatalog):
             raise TypeError("the validation of features needs the signals as context")
         taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
         over_time = self._time_columns = _make_time_columns(self, signals)
@@ -132,7 +132,7 @@ class FeatureFile(Config):
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
-        for name, what in ((PLAIN, "the catalogue's own signals"), (RECEIVED, "what cars sent")):
+        for name, what in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):
             if name in self.sets:
                 raise ValueError(f"{name!r} is the set of {what}")
         for name, one in self.sets.items():
@@ -154,7 +154,7 @@ class FeatureFile(Config):
         return self._time_columns
 
 
-def _make_time_columns(features: FeatureFile, signals: SignalCatalogue) -> dict[str, TimeColumn]:
+def _make_time_columns(features: FeatureFile, signals: SignalCatalog) -> dict[str, TimeColumn]:
     """Return every column over time: windows, products, estimates, slopes, factors, gates.
 
     Raises `ValueError` for a column that refers to an unknown one, or for a repeated name.
@@ -189,7 +189,7 @@ def _make(where: str, name: str, family: ColumnFamily, columns: KnownColumns) ->
     return True
 
 
-def load_features(configs: Configs, signals: SignalCatalogue) -> FeatureFile:
+def load_features(configs: Configs, signals: SignalCatalog) -> FeatureFile:
     """Return the shipped features, with the user's file laid over them. Raises `ConfigError`."""
     shipped, chosen = folder("configs") / "features.toml", configs.file("features.toml")
     if str(chosen) == str(shipped):
@@ -198,7 +198,7 @@ def load_features(configs: Configs, signals: SignalCatalogue) -> FeatureFile:
 
 
 def load_features_over(
-    shipped: Traversable, override: Traversable, signals: SignalCatalogue
+    shipped: Traversable, override: Traversable, signals: SignalCatalog
 ) -> FeatureFile:
     """Read a file of features laid over another: its entries are added, or replace others.
 

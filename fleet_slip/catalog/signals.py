@@ -1,4 +1,4 @@
-"""The signal catalogue `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
+"""The signal catalog `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -121,21 +121,21 @@ NEEDED_DRIVE_COLUMNS = (
 """What the shipped SQL asks of drives."""
 
 
-class SignalCatalogue(Config):
+class SignalCatalog(Config):
     """All signals and drive columns, in the file's order."""
 
     signals: dict[Identifier, Signal]
     drive: dict[Identifier, DriveColumn]
 
     @model_validator(mode="after")
-    def _consistent(self) -> "SignalCatalogue":
+    def _consistent(self) -> "SignalCatalog":
         labels = [name for name, signal in self.signals.items() if signal.role == "label"]
         if len(labels) != 1:
             raise ValueError(f"exactly one signal must have the role 'label', not {labels}")
         if missing := [name for name in NEEDED_DRIVE_COLUMNS if name not in self.drive]:
             raise ValueError(
                 f"the drive columns {', '.join(missing)} are missing. Copy them from the shipped "
-                "catalogue, configs/signals.toml"
+                "catalog, configs/signals.toml"
             )
         names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
         names += ["day", "tick", "time_s"]
@@ -159,12 +159,12 @@ class SignalCatalogue(Config):
 
     @cached_property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the signals that a model may use, in catalogue order."""
+        """Names of the signals that a model may use, in catalog order."""
         return tuple(name for name, signal in self.signals.items() if signal.role == "input")
 
     @cached_property
     def extras(self) -> tuple[str, ...]:
-        """Names of the signals that some cars log besides, in catalogue order.
+        """Names of the signals that some cars log besides, in catalog order.
 
         A file of the logs has their columns only where a drive in it has them.
         """
@@ -177,7 +177,7 @@ class SignalCatalogue(Config):
 
     @cached_property
     def feature_inputs(self) -> tuple[str, ...]:
-        """Names of the signals that a feature may be computed from, in catalogue order."""
+        """Names of the signals that a feature may be computed from, in catalog order."""
         return tuple(name for name in self.signals if name in {*self.inputs, *self.extras})
 
     @cached_property
@@ -187,7 +187,7 @@ class SignalCatalogue(Config):
 
     @property
     def stored_columns(self) -> tuple[str, ...]:
-        """Names of the columns that may come to the table `logs` with a new catalogue."""
+        """Names of the columns that may come to the table `logs` with a new catalog."""
         return (*self.drive, *self.signals)
 
     def null_sql(self, name: str) -> str:
@@ -213,9 +213,9 @@ class SignalCatalogue(Config):
         )
 
 
-def load_signals(configs: Configs) -> SignalCatalogue:
-    """Return the signal catalogue `signals.toml` of a folder of configs. Raises `ConfigError`."""
-    return load_config(configs.file("signals.toml"), SignalCatalogue)
+def load_signals(configs: Configs) -> SignalCatalog:
+    """Return the signal catalog `signals.toml` of a folder of configs. Raises `ConfigError`."""
+    return load_config(configs.file("signals.toml"), SignalCatalog)
 
 
 # From physical values to counts, as the cars' sensors and measured logs make them.
