@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_slip.resources import find_config
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 
 SHIPPED = "fleet"
@@ -76,7 +76,7 @@ def _mean_rows(sized: Sized) -> float:
 
 def sized_campaign(sized: Sized) -> Campaign:
     """Return the campaign itself."""
-    return load_campaign(SHIPPED).model_copy(
+    return load_campaign(SHIPPED, SHIPPED_CONFIGS).model_copy(
         update={
             "name": sized.name,
             "first_day": sized.first_day,
@@ -88,7 +88,7 @@ def sized_campaign(sized: Sized) -> Campaign:
 
 
 def _text(sized: Sized) -> str:
-    text = find_config("campaigns", SHIPPED).read_text(encoding="utf-8")
+    text = SHIPPED_CONFIGS.find("campaigns", SHIPPED).read_text(encoding="utf-8")
     values = {
         "name": f'"{sized.name}"',
         "first_day": sized.first_day.isoformat(),

@@ -16,6 +16,7 @@ from benchmarks.harness import durations, peak_bytes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.grams.job import update_grams
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.job import simulate_campaign
 from fleet_slip.storage.local import LocalFolder
@@ -29,7 +30,7 @@ def measure(
     root: Path, campaign: Campaign, days: int, executor: Executor, elsewhere: Executor | None
 ) -> tuple[float, float]:
     """Return the time to simulate and the time for the Gram rows, in s."""
-    warm = load_campaign(WARM_UP)
+    warm = load_campaign(WARM_UP, SHIPPED_CONFIGS)
     other = Warehouse(LocalFolder(root.with_name(f"{root.name}-warm")))
     simulate_campaign(other, warm, warm.days(), executor)
     update_grams(other, executor=elsewhere)
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--days", type=int, default=6)
     parser.add_argument("--workers", type=int, default=2)
     arguments = parser.parse_args()
-    campaign = load_campaign("fleet")
+    campaign = load_campaign("fleet", SHIPPED_CONFIGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         here, there = folder / "here", folder / "there"

@@ -38,6 +38,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 
 POINTS: tuple[tuple[Any, str], ...] = (
     (pq, "write_table"),
@@ -104,7 +105,7 @@ def let_an_hour_pass(root: Path) -> None:
 def state(root: Path) -> dict[str, Any]:
     """All that a root holds, apart from file names and the moments at which it was written."""
     warehouse = Warehouse(LocalFolder(root))
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root), CATALOG)
     names = registry.names()
     histories = {name: registry.history(name) for name in names}
     return {
@@ -216,7 +217,7 @@ def run(kills: int, seed: int, names: list[str]) -> Counter[tuple[str, str]]:
     with tempfile.TemporaryDirectory() as folder:
         inputs = prepare_inputs(Path(folder))
         load_code(inputs["campaign"])
-        counted_sets()  # once for all forks
+        counted_sets(CATALOG)  # once for all forks
         chosen = [command for command in COMMANDS if command.name in names]
         for place, command in enumerate(chosen):
             share = kills // len(chosen) + (place < kills % len(chosen))

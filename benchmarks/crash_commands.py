@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.flips_root import write_short_lists
-from fleet_slip.resources import find_config
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.commits import CHECKSUM_KEY, NOTE, checksum_of_actions
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
@@ -58,7 +58,7 @@ class Command:
 def prepare_inputs(folder: Path) -> dict[str, str]:
     """Write a campaign of eight very short drives, a log with rows to refuse, and short lists."""
     write_short_lists(folder / "configs")
-    text = find_config("campaigns", "smoke").read_text(encoding="utf-8")
+    text = SHIPPED_CONFIGS.find("campaigns", "smoke").read_text(encoding="utf-8")
     text = text.replace("laps = 0.5", "laps = 0.04").replace("15_000", "1_500")
     names = ("smoke.toml", "m.toml", "corrected.toml", "log.csv")
     campaign, mapping, corrected, measured = (folder / name for name in names)

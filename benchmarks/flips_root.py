@@ -17,11 +17,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.harness import forked
-from fleet_slip.resources import CONFIG_VARIABLE, find_config, folder
+from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.tables import CONFIG_VARIABLE, QUARANTINE_SCHEMA, Warehouse
 from tests.support.commands import COMMAND, PATIENCE_S, run_here
 
 KINDS = {
@@ -148,14 +148,16 @@ def campaign(root: Path) -> Path:
 
 def write_configs(root: Path) -> None:
     """Write a campaign of short drives, and sets and searches of few columns; choose them."""
-    campaign(root).write_text(_replace(find_config("campaigns", "smoke").read_text(), _CAMPAIGN))
+    campaign(root).write_text(
+        _replace(SHIPPED_CONFIGS.find("campaigns", "smoke").read_text(), _CAMPAIGN)
+    )
     write_short_lists(root.with_name("configs"))
 
 
 def write_short_lists(configs: Path) -> None:
     """Write sets and searches of few columns into a new folder; choose them."""
     (configs / "models").mkdir(parents=True)
-    estimator = _replace(find_config("models", "estimator").read_text(), _SEARCH)
+    estimator = _replace(SHIPPED_CONFIGS.find("models", "estimator").read_text(), _SEARCH)
     anything, found = _INPUTS.subn("", estimator)
     assert found == 1
     (configs / "models" / "estimator.toml").write_text(anything)
@@ -198,7 +200,7 @@ def _add_what_is_rare(root: Path) -> None:
     rows = QUARANTINE_SCHEMA.empty_table().from_pylist(refused, schema=QUARANTINE_SCHEMA)
     written = warehouse.quarantine.write_file("refused", rows)
     warehouse.quarantine.snapshot().commit(Change(add=[written]))
-    DocumentFolder(warehouse.root / "evaluations").append({"format": 1, "values": [1, 2.5]})
+    DocumentFolder(warehouse.root, "evaluations").append({"format": 1, "values": [1, 2.5]})
     for table in (warehouse.logs, warehouse.grams):
         delta = table.open_delta()
         assert delta is not None

@@ -31,10 +31,11 @@ from fleet_slip.evaluation.scenario_evaluation import train_competitors
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.resources import config_file
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import draw_road, random_generator
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, load_vehicle
+from tests.support.catalog import CATALOG, SIGNALS
 
 CAR = "d_class_sedan"
 OPEN = ("country", "hill")
@@ -57,8 +58,8 @@ class Kind:
 
 def kinds() -> dict[str, Kind]:
     """Return the kinds of driving by name."""
-    laden_kg = load_vehicle(CAR).body.sprung_mass_kg + 300
-    leaning = load_scenario("imperfect_road").imperfections
+    laden_kg = load_vehicle(CAR, SHIPPED_CONFIGS).body.sprung_mass_kg + 300
+    leaning = load_scenario("imperfect_road", SHIPPED_CONFIGS).imperfections
     load = {"sprung_mass_kg": laden_kg, "load_position_m": -1.9}
     return {
         "country": Kind(0.035, ("country",)),
@@ -74,7 +75,7 @@ def kinds() -> dict[str, Kind]:
 
 def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]:
     """Yield the drives of a kind."""
-    drivers = load_config(config_file("blind.toml"), BlindSet).drivers
+    drivers = load_config(SHIPPED_CONFIGS.file("blind.toml"), BlindSet).drivers
     for number in range(roads):
         road = one.roads[number % len(one.roads)]
         drawn = random_generator(seed, "goals", kind, str(number))
@@ -95,7 +96,8 @@ def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]
                     "top_speed_mps": TOP_SPEED_MPS,
                 },
                 **one.others,
-            }
+            },
+            context=SHIPPED_CONFIGS,
         )
 
 
@@ -109,7 +111,7 @@ def errors_deg(
 
     `laden`: judged at the centre of gravity of the loaded car instead of the empty one.
     """
-    drives = [one for one in simulate_drives(some) if one.lost_control_s is None]
+    drives = [one for one in simulate_drives(SIGNALS, some) if one.lost_control_s is None]
     if laden:
         drives = [_laden(drive) for drive in drives]
     errors = pooled_statistics(evaluate(drives, estimators))
@@ -127,11 +129,11 @@ def print_nights(version: ModelVersion, seed: int) -> None:
     every = {kind: one for kind, one in kinds().items() if kind in ("country", LADEN)}
     order = ["country"] * 3 + [LADEN] * 3 + ["country"] * 3
     some = [next(scenarios(kind, every[kind], seed + i, 1)) for i, kind in enumerate(order)]
-    drives = [drive for one in some for drive in simulate_drives([one])]  # all of one name
+    drives = [drive for one in some for drive in simulate_drives(SIGNALS, [one])]  # all of one name
     print("| remembered |", " | ".join(f"{i}: {kind}" for i, kind in enumerate(order, 1)), "|")
     print("| --- " * (len(order) + 1) + "|")
     for kept in (0, 128, 200, 240, 256):
-        estimator, found = Estimator(version.manifest), []
+        estimator, found = Estimator(CATALOG, version.manifest), []
         for drive in drives:
             estimator.restart(kept)
             rows = min(2 * MINUTE_TICKS, len(drive.time_s))
@@ -164,7 +166,7 @@ def main() -> None:
         _, bank = train_competitors(fleet.warehouse, versions[0], versions[1:], executor)
     wanted = [one.reference for one in versions] + [name for name in bank if name.startswith("ekf")]
     estimators = {name: bank[name][0] for name in wanted}
-    drives = {"nominal": (0.014, [load_scenario("nominal")])} | {
+    drives = {"nominal": (0.014, [load_scenario("nominal", SHIPPED_CONFIGS)])} | {
         kind: (one.goal_deg, list(scenarios(kind, one, seed, options.roads)))
         for kind, one in kinds().items()
     }
@@ -178,7 +180,9 @@ def main() -> None:
             print(f"| the same, at the laden centre of gravity | | {found} |", flush=True)
     for number in range(options.draws):
         drawn = sha256(f"{versions[0].sha256} {number}".encode()).hexdigest()
-        found = " | ".join(f"{e:.3f}" for e in errors_deg(blind_scenarios(drawn), estimators))
+        found = " | ".join(
+            f"{e:.3f}" for e in errors_deg(blind_scenarios(drawn, SHIPPED_CONFIGS), estimators)
+        )
         print(f"| 24 blind drives, draw {number + 1} | | {found} |", flush=True)
 
 

@@ -24,10 +24,12 @@ from typing import Any
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
 from fleet_slip.grams.job import update_grams
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_campaign, simulate_logs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 
 # Rows
 
@@ -43,7 +45,7 @@ def simulated(options: argparse.Namespace) -> Iterator[Warehouse]:
     """Yield a warehouse with the campaign that `add_options` names, its Gram rows up to date."""
     with tempfile.TemporaryDirectory() as folder:
         warehouse = Warehouse(LocalFolder(options.root or Path(folder) / "data"))
-        campaign = load_campaign(options.campaign)
+        campaign = load_campaign(options.campaign, SHIPPED_CONFIGS)
         with ThreadPoolExecutor(2) as executor:
             simulate_campaign(warehouse, campaign, campaign.days(), executor)
         update_grams(warehouse)
@@ -149,8 +151,8 @@ def load_code(campaign: str) -> None:
             importlib.import_module(found.name)
     for name in ("pandas", "pyarrow.dataset"):
         importlib.import_module(name)
-    plan = load_campaign(campaign)
-    simulate_logs(plan.drives(plan.days()[0])[:1])  # which loads the compiler, for seconds
+    plan = load_campaign(campaign, SHIPPED_CONFIGS)
+    simulate_logs(SIGNALS, plan.drives(plan.days()[0])[:1])  # which loads the compiler, for seconds
 
 
 # Pages

@@ -13,8 +13,7 @@ import pyarrow.compute as pc
 
 import fleet_slip
 from benchmarks.interleave_roots import ADDED, CAR, FIRST_DAY, ROWS
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.operations.marked_models import marked_models
@@ -24,6 +23,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def drives_of(warehouse: Warehouse) -> tuple[dict[str, Drive], list[str]]:
 
 def _described(rows: pa.Table, day: str) -> Drive:
     digest = hashlib.sha256()
-    for name in ("tick", *catalogue().signals):
+    for name in ("tick", *SIGNALS.signals):
         if name != ADDED and name in rows.schema.names:
             digest.update(rows[name].fill_null(-32768).combine_chunks().to_numpy().tobytes())
     return Drive(day, rows["vehicle_id"][0].as_py(), rows.num_rows, digest.hexdigest())
@@ -90,7 +90,7 @@ def state(root: str) -> dict[str, Any]:
 
 def grams_of(warehouse: Warehouse) -> Iterator[str]:
     """Yield the drive of each Gram row of the signals that counts."""
-    identity = features().identity(PLAIN)
+    identity = CATALOG.identity(PLAIN)
     active = {file.path for file in warehouse.logs.snapshot().files}
     for file in warehouse.grams.snapshot().files:
         for row in warehouse.grams.read(file.path).to_pylist():
@@ -120,7 +120,7 @@ def readers_findings(root: str, committed: Drives, gone: str) -> list[str]:
         seen = database.execute(
             "SELECT drive_id, count(*), sum(n)::BIGINT FROM grams WHERE feature_set = $set "
             "GROUP BY ALL",
-            {"set": features().identity(PLAIN)},
+            {"set": CATALOG.identity(PLAIN)},
         ).fetchall()
     found += [f"doubled: Gram row of {name}" for name, count, _ in seen if count > 1]
     found += [
@@ -154,8 +154,8 @@ def forgotten_findings(root: str, unsaid: bool) -> list[str]:
             where = "readable" if file.path in active else "unsaid"
             if (where == "readable" or unsaid) and _has_car(table, file.path):
                 found.append(f"{where}: {table.folder.name} has rows of the forgotten car")
-    registry = Registry(warehouse.root / "models")
-    marked = marked_models(warehouse.root)
+    registry = Registry(warehouse.root, CATALOG)
+    marked = marked_models(warehouse)
     for name in registry.names():
         for number in registry.versions(name):
             version = registry.load(name, number)
@@ -174,7 +174,7 @@ def _has_car(table: Table, path: str) -> bool:
 def version_findings(root: str) -> list[str]:
     """Return the versions that do not follow from the Gram rows that they name."""
     warehouse = warehouse_at(root)
-    registry = Registry(warehouse.root / "models")
+    registry = Registry(warehouse.root, CATALOG)
     found = []
     for name in registry.names():
         for number in registry.versions(name):

@@ -182,7 +182,7 @@ def _findings(
         if forgotten:
             found += checks.forgotten_findings(root, forgotten == "all")
         return found
-    return ["unreadable: in the scales of either catalogue"]
+    return ["unreadable: in the scales of either catalog"]
 
 
 def _final(

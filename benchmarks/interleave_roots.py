@@ -17,9 +17,10 @@ from typing import Any
 
 from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
-from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE
-from fleet_slip.resources import find_config, folder
+from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
+from fleet_slip.warehouse.tables import CONFIG_VARIABLE
+from tests.support.catalog import configs_with
 
 CAR = "mini-0000"
 """The car that is to be forgotten: simulated and measured, in what is there and in what comes."""
@@ -88,15 +89,15 @@ class Inputs:
         return tuple(part.format(**self.files) for part in COMMANDS[name])
 
     def environment(self, *names: str) -> Environment:
-        """Return the environment of commands; migrating needs another catalogue."""
-        chosen = "new_signals" if "migrate" in names else "signals"
-        return {CATALOGUE_VARIABLE: str(self.folder / f"{chosen}.toml")}
+        """Return the environment of commands; migrating needs another catalog."""
+        age = "new" if "migrate" in names else "old"
+        return {CONFIG_VARIABLE: str(self.folder / f"{age}_configs")}
 
 
 def write_inputs(where: Path) -> Inputs:
     """Write a campaign of three days of two cars, measured logs, and configs."""
     where.mkdir()
-    text = find_config("campaigns", "fleet").read_text(encoding="utf-8")
+    text = SHIPPED_CONFIGS.find("campaigns", "fleet").read_text(encoding="utf-8")
     for old, new in (
         ('name = "fleet"', 'name = "mini"'),
         ("first_day = 2024-06-01", f"first_day = {FIRST_DAY}"),
@@ -119,10 +120,10 @@ def write_inputs(where: Path) -> Inputs:
     retention = f"drives_days = {days}\nreplaced_files_hours = 24\n"
     (where / "retention.toml").write_text(retention, encoding="utf-8")
     signals = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
-    (where / "signals.toml").write_text(signals, encoding="utf-8")
+    configs_with(where / "old_configs", signals=signals)
     before, found, after = signals.partition("[drive.drive_id]")
     assert found
-    (where / "new_signals.toml").write_text(before + NEW_SIGNAL + found + after, encoding="utf-8")
+    configs_with(where / "new_configs", signals=before + NEW_SIGNAL + found + after)
     return Inputs(where)
 
 

@@ -19,8 +19,6 @@ from deltalake import DeltaTable
 from deltalake.table import TableAlterer
 
 from benchmarks.harness import call, in_child
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.objects import ObjectFolder
 from fleet_slip.storage.table import Table
@@ -148,10 +146,8 @@ def command(root: object, arguments: tuple[str, ...], environment: Environment) 
 
 
 def use(environment: Environment) -> None:
-    """Take an environment, and forget what was read by another one."""
+    """Let the commands of this process have an environment."""
     os.environ.update(environment)
-    for cached in (catalogue, input_scales):
-        cached.cache_clear()
 
 
 def _give(

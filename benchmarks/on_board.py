@@ -24,6 +24,7 @@ from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
 from fleet_slip.export.templating import c_prefix
 from fleet_slip.models.registry import ModelVersion
+from tests.support.catalog import CATALOG
 from tests.support.cortex_m import can_measure, measure_cortex_m
 
 DRIVER = """
@@ -111,7 +112,7 @@ def best_of(call: Any, seconds: float) -> float:
 
 def in_c(folder: Path, fleet: fleet_slip.Fleet, version: ModelVersion) -> dict[str, Any]:
     """Compile a version and run it; return its time and sizes."""
-    program, prefix = compile_program(version.manifest), c_prefix(version)
+    program, prefix = compile_program(CATALOG, version.manifest), c_prefix(version)
     names = ", ".join(one.name for one in program.signals)
     counts = fleet.sql(
         f"SELECT {names} FROM log_counts "

@@ -22,11 +22,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.models.request import load_model_list
+from tests.support.catalog import CATALOG, SIGNALS
 
-INPUTS = list(load_model_list("table1").model[-1].signals)
-LABEL = catalogue().label
+INPUTS = list(load_model_list(CATALOG, "table1").model[-1].signals)
+LABEL = SIGNALS.label
 COLUMNS = [*INPUTS, LABEL]
 SOURCE = "read_parquet(getvariable('log_files'), union_by_name => true)"
 
@@ -67,10 +67,10 @@ def fleet_slip(threads: int) -> Fit:
 
     def run(paths: list[str]) -> Coefficients:
         logged = pq.read_schema(paths[0]).names
-        absent = [name for name in catalogue().stored_columns if name not in logged]
-        statement = gram_statement(whole=True, absent=absent)
+        absent = [name for name in SIGNALS.stored_columns if name not in logged]
+        statement = gram_statement(CATALOG, whole=True, absent=absent)
         database = duckdb.connect(config={"threads": threads})
-        total = Gram.zero(catalogue().gram_signals)
+        total = Gram.zero(SIGNALS.gram_signals)
         for first in range(0, len(paths), FILES_PER_QUERY):
             batch = paths[first : first + FILES_PER_QUERY]
             database.execute("SET VARIABLE log_files = $files", {"files": batch})
@@ -133,7 +133,7 @@ def _unpacked(row: tuple[float, ...]) -> Coefficients:
 
 
 def _scale(name: str, *, physical: bool) -> float:
-    return float(catalogue()[name].scale) if physical else 1.0
+    return float(SIGNALS[name].scale) if physical else 1.0
 
 
 def duckdb_float(threads: int) -> Fit:

@@ -31,10 +31,10 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness import add_options, simulated
 from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
-from fleet_slip.catalogue.features import input_scales
 from fleet_slip.pages.drawing import PALETTE, STYLE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel, fit
+from tests.support.catalog import CATALOG
 
 MOST_DIGITS = 16.0
 """A coefficient that is the exact one, rounded once."""
@@ -90,7 +90,7 @@ def measure(way: str, paths: Sequence[str], rows: int, exact: LinearModel) -> Re
     one = in_process(way, 2, 2, paths)
     other = in_process(way, 1, 1, paths[::-1])
     every = [*one["coefficients"], *other["coefficients"]]
-    truth = exact.physical(input_scales()) if WAYS[way].physical else exact
+    truth = exact.physical(CATALOG.input_scales) if WAYS[way].physical else exact
     return Result(
         WAYS[way].name,
         rows / one["s"],

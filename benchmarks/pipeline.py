@@ -22,8 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from benchmarks.harness import add_options, durations, simulated
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import gram_statement
 from fleet_slip.grams.gram_files import write_rows
@@ -33,10 +32,11 @@ from fleet_slip.models.select import select
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, absent_columns
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 
 ROUNDS = 5
-MODELS = load_model_list("table1")
-SIGNALS = catalogue().gram_signals
+MODELS = load_model_list(CATALOG, "table1")
+SIGNALS = CATALOG.signals.gram_signals
 
 
 def best(function: Callable[[], object]) -> float:
@@ -50,13 +50,13 @@ def line(what: str, seconds: float, rows: int, remark: str = "") -> None:
 
 
 def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
-    """Return the columns of the catalogue that no log file has."""
-    return absent_columns(warehouse.logs.snapshot().files, catalogue().stored_columns)
+    """Return the columns of the catalog that no log file has."""
+    return absent_columns(warehouse.logs.snapshot().files, CATALOG.signals.stored_columns)
 
 
 def job_statement(warehouse: Warehouse) -> str:
     """Return the statement with which the Gram job reads the logs."""
-    return gram_statement(whole=True, absent=absent_from(warehouse))
+    return gram_statement(CATALOG, whole=True, absent=absent_from(warehouse))
 
 
 def gram_query(warehouse: Warehouse, threads: int) -> None:
@@ -71,7 +71,7 @@ def gram_query(warehouse: Warehouse, threads: int) -> None:
     sums = ", ".join(f"sum({name})" for name in SIGNALS)
     bare = f"SELECT {sums} FROM {source}"
     absent = absent_from(warehouse)
-    logged = ["tick", *(name for name in catalogue().signals if name not in absent)]
+    logged = ["tick", *(name for name in CATALOG.signals.signals if name not in absent)]
     every = ", ".join(f"sum({name})" for name in logged)
     grouped = f"SELECT drive_id, {sums} FROM {source} GROUP BY drive_id"
     gram = job_statement(warehouse)
@@ -146,7 +146,7 @@ def repeat_drives(root: Path, drives: int, feature_set: str) -> Warehouse:
     """Give a root Gram rows of so many drives of a set, by repeating those that it has."""
     warehouse = Warehouse(LocalFolder(root))
     grams = warehouse.grams.snapshot()
-    identity = features().identity(feature_set)
+    identity = CATALOG.identity(feature_set)
     parts = [grams.table.read(file.path) for file in grams.files]
     usual = grams.table.usual_schema  # without what few files have
     rows = pa.concat_tables(part.select(usual.names).cast(usual) for part in parts)

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.operations.quality import QualityReport, examine, find_wrong_labels
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 
 Counts = NDArray[np.float64]
 Change = Callable[[Counts, np.random.Generator], Counts]
@@ -42,7 +43,7 @@ class Injected:
 
 
 def biased(signal: str, physical: float, unit: str) -> Injected:
-    count = physical / float(catalogue()[signal].scale)
+    count = physical / float(SIGNALS[signal].scale)
     return Injected(
         f"{signal} + {physical:g} {unit}", (signal,), ("biased",), lambda x, _: x + count
     )
@@ -53,7 +54,7 @@ def scaled(signal: str, factor: float) -> Injected:
 
 
 def noisy(signal: str, physical: float, unit: str) -> Injected:
-    count = physical / float(catalogue()[signal].scale)
+    count = physical / float(SIGNALS[signal].scale)
     return Injected(
         f"{signal} with noise of {physical:g} {unit}",
         (signal,),
@@ -152,7 +153,7 @@ def sample(cohort: Cohort, rng: np.random.Generator) -> NDArray[np.intp]:
 
 def read_counts(root: Path, drives: Sequence[str]) -> Mapping[str, Counts]:
     """Read the counts of drives, rows by signals of a Gram row."""
-    names = catalogue().gram_signals
+    names = SIGNALS.gram_signals
     with connect(root) as database:
         rows = database.execute(
             f"SELECT drive_id, tick, {', '.join(names)} FROM log_counts "

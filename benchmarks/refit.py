@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.harness import durations
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
@@ -23,10 +22,11 @@ from fleet_slip.models.select import answer_request
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 
 ROUNDS = 7
 TABLE = SelectionRequest(models="table1")
-MODELS = load_model_list("table1")
+MODELS = load_model_list(CATALOG, "table1")
 INPUTS, FOLDS = MODELS.model[1].signals, MODELS.folds
 
 
@@ -38,7 +38,7 @@ def median_ms(function: Callable[[], Any]) -> float:
 
 def main(root: str, condition: str) -> None:
     warehouse = Warehouse(LocalFolder(Path(root)))
-    label = catalogue().label
+    label = SIGNALS.label
     cohort = load_cohort(warehouse, condition)
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:

@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
 from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.driver import SAMPLE_S
@@ -29,12 +30,15 @@ DRIVES = 32
 
 def fleet(laps: float) -> list[LaneDrive]:
     """Return drives on Waterford Hills, each at another speed and mass."""
-    track = load_track("waterford_hills")
+    track = load_track("waterford_hills", SHIPPED_CONFIGS)
     limits = SpeedLimits(
         lateral_mps2=5.0, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=45.0
     )
     profile = speed_profile(track, limits, spacing_m=1.0)
-    curvature, sedan = track.curvature(profile.station_m), load_vehicle("d_class_sedan")
+    curvature, sedan = (
+        track.curvature(profile.station_m),
+        load_vehicle("d_class_sedan", SHIPPED_CONFIGS),
+    )
     return [
         LaneDrive(
             sedan.with_sprung_mass(1000.0 + 20.0 * i),

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.harness import durations
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import lane_drive, simulate_logs, tabulate
 from fleet_slip.simulation.sensors import Recorder
@@ -23,6 +23,7 @@ from fleet_slip.storage.checksums import checksum_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 
 ROUNDS = 5
 
@@ -41,16 +42,18 @@ def drive(drives: list[LaneDrive]) -> None:
 def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     """Return the rows of a batch and the seconds of each stage on its way to the logs."""
     lanes = [lane_drive(spec) for spec in batch.drives]
-    logs = simulate_logs(batch.drives)
-    rows = tabulate(batch, logs)
-    signals = [name for name in catalogue().signals if name in rows.schema.names]
+    logs = simulate_logs(SIGNALS, batch.drives)
+    rows = tabulate(SIGNALS, batch, logs)
+    signals = [name for name in SIGNALS.signals if name in rows.schema.names]
     blocks = [
         (block.drive, {name: values.copy() for name, values in block.channels.items()})
         for block in simulate_blocks(lanes)
     ]
 
     def measure() -> None:
-        recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in batch.drives]
+        recorders = [
+            Recorder(SIGNALS, s.sensors, s.generator(), s.distortion()) for s in batch.drives
+        ]
         for drive, truth in blocks:
             recorders[drive].record(truth)
 
@@ -69,14 +72,14 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     others = [name for name in rows.schema.names if name not in signals]
     return len(rows), {
         "plan a day: cars, roads, speeds": best(
-            lambda: load_campaign(batch.campaign).batches(batch.day)
+            lambda: load_campaign(batch.campaign, SHIPPED_CONFIGS).batches(batch.day)
         ),
         "roads of the drives": best(lambda: [lane_drive(spec) for spec in batch.drives]),
         "kernel": best(lambda: drive(lanes)),
         "sensors: draw the noise": draw_s,
         "sensors: imperfections": distort_s,
         "sensors: add it, round, clip": best(measure) - draw_s - distort_s,
-        "tabulate": best(lambda: tabulate(batch, logs)),
+        "tabulate": best(lambda: tabulate(SIGNALS, batch, logs)),
         "encode: signals": best(lambda: warehouse.logs.encode(rows.select(signals))),
         "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(others))),
         "checksum (again in encode)": best(lambda: checksum_of(encoded.content)),
@@ -88,7 +91,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--campaign", default="fleet")
     arguments = parser.parse_args()
-    campaign = load_campaign(arguments.campaign)
+    campaign = load_campaign(arguments.campaign, SHIPPED_CONFIGS)
     batch = campaign.batches(campaign.first_day)[0]
     with tempfile.TemporaryDirectory() as folder:
         rows, seconds = stages(batch, Warehouse(LocalFolder(Path(folder))))

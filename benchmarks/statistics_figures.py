@@ -12,7 +12,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.regression.choice import (
     CROSS_VALIDATION,
@@ -37,8 +36,9 @@ from fleet_slip.regression.subsets import (
 )
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 
-SIGNALS = catalogue()
+SIGNALS = CATALOG.signals
 LABEL = SIGNALS.label
 NINE = tuple(name for name in SIGNALS.inputs if name != "steering_wheel")
 SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 import fleet_slip
 from fleet_slip.evaluation.watch import DriveFrames, scenario_frames
 from fleet_slip.pages.drawing import STYLE, colour
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import simulate_batch
+from tests.support.catalog import SIGNALS
 
 SHOWN_S = (31.0, 66.0)
 """What is drawn: merging and the roundabout."""
@@ -68,7 +70,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.plot:
         return plot(*arguments.plot)
-    campaign = load_campaign("traffic")
+    campaign = load_campaign("traffic", SHIPPED_CONFIGS)
     specs = campaign.drives(campaign.first_day)[: arguments.drives]
     spent: dict[str, float] = {}
     start = time.process_time()
@@ -77,7 +79,7 @@ def main() -> None:
         assert spec.in_traffic
         spent[spec.track.name] = spent.get(spec.track.name, 0.0) + time.process_time() - before
     decided = time.process_time()
-    table = simulate_batch(Batch(campaign.name, campaign.first_day, 0, specs))
+    table = simulate_batch(SIGNALS, Batch(campaign.name, campaign.first_day, 0, specs))
     ended = time.process_time()
     driven_s = table.num_rows / 100
     for road, cpu_s in sorted(spent.items()):

@@ -18,6 +18,7 @@ from matplotlib import pyplot as plt
 
 from benchmarks.harness import insert
 from fleet_slip.arrays import FloatArray
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.driver import handling
@@ -41,7 +42,7 @@ CAR_WIDTH_M = 1.8
 
 def imperfections() -> CarImperfections:
     """Return the imperfections of a car of the scenario `imperfect`."""
-    return load_scenario("imperfect").imperfections.car
+    return load_scenario("imperfect", SHIPPED_CONFIGS).imperfections.car
 
 
 def compliance(flaws: CarImperfections) -> float:
@@ -248,7 +249,7 @@ def plot(folder: Path) -> None:
     mpl.rcParams["svg.hashsalt"] = "validation"
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.6))
     for colour, (kind, file) in zip(("C0", "C1", "C2"), CARS.items(), strict=True):
-        car = load_vehicle(file)
+        car = load_vehicle(file, SHIPPED_CONFIGS)
         for flaws, style, label in ((PERFECT, "--", None), (imperfections(), "-", kind)):
             circle = constant_radius(car, flaws)
             left.plot(circle.ay_mps2, circle.steering_deg, style, color=colour, label=label)
@@ -276,9 +277,11 @@ def main() -> None:
     arguments = parser.parse_args()
     lines = [HEADER, ("---",) * len(HEADER)]
     for kind, file in CARS.items():
-        lines.append(row(kind, load_vehicle(file), PERFECT))
+        lines.append(row(kind, load_vehicle(file, SHIPPED_CONFIGS), PERFECT))
         print(lines[-1], flush=True)
-        lines.append(row(f"{kind}, imperfect", load_vehicle(file), imperfections()))
+        lines.append(
+            row(f"{kind}, imperfect", load_vehicle(file, SHIPPED_CONFIGS), imperfections())
+        )
         print(lines[-1], flush=True)
     text = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     if arguments.document:

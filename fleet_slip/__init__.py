@@ -45,17 +45,31 @@ _HOMES = {
 """Where the names are that are imported when they are first used: importing the package is fast."""
 
 
-def open(root: "Folder | Path | str | None" = None) -> "Fleet":  # noqa: A001 - as in gzip
-    """Return the fleet whose warehouse is at `root`; nothing is read or written yet.
+def open(  # noqa: A001 - as in gzip
+    root: "Folder | Path | str | None" = None, config: "Path | str | None" = None
+) -> "Fleet":
+    """Open the fleet of a data root. Nothing in the root is read or written yet.
 
-    It is a folder, a URL (`s3://BUCKET/PATH`, `gs://`, `az://`), or None for `$FLEET_SLIP_ROOT`,
-    else `./data`. Credentials come from the environment. Raises `StorageError` for no such root.
+    Parameters
+    ----------
+    root
+        A folder, or a URL (`s3://BUCKET/PATH`, `gs://`, `az://`). None means `$FLEET_SLIP_ROOT`,
+        else `./data`. Credentials come from the environment.
+    config
+        A folder of configs that is laid over the shipped ones. None means `$FLEET_SLIP_CONFIG`,
+        else the shipped ones alone.
+
+    Raises
+    ------
+    StorageError
+        If no data root can have this path.
+    ConfigError
+        If `config` is no readable folder of configs.
     """
     from fleet_slip.api.fleet import Fleet  # noqa: PLC0415 - pyarrow and Delta
-    from fleet_slip.storage.data_root import data_root  # noqa: PLC0415
-    from fleet_slip.warehouse.tables import Warehouse  # noqa: PLC0415
+    from fleet_slip.warehouse.tables import open_warehouse  # noqa: PLC0415
 
-    return Fleet(Warehouse(data_root(root)))
+    return Fleet(open_warehouse(root, config))
 
 
 def __getattr__(name: str) -> Any:

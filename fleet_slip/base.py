@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import unicodedata
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
@@ -150,6 +151,33 @@ Progress = Callable[[int, int], None]
 
 def no_progress(_more: int, _all: int) -> None:
     """Tell nobody."""
+
+
+# Names of cars, drives and places, as logs, Gram rows and people write them.
+
+MAX_NAME_CHARACTERS = 200
+"""Longest name of a car, drive or place."""
+
+
+def normalize_name(text: str) -> str:
+    """Return the form in which a name is stored: Unicode NFC, without spaces around it."""
+    return unicodedata.normalize("NFC", text).strip()
+
+
+def find_name_fault(name: str) -> str | None:
+    """Return why a normalized name is refused; None for a valid name."""
+    if not name:
+        return "is empty"
+    if len(name) > MAX_NAME_CHARACTERS:
+        return f"has more than {MAX_NAME_CHARACTERS} characters"
+    if not name.isprintable():
+        return "has characters that cannot be printed"
+    return None
+
+
+def name_key(name: str) -> str:
+    """Return the key by which erasure compares names: the normalized name after case folding."""
+    return normalize_name(unicodedata.normalize("NFD", name).casefold())
 
 
 # How messages say numbers with their nouns, and names from strangers.

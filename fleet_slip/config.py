@@ -63,6 +63,7 @@ _SAID = {
     "less_than": "must be less than {lt}",
     "less_than_equal": "must be at most {le}",
     "finite_number": "must be a finite number",
+    "too_long": "has more than {max_length} entries",
 }
 """What is said of a fault, by its type in pydantic; what is not listed keeps pydantic's words."""
 
@@ -141,18 +142,26 @@ def _parse_decimal(text: str) -> Decimal:
     return number
 
 
-def load_config(file: Traversable, model: type[ConfigT]) -> ConfigT:
-    """Parse and validate a TOML file. Raises `ConfigError` with file, key, reason of each fault."""
+def load_config(file: Traversable, model: type[ConfigT], context: object = None) -> ConfigT:
+    """Parse and validate a TOML file. Raises `ConfigError` with file, key, reason of each fault.
+
+    `context` is passed to the validators of the model.
+    """
     try:
-        return model.model_validate(load_toml(file))
+        return model.model_validate(load_toml(file), context=context)
     except ValidationError as error:
         raise ConfigError(f"{file}: {faults_of(error)}") from None
 
 
-def parse_document(content: Mapping[str, Any], model: type[ModelT], name: str, kind: str) -> ModelT:
-    """Return a document with a valid checksum. Raises `StorageError`: another program wrote it."""
+def parse_document(
+    content: Mapping[str, Any], model: type[ModelT], name: str, kind: str, context: object = None
+) -> ModelT:
+    """Return a document with a valid checksum. Raises `StorageError`: another program wrote it.
+
+    `context` is passed to the validators of the model.
+    """
     try:
-        return model.model_validate(content)
+        return model.model_validate(content, context=context)
     except ValidationError as error:
         raise StorageError(
             f"{name}: this program does not understand {kind}: {faults_of(error)}. Update "

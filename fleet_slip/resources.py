@@ -3,15 +3,13 @@
 import json
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Literal
 
 from fleet_slip.errors import ConfigError
-
-CONFIG_VARIABLE = "FLEET_SLIP_CONFIG"
-"""Names a folder of configs that is laid over the shipped ones."""
 
 CONFIG_FILES = (
     "blind.toml",
@@ -41,81 +39,97 @@ def read_sql(name: ShippedFolder, file: str) -> str:
     return (folder(name) / file).read_text(encoding="utf-8")
 
 
-def own_configs() -> Path | None:
-    """Return the folder of configs laid over those shipped. Raises `ConfigError` if unusable."""
-    chosen = os.environ.get(CONFIG_VARIABLE)
-    if not chosen:
-        return None
-    folder_of_own = Path(chosen)
-    if not folder_of_own.is_dir():
-        raise ConfigError(f"{chosen}: no such folder of configs.")
-    for place in (folder_of_own, *(folder_of_own / kind for kind in CONFIG_FOLDERS)):
-        # What cannot be looked into would count as empty, and the shipped configs would be used.
-        if os.path.lexists(place) and not (place.is_dir() and os.access(place, os.R_OK | os.X_OK)):
-            raise ConfigError(f"{place}: not a folder that can be read.")
-    for file in sorted(folder_of_own.rglob("*.toml")):
-        _require_kind(file.relative_to(folder_of_own).as_posix(), file)
-    return folder_of_own
+@dataclass(frozen=True)
+class Configs:
+    """Configuration files: the shipped ones, and a folder of the user's laid over them.
+
+    Parameters
+    ----------
+    folder
+        Folder with the user's files, laid out like `configs/`; None for the shipped files alone.
+
+    Raises
+    ------
+    ConfigError
+        If the folder does not exist, cannot be read, or holds a file that is no configuration.
+    """
+
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.folder is None:
+            return
+        if not self.folder.is_dir():
+            raise ConfigError(f"{self.folder}: no such folder of configs.")
+        for place in (self.folder, *(self.folder / kind for kind in CONFIG_FOLDERS)):
+            # An unreadable folder would count as empty, and the shipped files would be used.
+            readable = place.is_dir() and os.access(place, os.R_OK | os.X_OK)
+            if os.path.lexists(place) and not readable:
+                raise ConfigError(f"{place}: not a folder that can be read.")
+        for file in sorted(self.folder.rglob("*.toml")):
+            _require_kind(file.relative_to(self.folder).as_posix(), file)
+
+    def file(self, name: str) -> Traversable:
+        """Return a file such as `monitor.toml`: the user's, even a broken link, or the shipped."""
+        if self.folder and os.path.lexists(self.folder / name):
+            return self.folder / name
+        return folder("configs") / name
+
+    def files(self) -> dict[str, Traversable]:
+        """Return every configuration file in force, by its name below the folder."""
+        names = [
+            *CONFIG_FILES,
+            *(f"{kind}/{name}.toml" for kind in CONFIG_FOLDERS for name in self.names(kind)),
+        ]
+        return {name: self.file(name) for name in names}
+
+    def names(self, kind: str) -> list[str]:
+        """Return the names of the files of one kind, such as `campaigns`, sorted."""
+        folders: list[Traversable] = [folder("configs") / kind]
+        if self.folder:
+            folders.append(self.folder / kind)
+        return sorted(
+            {
+                entry.name.removesuffix(".toml")
+                for place in folders
+                if place.is_dir()
+                for entry in place.iterdir()
+                if entry.name.endswith(".toml")
+            }
+        )
+
+    def find(self, kind: str, name_or_path: str) -> Traversable:
+        """Return a file by path or name. Raises `ConfigError` that lists the existing names."""
+        if name_or_path.endswith(".toml") or "/" in name_or_path:
+            path = Path(name_or_path)
+            if _is_file(path):
+                return path
+            raise ConfigError(f"{path}: no such file. Give the path of a TOML file.")
+        file = self.file(f"{kind}/{name_or_path}.toml")
+        if _is_file(file) or os.path.islink(str(file)):  # noqa: PTH114 - see `file`
+            return file
+        names = ", ".join(self.names(kind))
+        raise ConfigError(
+            f"{kind}: nothing is called {name_or_path!r}. Known: {names}; or give the path of a "
+            "TOML file."
+        )
+
+
+SHIPPED_CONFIGS = Configs()
+"""The shipped configuration files alone."""
 
 
 def _require_kind(name: str, file: Path) -> None:
-    kind, _, rest = name.rpartition("/")
-    if kind not in CONFIG_FOLDERS if kind else rest not in CONFIG_FILES:
+    kind, _, base = name.rpartition("/")
+    if kind not in CONFIG_FOLDERS if kind else base not in CONFIG_FILES:
         raise ConfigError(
             f"{file}: no config of fleet-slip. A folder of configs has {', '.join(CONFIG_FILES)}, "
             f"and TOML files in {', '.join(CONFIG_FOLDERS)}."
         )
 
 
-def config_file(name: str) -> Traversable:
-    """Return a config file such as `monitor.toml`: one's own, even a broken link, or ours."""
-    own = own_configs()
-    return own / name if own and os.path.lexists(own / name) else folder("configs") / name
-
-
-def config_files() -> dict[str, Traversable]:
-    """Return every config file that is in force, by its name below the folder of configs."""
-    names = [
-        *CONFIG_FILES,
-        *(f"{kind}/{name}.toml" for kind in CONFIG_FOLDERS for name in config_names(kind)),
-    ]
-    return {name: config_file(name) for name in names}
-
-
-def config_names(kind: str) -> list[str]:
-    """Return the names of the configs of one kind, such as `campaigns`, sorted."""
-    own = own_configs()
-    folders = [folder("configs") / kind, *([own / kind] if own else [])]
-    return sorted(
-        {
-            entry.name.removesuffix(".toml")
-            for one in folders
-            if one.is_dir()
-            for entry in one.iterdir()
-            if entry.name.endswith(".toml")
-        }
-    )
-
-
-def find_config(kind: str, name_or_path: str) -> Traversable:
-    """Return a config file by path or name. Raises `ConfigError`, naming those that there are."""
-    if name_or_path.endswith(".toml") or "/" in name_or_path:
-        path = Path(name_or_path)
-        if _is_file(path):
-            return path
-        raise ConfigError(f"{path}: no such file. Give the path of a TOML file.")
-    file = config_file(f"{kind}/{name_or_path}.toml")
-    if _is_file(file) or os.path.islink(str(file)):  # noqa: PTH114 - see `config_file`
-        return file
-    known = ", ".join(config_names(kind))
-    raise ConfigError(
-        f"{kind}: nothing is called {name_or_path!r}. Known: {known}; or give the path of a TOML "
-        "file."
-    )
-
-
 def _is_file(path: Traversable) -> bool:
-    """Whether there is such a file; a name that the system cannot have names none."""
+    """Return True if the file exists; no file has a name that the system does not allow."""
     try:
         return path.is_file()
     except (OSError, ValueError):

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import duckdb
 
-from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
-from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
 from fleet_slip.warehouse.tables import (
@@ -17,6 +16,7 @@ from fleet_slip.warehouse.tables import (
     describe_columns,
     lock,
     open_tables,
+    open_warehouse,
     paths_of,
     table_snapshots,
     views_in,
@@ -34,6 +34,7 @@ _SOURCE = re.compile(r"\bsource\b", re.I)
 def connect(
     root: Folder | Path | str | None = None,
     *,
+    config: Path | str | None = None,
     threads: int | None = None,
     query: str | None = None,
 ) -> duckdb.DuckDBPyConnection:
@@ -47,18 +48,17 @@ def connect(
     It opens the files of the snapshot and no others, and its settings cannot be changed. DuckDB
     knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
     """
-    return open_views(data_root(root), query, threads)
+    return open_views(open_warehouse(root, config), query, threads)
 
 
 def open_views(
-    root: Folder,
+    warehouse: Warehouse,
     query: str | None,
     threads: int | None = None,
     *,
     unlocked: bool = False,
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
-    warehouse = Warehouse(root)
     warehouse.require()
     wanted = VIEWS if query is None else needed_views(query)
     snapshots = table_snapshots(warehouse, wanted)
@@ -69,7 +69,7 @@ def open_views(
     if "models" in wanted:
         add_table(database, "models", Registry.of(warehouse).as_table())
     if "dictionary" in wanted:
-        add_table(database, "dictionary", describe_columns(database))
+        add_table(database, "dictionary", describe_columns(database, warehouse.catalog.signals))
     if not unlocked:
         lock(database, paths_of(snapshots, wanted))
     return database

@@ -30,8 +30,8 @@ judged AS (
                 THEN 'is of another car or day than a row of its drive before'
             WHEN row_number() OVER (PARTITION BY drive_id, feature_set, part, signals ORDER BY number) > 1
                 THEN 'is there twice'
-            WHEN sum(n) OVER (PARTITION BY drive_id, feature_set, part ORDER BY number) > $longest
-                THEN 'has more rows than the day of a drive has time for'
+            WHEN sum(n) OVER (PARTITION BY vehicle_id, day, feature_set, part ORDER BY number) > $longest
+                THEN 'makes its car drive more than 24 hours on a day'
         END AS reason
     FROM named
     LEFT JOIN known ON feature_set = key

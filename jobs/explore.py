@@ -31,7 +31,7 @@ def _():
 
 @app.cell
 def _(fleet_slip, mo, number_of):
-    fleet = fleet_slip.open(mo.cli_args().get("root"))
+    fleet = fleet_slip.open(mo.cli_args().get("root"), mo.cli_args().get("config"))
     with fleet.session() as session:
         drives = session.sql("SELECT * FROM drives ORDER BY drive_id").pl()
         trained = session.sql("SELECT DISTINCT name FROM models ORDER BY 1").pl()["name"].to_list()

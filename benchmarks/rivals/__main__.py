@@ -43,7 +43,9 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.request import load_model_list
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import load_scenario
+from tests.support.catalog import CATALOG, SIGNALS
 
 DRIVES = (
     "nominal", "noise_doubled", "melbourne", "mass_1740", "adhesion_0_7", "adhesion_0_4",
@@ -76,7 +78,7 @@ class Rival(NamedTuple):
 
 def all_signals() -> tuple[str, ...]:
     """Return the signals of model 4 of Table I, which the paper settles on."""
-    return next(one.signals for one in load_model_list(TABLE_ONE).model if one.name == "4")
+    return next(one.signals for one in load_model_list(CATALOG, TABLE_ONE).model if one.name == "4")
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
@@ -101,7 +103,10 @@ def train(
     """Yield each rival by name."""
     yield (
         manifest.name,
-        Rival(PublishedEstimate(Predictor.of(manifest)), 8 * (len(manifest.terms) + 1)),
+        Rival(
+            PublishedEstimate(SIGNALS, Predictor.of(SIGNALS, manifest)),
+            8 * (len(manifest.terms) + 1),
+        ),
     )
     cohort = load_cohort(fleet.warehouse, manifest.trained_on.cohort)
     windows = Inputs.of_model(manifest, all_signals())
@@ -114,7 +119,7 @@ def train(
                 yield f"{name}_{suffix}", learn(fit, sample, inputs)
     if not (wanted(FILTER.name) or wanted(TREE)):
         return
-    car = load_scenario("nominal").car
+    car = load_scenario("nominal", SHIPPED_CONFIGS).car
     drives = TuningDrives.choose(fleet.warehouse, cohort, with_mass=False)
     with ThreadPoolExecutor(1) as executor:
         best, took_s = timed(partial(FILTER.tune, drives.drives, car, executor))
@@ -136,7 +141,7 @@ def main() -> None:
     names, asked = given.drives.split(","), given.rivals.split(",")
     fleet = fleet_slip.open(given.root)
     manifest = fleet.model(given.model).manifest
-    drives = simulate_drives([load_scenario(name) for name in names])
+    drives = simulate_drives(SIGNALS, [load_scenario(name, SHIPPED_CONFIGS) for name in names])
 
     def show(*cells: Any) -> None:
         texts = (

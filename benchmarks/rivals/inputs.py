@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.definitions import Definition
 from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
@@ -24,6 +23,7 @@ from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Inputs:
     @classmethod
     def of_signals(cls, names: Sequence[str]) -> "Inputs":
         """Return logged signals as inputs."""
-        return cls({name: float(catalogue()[name].scale) for name in names})
+        return cls({name: float(SIGNALS[name].scale) for name in names})
 
     @classmethod
     def of_model(cls, manifest: Manifest, signals: Sequence[str]) -> "Inputs":
@@ -52,10 +52,10 @@ class Inputs:
         Of a gated column, the column without its gate, and the counts of what opens the gate: the
         product of both is what these learners make themselves.
         """
-        scales = {name: float(catalogue()[name].scale) for name in signals}
+        scales = {name: float(SIGNALS[name].scale) for name in signals}
         definitions: dict[str, Definition] = {}
         for term in manifest.terms:
-            scale = float(catalogue()[term.signal].scale if term.logged else term.scale)
+            scale = float(SIGNALS[term.signal].scale if term.logged else term.scale)
             one = term.definition
             if one is None:
                 scales.setdefault(term.signal, scale)
@@ -82,7 +82,7 @@ class Inputs:
 
     def beside(self, signal: str) -> "Inputs":
         """Return the same with a logged signal as the last one."""
-        return replace(self, scales={**self.scales, signal: float(catalogue()[signal].scale)})
+        return replace(self, scales={**self.scales, signal: float(SIGNALS[signal].scale)})
 
     def values(self, drive: DriveCounts) -> FloatArray:
         """Return physical values, shape (rows, columns), NaN where missing. Raises `DataError`."""
@@ -106,7 +106,7 @@ class LearnedEstimate:
     ) -> FloatArray:
         """Estimate side-slip from signals by SI column and attributes of the vehicle."""
         plan = self.inputs.plan
-        inputs = self.inputs.values(as_counts(signals, plan.signals, attributes))
+        inputs = self.inputs.values(as_counts(SIGNALS, signals, plan.signals, attributes))
         complete = np.isfinite(inputs).all(axis=1)
         estimates = np.full(len(inputs), np.nan)
         if complete.any():
@@ -155,7 +155,7 @@ def draw_sample(
     numbers: CarCounts | None = None,
 ) -> RowSample:
     """Draw about so many rows with all inputs and the label, or raise `DataError`."""
-    with_label = inputs.beside(catalogue().label)
+    with_label = inputs.beside(SIGNALS.label)
     plan = with_label.plan
     trips = dict(zip(*(cohort.drives[n].to_pylist() for n in ("drive_id", "trip")), strict=True))
     stride = max(1, cohort.rows // rows)

@@ -24,7 +24,7 @@ from typing import (
 from typing_extensions import Doc
 
 from fleet_slip.base import Progress, needed, no_progress
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
+from fleet_slip.catalog.facts import TRAINING_DRIVES
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.folder import Folder
@@ -183,10 +183,15 @@ def unless_local(executor: Executor) -> Executor | None:
 
 
 def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
-    """Return the warehouse as the workers of an executor find it."""
+    """Return the warehouse as the workers of an executor find it.
+
+    It is pickled with its catalog: a worker need not have the folder of configs.
+    """
     from fleet_slip.warehouse.tables import Warehouse
 
-    return warehouse if unless_local(executor) is None else Warehouse(absolute(warehouse.root))
+    if unless_local(executor) is None:
+        return warehouse
+    return Warehouse(absolute(warehouse.root), warehouse.configs)
 
 
 # What is said of parameters of several methods; with a `Doc` they are options of commands, too.

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Unpack
 from typing_extensions import Doc
 
 from fleet_slip.api.calls import CarMeasures, Rooted, open_workers, takes
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.features import features as known_features
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import (
@@ -82,7 +81,7 @@ class FleetCohort(Rooted):
         examined = self.examine()
         with examined.explaining():
             request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
-            plan = SelectionPlan.of(request)
+            plan = SelectionPlan.of(self.warehouse.catalog, request)
             if plan.request.models == DEFAULT_MODELS:
                 update_if_quick(self.warehouse, plan.feature_set, examined.cohort)
             found = answer_request(self.warehouse, request, examined.cohort)
@@ -154,5 +153,5 @@ class FleetCohort(Rooted):
             model = registry.only(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)
         identity = version.manifest.trained_on.feature_set
-        cohort = self._load(known_features().name_of(identity))
+        cohort = self._load(self.warehouse.catalog.name_of(identity))
         return cohort, version.manifest.signals, version

@@ -7,7 +7,7 @@ from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Self
 
 from typing_extensions import Doc
 
@@ -33,8 +33,8 @@ from fleet_slip.api.calls import (
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.base import last_day
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.runs import LOGGER, step
@@ -59,9 +59,20 @@ if TYPE_CHECKING:
 class Fleet(HealthAndUpkeep):
     """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one.
 
-    A fleet holds no connection or file open, and threads may share it. Changes leave a record in
-    the view `runs`. Every call raises `StorageError` where the root cannot be read or written.
+    Threads may share it. Close it, or use it in a `with` block, to release what it keeps between
+    calls; it can be used again afterwards. Changes leave a record in the view `runs`. Every call
+    raises `StorageError` where the root cannot be read or written.
     """
+
+    def close(self) -> None:
+        """Release the connections and models that the warehouse keeps between calls."""
+        self.warehouse.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
 
     def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
         """Return the answer to an SQL query on the views as a DuckDB relation.
@@ -90,7 +101,7 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.api.session import Session
         from fleet_slip.views import open_views
 
-        opened = open_views(self.root, query, threads, unlocked=unlocked)
+        opened = open_views(self.warehouse, query, threads, unlocked=unlocked)
         return Session(opened, unlocked)
 
     def cohort(
@@ -122,7 +133,9 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.simulation.campaign import load_campaign
         from fleet_slip.simulation.job import simulate_campaign
 
-        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        chosen = campaign
+        if isinstance(chosen, str):
+            chosen = load_campaign(chosen, self.warehouse.configs)
         wanted = chosen.chosen_days(days, last_day(through, "through"))
         with open_workers(self.root, workers) as executor, step("simulate") as figures:
             report = simulate_campaign(
@@ -168,7 +181,7 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.ingest.recordings import KnownFiles
         from fleet_slip.operations.rewriting import take_out
 
-        plan, logs, folders = _chosen_logs(files, mapping)
+        plan, logs, folders = self._chosen_logs(files, mapping)
         count = count_from_start(progress)
         reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
@@ -223,7 +236,7 @@ class Fleet(HealthAndUpkeep):
         """
         from fleet_slip.ingest.load import preview_logs
 
-        plan, logs, _ = _chosen_logs(files, mapping)
+        plan, logs, _ = self._chosen_logs(files, mapping)
         return preview_logs(logs, plan)
 
     @record_call
@@ -256,7 +269,10 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.grams.reader import cohort_files
         from fleet_slip.warehouse.condition import parse_cohort
 
-        among = cohort_files(self.warehouse, parse_cohort(cohort)) if cohort else None
+        among = None
+        if cohort:
+            condition = parse_cohort(self.warehouse.catalog.signals, cohort)
+            among = cohort_files(self.warehouse, condition)
         with open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
                 within_reach(self.warehouse, executor),
@@ -283,7 +299,7 @@ class Fleet(HealthAndUpkeep):
 
     @record_call
     def migrate(self) -> "MigrationReport":
-        """Bring the tables to this program and its catalogue (`docs/configuration.md`).
+        """Bring the tables to this program and its catalog (`docs/configuration.md`).
 
         Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
         """
@@ -319,7 +335,9 @@ class Fleet(HealthAndUpkeep):
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
-        chosen = load_campaign(campaign) if isinstance(campaign, str) else campaign
+        chosen = campaign
+        if isinstance(chosen, str):
+            chosen = load_campaign(chosen, self.warehouse.configs)
         model_name = require_model_name(name or chosen.name)
         parse_worth(worth)  # before anything is written
         condition = f"campaign = '{chosen.name}'"
@@ -370,10 +388,9 @@ class Fleet(HealthAndUpkeep):
         """
         from fleet_slip.api.training import LearnReport, Training
         from fleet_slip.errors import InputError
-        from fleet_slip.ingest.mapping import load_mapping
 
         begun = time.monotonic()
-        plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
+        plan = self._chosen_mapping(mapping)
         training = Training.on_mapping(require_model_name(name), plan)
         reports: list[IngestReport] = []
         failure = None
@@ -436,14 +453,19 @@ class Fleet(HealthAndUpkeep):
         waiting = partial(LOGGER.info, "%s: waiting for another fleet-slip %s", name, job)
         return self.root.exclusive(f".{job}-{name}.lock", waiting)
 
+    def _chosen_mapping(self, mapping: "str | Mapping") -> "Mapping":
+        from fleet_slip.ingest.mapping import load_mapping
 
-def _chosen_logs(
-    files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
-) -> "tuple[Mapping, list[Path], bool]":
-    """Return a mapping, the logs that are meant, and whether these are in folders or patterns."""
-    from fleet_slip.ingest.log_files import find_logs, names_several
-    from fleet_slip.ingest.mapping import load_mapping
+        if isinstance(mapping, str):
+            return load_mapping(mapping, self.warehouse.catalog)
+        return mapping
 
-    plan = load_mapping(mapping) if isinstance(mapping, str) else mapping
-    given = [files] if isinstance(files, Path | str) else list(files)
-    return plan, find_logs(given), any(map(names_several, given))
+    def _chosen_logs(
+        self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
+    ) -> "tuple[Mapping, list[Path], bool]":
+        """Return a mapping, the chosen logs, and whether these are in folders or patterns."""
+        from fleet_slip.ingest.log_files import find_logs, names_several
+
+        plan = self._chosen_mapping(mapping)
+        paths = [files] if isinstance(files, Path | str) else list(files)
+        return plan, find_logs(paths), any(map(names_several, paths))

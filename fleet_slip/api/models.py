@@ -20,7 +20,7 @@ from fleet_slip.api.calls import (
     record_call,
 )
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.program import Target
 from fleet_slip.models.manifest import require_model_name
@@ -57,7 +57,7 @@ class PublishedModels(Rooted):
         if name is not None:
             registry.require(name)
         found = registry.as_table(name)
-        marked = marked_models(self.root)
+        marked = marked_models(self.warehouse)
         pairs = zip(found["name"].to_pylist(), found["version"].to_pylist(), strict=True)
         return found.append_column(
             "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
@@ -195,7 +195,8 @@ class PublishedModels(Rooted):
         """
         from fleet_slip.export.stepping import Estimator
 
-        return Estimator(self.model(model).manifest, car)
+        version = self.model(model)
+        return Estimator(version.catalog, version.manifest, car)
 
     def export(
         self,
@@ -275,9 +276,10 @@ class JudgedModels(PublishedModels):
 
         version = self.model(model)
         asked = ALL_DRIVES if cohort is None else cohort
-        rows = cohort_of_rows(asked)
+        signals = self.warehouse.catalog.signals
+        rows = cohort_of_rows(signals, asked)
         examined = Examined(asked) if unexamined else leave_out_faulty(self.warehouse, asked)
-        rows = replace(rows, sql=cohort_of_rows(examined.cohort).sql)
+        rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
         with examined.explaining():
             seen = find_seen(self.warehouse, self.registry(), version.manifest, rows)
             found = score(self.warehouse, version.manifest, rows if cohort else seen.others)
@@ -318,9 +320,11 @@ class JudgedModels(PublishedModels):
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
         from fleet_slip.evaluation.scenario_evaluation import evaluate_scenarios
         from fleet_slip.evaluation.test_drives import simulate_scenarios
-        from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+        from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 
-        chosen = tuple(map(load_scenario, scenarios)) if scenarios else shipped_scenarios()
+        configs = self.warehouse.configs
+        chosen = tuple(load_scenario(name, configs) for name in scenarios)
+        chosen = chosen or load_scenarios(configs)
         first, *rest = [self.model(one) for one in (model, *others)]
         with open_workers(self.root, threads) as executor:
             told = count_from_start(progress)
@@ -356,7 +360,9 @@ class JudgedModels(PublishedModels):
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = [self.model(one) for one in (model, *others)]
-        car: VehicleParameters | Measured | None = load_vehicle(vehicle) if vehicle else None
+        car: VehicleParameters | Measured | None = None
+        if vehicle:
+            car = load_vehicle(vehicle, self.warehouse.configs)
         if any(measured.values()):
             if car is not None:
                 raise UsageError("give a vehicle file or measurements of the car, not both.")
@@ -429,7 +435,7 @@ class JudgedModels(PublishedModels):
         if output.suffix != ".html":
             raise UsageError(f"{output}: a drive is shown as a page, which ends with .html.")
         version = self.model(model)
-        if is_scenario(what):
+        if is_scenario(what, self.warehouse.configs):
             frames = scenario_frames(what, version)
         else:
             frames = drive_frames(self.warehouse, what, version)

@@ -155,7 +155,7 @@ class Night:
     def _ingest(self) -> Told:
         from fleet_slip.ingest.mapping import load_mapping
 
-        mapping = load_mapping(self.asked.mapping)
+        mapping = load_mapping(self.asked.mapping, self.fleet.warehouse.catalog)
         landing = self.asked.landing
         if not Path(landing).is_dir():
             raise InputError(

@@ -1,6 +1,6 @@
 """The part of a `Fleet` that watches the warehouse and looks after it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING, Annotated
@@ -19,8 +19,8 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.base import date_of, number_of
-from fleet_slip.catalogue.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.base import date_of, normalize_name, number_of
+from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.runs import step
@@ -102,7 +102,8 @@ class HealthAndUpkeep(JudgedModels):
         from fleet_slip.grams.calibration import calibrate
         from fleet_slip.warehouse.condition import parse_cohort
 
-        return calibrate(self.warehouse, parse_cohort(cohort), receivers=True)
+        condition = parse_cohort(self.warehouse.catalog.signals, cohort)
+        return calibrate(self.warehouse, condition, receivers=True)
 
     def monitor(
         self,
@@ -137,13 +138,21 @@ class HealthAndUpkeep(JudgedModels):
             ),
         ] = False,
         repair: Annotated[bool, Doc("Rebuild Gram rows from the logs.")] = False,
+        accept_loss: Annotated[
+            Sequence[str],
+            Doc(
+                "Go on without a lost document of which there is no backup: FOLDER/NUMBER.json, "
+                "or FOLDER for all of it. May be repeated."
+            ),
+        ] = (),
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "Verification":
         """Verify every byte against its checksum, and all tables against each other.
 
         Progress is in bytes. `damage` is what is wrong, after a repair what is left. Raises
-        `StorageError` without a data root, and `ClusterError`.
+        `StorageError` without a data root, `QuestionError` if nothing is lost at `accept_loss`, and
+        `ClusterError`.
         """
         from fleet_slip.grams.check import check_grams
         from fleet_slip.operations.verify import verify
@@ -156,15 +165,27 @@ class HealthAndUpkeep(JudgedModels):
                 executor=unless_local(executor),
             )
 
+        accepted = self.accept_losses(accept_loss) if accept_loss else ()
         with open_workers(self.root, workers) as executor:
             found = look()
             if repair:
                 rebuilt = self.repair(found)
                 found = look()
                 found.rebuilt, found.repaired = rebuilt, True
+        found.accepted = accepted
         if grams and not found.damage:
             found.compared = check_grams(self.warehouse)
         return found
+
+    @record_call
+    def accept_losses(self, paths: Sequence[str]) -> list[str]:
+        """Go on without lost documents, given by files or folders below the root; return the files.
+
+        Raises `QuestionError` if nothing is lost there.
+        """
+        from fleet_slip.storage.documents import accept_losses
+
+        return accept_losses(self.warehouse.root, paths)
 
     @record_call
     def repair(self, found: "Verification") -> list[str]:
@@ -267,17 +288,18 @@ class HealthAndUpkeep(JudgedModels):
 
         told = count_from_start(progress)
         with step("retain") as figures:
-            report = retain(self.warehouse, load_retention(config), date.today(), told)
+            retention = load_retention(config, self.warehouse.configs)
+            report = retain(self.warehouse, retention, date.today(), told)
             figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
         return report
 
 
 def _subject(vehicle: str | None, drive: str | None) -> "Forgettable":
-    """Return the one that is given. Raises `UsageError` for none and for both."""
+    """Return the one that is given. Raises `UsageError` for none, for both and for a blank name."""
     from fleet_slip.warehouse.forgotten import Forgettable
 
-    if vehicle is not None and drive is None:
-        return Forgettable("vehicle", vehicle)
-    if drive is not None and vehicle is None:
-        return Forgettable("drive", drive)
-    raise UsageError("give a vehicle or a drive.")
+    names = {"vehicle": vehicle, "drive": drive}
+    match [(kind, normalize_name(name)) for kind, name in names.items() if name is not None]:
+        case [("vehicle" | "drive" as kind, name)] if name:
+            return Forgettable(kind, name)
+    raise UsageError("give a vehicle or a drive by its name.")

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import ShowStep, Workers, of_step
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import COURSE
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import COURSE
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, ConfigError, FleetSlipError, InputError, RefusedError
 from fleet_slip.models.request import COURSE_MODELS, DEFAULT_MODELS, Label, load_model_list
 from fleet_slip.rendering import Answer, Part, Remark
@@ -40,7 +39,7 @@ class Training:
 
         Raises `ConfigError` for a mapping without either.
         """
-        cohort, label = f"campaign = '{mapping.name}'", catalogue().label
+        cohort, label = f"campaign = '{mapping.name}'", mapping.signal_catalog.label
         if label in mapping.signal_names:
             return cls(name, cohort, DEFAULT_MODELS)
         if COURSE not in mapping.signals:
@@ -55,11 +54,12 @@ class Training:
         self, fleet: "Fleet", workers: "Workers", progress: "ShowStep | None" = None
     ) -> "tuple[GramReport, ...]":
         """Make the Gram rows that the list needs: of the signals, its feature set, and others."""
-        models = load_model_list(self.models)
+        catalog = fleet.warehouse.catalog
+        models = load_model_list(catalog, self.models)
         if models.line:  # from what its rows tell, select makes those of the list
-            models = load_model_list(models.line)
-        wanted = models.features
-        names = dict.fromkeys((PLAIN, wanted, *features().beside(wanted)))
+            models = load_model_list(catalog, models.line)
+        auxiliary = catalog.auxiliary_sets(models.features)
+        names = dict.fromkeys((PLAIN, models.features, *auxiliary))
         return tuple(
             fleet.gram(
                 name,
@@ -76,7 +76,7 @@ class Training:
         from fleet_slip.operations.marked_models import marked_models
 
         champion = fleet.registry().champion(self.name)
-        if champion is None or champion.reference in marked_models(fleet.root):
+        if champion is None or champion.reference in marked_models(fleet.warehouse):
             return None
         manifest = champion.manifest
         if not is_up_to_date(manifest, fleet.warehouse, self.cohort, self.models, self.worth):
@@ -117,7 +117,7 @@ class Training:
         force = (
             replace_marked
             and champion is not None
-            and champion.reference in marked_models(fleet.root)
+            and champion.reference in marked_models(fleet.warehouse)
         )
         try:
             published = fleet.publish(self.name, selection, force=force)

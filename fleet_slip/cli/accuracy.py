@@ -191,7 +191,10 @@ def explore(
     fleet.warehouse.require()
     words = ["edit" if edit else "run", str(folder("jobs") / "explore.py")]
     words += [*(["--port", str(port)] if port else []), *(["--headless"] if headless else [])]
-    command = [sys.executable, "-m", "marimo", *words, "--", "--root", str(fleet.root)]
+    opened = ["--root", str(fleet.root)]
+    if config := fleet.warehouse.configs.folder:
+        opened += ["--config", str(config)]
+    command = [sys.executable, "-m", "marimo", *words, "--", *opened]
     os.execv(command[0], command)  # noqa: S606 - the notebook takes the place of this process
 
 

@@ -10,7 +10,6 @@ from functools import cache, partial
 from importlib import import_module
 from importlib.abc import InspectLoader
 from importlib.util import find_spec
-from pathlib import Path
 from types import CodeType, FunctionType
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,8 +29,6 @@ from fleet_slip.errors import (
     is_lack_of_memory,
 )
 from fleet_slip.limits import memory_bytes
-from fleet_slip.resources import CONFIG_VARIABLE, own_configs
-from fleet_slip.storage.data_root import ROOT_VARIABLE
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
@@ -158,9 +155,9 @@ app = typer.Typer(
 )
 
 
-def _open(root: str | None) -> "Fleet":
+def _open(root: str | None, config: str | None) -> "Fleet":
     """Return the fleet of a command, when it runs: its help waits for no table."""
-    fleet = fleet_slip.open(root)
+    fleet = fleet_slip.open(root, config)
     _leave_pandas()
     return fleet
 
@@ -199,7 +196,7 @@ def options(
         str | None,
         typer.Option(
             help="Data root: a folder, or the URL of an object store such as s3://BUCKET/PATH. "
-            f"Default: ${ROOT_VARIABLE}, else ./data.",
+            "Default: $FLEET_SLIP_ROOT, else ./data.",
             show_default=False,
         ),
     ] = None,
@@ -207,7 +204,7 @@ def options(
         str | None,
         typer.Option(
             help="A folder of configs laid over the shipped ones (docs/configuration.md). "
-            f"Default: ${CONFIG_VARIABLE}.",
+            "Default: $FLEET_SLIP_CONFIG.",
             show_default=False,
         ),
     ] = None,
@@ -225,10 +222,7 @@ def options(
     With logs of your own: fleet-slip mapping suggest LOG, then fleet-slip learn
     """
     configure_remarks()
-    if config is not None:
-        os.environ[CONFIG_VARIABLE] = str(Path(config).absolute())
-    own_configs()
-    context.obj = partial(_open, root)
+    context.obj = partial(_open, root, config)
 
 
 def run_app() -> int:

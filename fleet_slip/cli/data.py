@@ -10,6 +10,7 @@ import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.cli.options import Cluster, command
 from fleet_slip.cli.output import Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -160,6 +161,7 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
 
 
 def mapping(
+    context: typer.Context,
     _action: Annotated[Literal["suggest"], typer.Argument(metavar="suggest", show_default=False)],
     file: Annotated[str, typer.Argument(help="A measured log.", show_default=False)],
     output: Annotated[
@@ -179,7 +181,7 @@ def mapping(
     """
     if output is not None and output.exists():
         raise UsageError(f"{output} exists. Choose another name, or remove it.")
-    draft, text = _draft(file, can)
+    draft, text = _draft(context.obj().warehouse.catalog.signals, file, can)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
     channels = [
         {
@@ -209,7 +211,7 @@ def mapping(
         print_parts(["\n" + text])
 
 
-def _draft(file: str, can: Path | None) -> "tuple[Draft, str]":
+def _draft(signals: SignalCatalog, file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return what a log suggests, and that as a mapping."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft  # noqa: PLC0415 - takes a while
     from fleet_slip.ingest.formats.can import CanBus, read_can_database  # noqa: PLC0415
@@ -220,5 +222,5 @@ def _draft(file: str, can: Path | None) -> "tuple[Draft, str]":
     logs = find_logs([file])
     if len(logs) > 1:
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
-    draft = draft_mapping(logs[0], profile_file(logs[0], bus))
+    draft = draft_mapping(signals, logs[0], profile_file(logs[0], bus))
     return draft, write_draft(draft, name_of(logs[0].stem))

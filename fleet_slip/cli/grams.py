@@ -1,6 +1,7 @@
 """Reducing logs to Gram rows, and what can be reduced: the commands gram and features."""
 
 from concurrent.futures import Executor
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -8,8 +9,9 @@ import typer
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN, FeatureCatalogue
-from fleet_slip.catalogue.features import features as known_features
+from fleet_slip.catalog.catalog import Catalog, FeatureSet
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
@@ -17,7 +19,7 @@ from fleet_slip.columns.sql import column_query
 from fleet_slip.config import read_named_file
 from fleet_slip.grams.compute import gram_statement, has_statement
 from fleet_slip.rendering import TextTable
-from fleet_slip.resources import config_files, folder, own_configs
+from fleet_slip.resources import Configs, folder
 
 if TYPE_CHECKING:
     from fleet_slip.grams.job import GramReport
@@ -47,8 +49,10 @@ def gram(
     """
     names = fleet.warehouse.feature_sets() if features == ALL_SETS else (features,)
     if sql:
-        for name in names if features != ALL_SETS else filter(has_statement, names):
-            typer.echo(gram_statement(name))
+        catalog = fleet.warehouse.catalog
+        for name in names:
+            if features != ALL_SETS or has_statement(catalog, name):
+                typer.echo(gram_statement(catalog, name))
         return
     with open_workers(fleet.root, cluster or threads) as executor:
         if cohort:  # which files have its drives is known from the logged signals' Gram rows
@@ -77,6 +81,7 @@ def _run_gram(
 
 
 def features(
+    context: typer.Context,
     sets: Annotated[
         bool, typer.Option("--sets", help="List the feature sets instead of the features.")
     ] = False,
@@ -102,24 +107,25 @@ def features(
 
     Example: fleet-slip features --sql ay_mean_16
     """
-    known = known_features()
-    named = {name: known.feature_set(name) for name in (PLAIN, *known.sets)}
+    catalog: Catalog = context.obj().warehouse.catalog
+    if files:
+        _print_files(catalog.configs, json)
+        return
+    named = {name: catalog.feature_set(name) for name in (PLAIN, *catalog.sets)}
     if sql is not None:
-        typer.echo(column_query(known, sql))
-    elif files:
-        _print_files(json)
+        typer.echo(column_query(catalog, sql))
     elif json:
         print_json(
             {
                 "windows": {
-                    name: one.model_dump(mode="json") for name, one in known.time_columns.items()
+                    name: one.model_dump(mode="json") for name, one in catalog.time_columns.items()
                 },
                 "features": {
                     name: {**one.model_dump(mode="json"), "sql": one.sql}
-                    for name, one in known.features.items()
+                    for name, one in catalog.features.items()
                 },
                 "sets": {
-                    name: {"identity": known.identity(name), **one.model_dump()}
+                    name: {"identity": catalog.identity(name), **_content_of(one)}
                     for name, one in named.items()
                 },
             }
@@ -128,36 +134,45 @@ def features(
         row = "{0}|{1.inputs}|{1.description}"
         print_parts([TextTable("", "set|columns|description", named.items(), row, left=3)])
     else:
-        shown: dict[str, Any] = {**known.features, **(known.time_columns if everything else {})}
+        shown: dict[str, Any] = dict(catalog.features)
+        if everything:
+            shown |= catalog.time_columns
         header, row = "column|unit|scale|description", "{0}|{1.unit}|{1.scale}|{1.description}"
         print_parts([TextTable("", header, shown.items(), row, left=4)])
         if not everything:
-            print_parts([_families(known)])
+            print_parts([_families(catalog)])
 
 
-def _families(known: FeatureCatalogue) -> TextTable:
+def _content_of(feature_set: FeatureSet) -> dict[str, Any]:
+    """Return what JSON says of a feature set: times in s, as the file states them."""
+    content = asdict(feature_set)
+    ticks = content.pop("block_ticks")
+    return {**content, "block_s": None if ticks is None else float(ticks * SAMPLE_TIME_S)}
+
+
+def _families(catalog: Catalog) -> TextTable:
     """Return columns over time by family: one by one they are hundreds."""
+    file = catalog.file
     families = [
         [name, " ".join(map(str, one.ticks or (0,))), one.description]
-        for name, one in known.windows.items()
+        for name, one in file.windows.items()
     ]
-    made = {**known.products, **known.estimates, **known.slopes}
-    single = {**made, **known.factors, **known.calibrated}
-    families += [[name, "", known.time_columns[name].description] for name in single]
-    families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in known.gates.items()]
-    many = number_of(len(known.time_columns), "column")
+    single = (*file.products, *file.estimates, *file.slopes, *file.factors, *file.calibrated)
+    families += [[name, "", file.time_columns[name].description] for name in single]
+    families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in file.gates.items()]
+    many = number_of(len(file.time_columns), "column")
     title = f"\n{many} over time; one by one: --all"
     return TextTable(title, "column|over ticks|description", families, left=3)
 
 
-def _print_files(json: bool) -> None:
-    own = own_configs()
+def _print_files(configs: Configs, json: bool) -> None:
+    own = configs.folder
     found = {
         name: {
             "from": "own" if own and str(file).startswith(str(own)) else "shipped",
             "path": str(file),
         }
-        for name, file in config_files().items()
+        for name, file in configs.files().items()
         if read_named_file(file)
     }
     if json:

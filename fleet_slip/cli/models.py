@@ -69,7 +69,7 @@ def show(version: ModelVersion, everything: All = False, json: Json = False) -> 
         facts = {
             "version": version.version,
             "sha256": version.sha256,
-            "on_board": costs_content(version.manifest),
+            "on_board": costs_content(version),
         }
         print_json({**facts, **content})
     else:
@@ -139,7 +139,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         "label noise": _label_noise(figures),
         "error std": f"{figures.error_std_deg:.4f} deg",
         "error mean": f"{figures.error_mean_deg:+.4f} deg",
-        "on board": describe_costs(manifest),
+        "on board": describe_costs(version),
         "cross-validation": f"{number_of(figures.folds, 'fold')} by {figures.folds_by}",
         "cohort": f"{describe_cohort(trained.cohort)}: {drives}",
         "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",

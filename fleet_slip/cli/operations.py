@@ -167,7 +167,7 @@ def forget(
 
 @command(Fleet.migrate)
 def migrate() -> None:
-    """Bring the data root to this program and to the signal catalogue: add columns.
+    """Bring the data root to this program and to the signal catalog: add columns.
 
     It can be repeated after any interruption.
 

@@ -48,6 +48,7 @@ READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "others": (list[str] | None, lambda names: names or ()),
     "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
     "scenarios": (list[str] | None, lambda names: names or ()),
+    "accept_loss": (list[str] | None, lambda paths: paths or ()),
     "since": (str | None, lambda since: date_of(since, "--since")),
     "through": (str | None, last_day),
 }

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from fleet_slip.base import document_of
+from fleet_slip.errors import printable
 from fleet_slip.rendering import FILE_WIDTH, Answer, Part, Remark, TextTable, wrap_lines
 from fleet_slip.storage.runs import LOGGER
 
@@ -45,7 +46,17 @@ def print_parts(parts: Iterable[Part]) -> None:
                 print_parts([part.title])
             _print(part.text(width, bold=terminal and os.environ.get("TERM") != "dumb"))
         else:
-            _print(wrap_lines(part, width) if terminal else part)
+            _print(wrap_lines(printable_lines(part), width) if terminal else part)
+
+
+def print_text(text: str) -> None:
+    """Print a text as it is, on a terminal without what the terminal would execute."""
+    _print(printable_lines(text) if sys.stdout.isatty() else text)
+
+
+def printable_lines(text: str) -> str:
+    """Return a text with escapes in place of unprintable characters, but with its lines."""
+    return "\n".join(map(printable, text.split("\n")))
 
 
 def print_answer(answer: Answer, json: bool, **chosen: Any) -> None:

@@ -18,7 +18,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
 from fleet_slip.base import number_of
 from fleet_slip.cli.options import command
-from fleet_slip.cli.output import Json, json_text, print_json, say
+from fleet_slip.cli.output import Json, json_text, print_json, print_text, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory, split_statements
 
@@ -95,9 +95,7 @@ def sql(
             if json:
                 print_json(session.table(statement).to_pylist())
             elif csv:
-                sys.stdout.flush()
-                _write_csv(session.table(statement), sys.stdout.buffer, exact)
-                sys.stdout.buffer.flush()
+                _print_csv(session.table(statement), exact)
             else:
                 _show(session, statement, everything)
 
@@ -124,6 +122,17 @@ def _write_csv(rows: pa.Table, to: Any, exact: bool) -> None:
     write_csv(rows if exact else _mark_formulas(rows), to)
 
 
+def _print_csv(rows: pa.Table, exact: bool) -> None:
+    if sys.stdout.isatty():
+        content = io.BytesIO()
+        _write_csv(rows, content, exact)
+        print_text(content.getvalue().decode().removesuffix("\n"))
+        return
+    sys.stdout.flush()
+    _write_csv(rows, sys.stdout.buffer, exact)
+    sys.stdout.buffer.flush()
+
+
 _CUT = re.compile(r"│ … │|\S… │|rows .*shown\)|columns .*shown\)")
 
 
@@ -132,7 +141,7 @@ def _show(session: Session, text: str, everything: bool) -> None:
     width = ENDLESS if everything else shutil.get_terminal_size((160, 40)).columns
     rows = ENDLESS if everything else ROWS_SHOWN
     shown = session.compute(text, lambda answer: _drawn(answer, width, rows))
-    typer.echo(shown)
+    print_text(shown)
     if _CUT.search(shown):
         say("output truncated. Select fewer columns, or: --all")
 

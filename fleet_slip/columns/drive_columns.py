@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.definitions import limit_of
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.kernel import GAPS, run
 from fleet_slip.columns.operations import CarFact
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region
@@ -55,7 +55,10 @@ class DriveCounts:
 
 
 def as_counts(
-    values: Mapping[str, FloatArray], names: Sequence[str], facts: Mapping[str, Any]
+    signals: SignalCatalog,
+    values: Mapping[str, FloatArray],
+    names: Sequence[str],
+    facts: Mapping[str, Any],
 ) -> DriveCounts:
     """Return the counts of some signals of a drive that has a row for every tick.
 
@@ -63,9 +66,9 @@ def as_counts(
     """
     counts, present = {}, {}
     for name in names:
-        given = values[catalogue()[name].column]
-        present[name] = np.isfinite(given)
-        scaled = np.where(present[name], given, 0.0) / float(catalogue()[name].scale)
+        column = values[signals[name].column]
+        present[name] = np.isfinite(column)
+        scaled = np.where(present[name], column, 0.0) / float(signals[name].scale)
         counts[name] = np.rint(scaled).astype(np.int64)
     ticks = np.arange(len(next(iter(counts.values()))))
     return DriveCounts(ticks, counts, present, facts)

@@ -12,8 +12,8 @@ from functools import reduce
 from itertools import combinations_with_replacement
 from typing import Any, Literal, TypeVar
 
-from fleet_slip.catalogue.arithmetic import nearest, parse, truncated
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.arithmetic import nearest, parse, truncated
+from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     LARGEST_FACT,
     WEIGHT,
@@ -27,8 +27,8 @@ from fleet_slip.catalogue.definitions import (
     Slope,
     limit_of,
 )
-from fleet_slip.catalogue.facts import CAR_NUMBERS
-from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.catalog.facts import CAR_NUMBERS
+from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.errors import QuestionError
 
 Step = tuple[str | int, ...]
@@ -210,7 +210,7 @@ def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
 
 # Lowers signals, features, windows, factors, gates and own numbers to steps: the one place.
 #
-# Columns are `fleet_slip.catalogue.definitions`, steps `fleet_slip.columns.operations`, once each.
+# Columns are `fleet_slip.catalog.definitions`, steps `fleet_slip.columns.operations`, once each.
 
 Key = TypeVar("Key", bound=Hashable)
 

@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course import COURSE, YAW_RATE
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COURSE, YAW_RATE
+from fleet_slip.catalog.definitions import (
     Definition,
     Slope,
     limit_of,
     plain_column,
     rows_behind,
 )
-from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
@@ -526,22 +525,22 @@ class ColumnPlan:
         return cls(tuple(names), rows_of(rows, windows), dict(windows))
 
     @classmethod
-    def of_set(cls, known: FeatureCatalogue, name: str, fold: str | None = None) -> "ColumnPlan":
+    def of_set(cls, catalog: Catalog, name: str, fold: str | None = None) -> "ColumnPlan":
         """Plan the columns of a feature set, the label last; of changes, what makes it.
 
-        For the `fold` see `FeatureCatalogue.definitions`.
+        For the `fold` see `Catalog.definitions`.
         """
-        one = known.feature_set(name)
-        features = known.rows(one.features)
-        inputs = (*one.signals, *one.features, *one.windows)
-        columns = (*inputs, COURSE, YAW_RATE) if one.change_ticks else one.columns
-        return cls.of(columns, features, known.definitions(name, fold))
+        feature_set = catalog.feature_set(name)
+        features = catalog.rows(feature_set.features)
+        inputs = (*feature_set.signals, *feature_set.features, *feature_set.windows)
+        changes = (*inputs, COURSE, YAW_RATE)
+        columns = changes if feature_set.change_ticks else feature_set.columns
+        return cls.of(columns, features, catalog.definitions(name, fold))
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The logged signals that are needed, in catalogue order."""
-        used = {name for row in self.rows.values() for name in row.signals}
-        return tuple(name for name in catalogue().signals if name in used)
+        """The logged signals that are needed, sorted."""
+        return tuple(sorted({name for row in self.rows.values() for name in row.signals}))
 
     @property
     def facts(self) -> tuple[str, ...]:

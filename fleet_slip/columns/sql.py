@@ -7,10 +7,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.catalogue.arithmetic import nearest_sql
-from fleet_slip.catalogue.definitions import LARGEST_FACT, Definition, rows_behind
-from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalog.arithmetic import nearest_sql
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import LARGEST_FACT, Definition, rows_behind
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
@@ -254,11 +254,11 @@ def _clips(steps: tuple[Step, ...], of: int, ends: Iterable[int]) -> set[int]:
 _SEPARATOR = ",\n            "
 
 
-def with_absent(rows: str, absent: Sequence[str]) -> str:
+def with_absent(signals: SignalCatalog, rows: str, absent: Sequence[str]) -> str:
     """Return a table expression with stored columns that none of its files has, as nulls."""
     if not absent:
         return rows
-    nulls = ", ".join(map(catalogue().null_sql, absent))
+    nulls = ", ".join(map(signals.null_sql, absent))
     return f"(SELECT *, {nulls} FROM {rows})"
 
 
@@ -305,18 +305,18 @@ def with_columns(
     return f"(SELECT *{exclude},\n            {_SEPARATOR.join(columns)}\n        FROM {rows})"
 
 
-def column_query(known: FeatureCatalogue, name: str) -> str:
+def column_query(catalog: Catalog, name: str) -> str:
     """Return the query of `log_counts` for a feature or windowed column. Raises `QuestionError`."""
-    definition = known.definition(name)
+    definition = catalog.definition(name)
     if definition is not None and definition.number is not None:
         raise QuestionError(
-            f"{name} is {known.calibrated[name].of} times {definition.number.name} of each car, in "
-            "counts: see fleet-slip features --sql of the one, and the view calibration."
+            f"{name} is {catalog.calibrated[name].of} times {definition.number.name} of each car, "
+            "in counts: see fleet-slip features --sql of the one, and the view calibration."
         )
-    if definition is not None and name not in known.features:
+    if definition is not None and name not in catalog.features:
         rows = with_columns("log_counts", {}, {name: definition})
-    elif name in known.features:
-        rows = with_columns("log_counts", known.rows([name]), {})
+    elif name in catalog.features:
+        rows = with_columns("log_counts", catalog.rows([name]), {})
     else:
         raise QuestionError(
             f"no feature, window or factor is called {name!r}. See: fleet-slip features"

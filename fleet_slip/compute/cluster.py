@@ -36,7 +36,7 @@ from distributed.versions import VersionMismatchWarning
 
 from fleet_slip.compute.tasks import LostTaskError
 from fleet_slip.errors import ClusterError, FleetSlipError, RefusedError, StorageError
-from fleet_slip.resources import folder, own_configs
+from fleet_slip.resources import folder
 from fleet_slip.storage.folder import Folder
 
 PACKAGES = (
@@ -298,12 +298,14 @@ def _version(package: str) -> str:
 
 
 def _sources_digest() -> str:
-    """Return a checksum of programs, statements and configs: a checkout may have been edited."""
+    """Return a checksum of programs, statements and shipped configs: a checkout may be edited.
+
+    Tasks carry the catalog of their warehouse, so that a worker needs no folder of configs.
+    """
     digest = sha256()
     package: Traversable = Path(__file__).parent.parent
-    own = own_configs()
     shipped = (folder("configs"), folder("jobs"), folder("warehouse"))
-    for entry in (package, *shipped, *([own] if own else [])):
+    for entry in (package, *shipped):
         for file in _shipped(entry):
             digest.update(f"{file.name}\n".encode())
             digest.update(file.read_bytes())

@@ -11,11 +11,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.evaluation.evaluator import Estimator, EvaluatedDrive, evaluate, pooled_statistics
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
-from fleet_slip.resources import config_file
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name
@@ -101,20 +102,22 @@ class BlindSet(Config):
         return Scenario.model_validate(content)
 
 
-def blind_scenarios(sha256: str) -> tuple[Scenario, ...]:
+def blind_scenarios(sha256: str, configs: Configs) -> tuple[Scenario, ...]:
     """Draw the blind drives of the model version with this hash."""
-    return load_config(config_file("blind.toml"), BlindSet).scenarios(int(sha256[:15], 16))
+    blind_set = load_config(configs.file("blind.toml"), BlindSet, configs)
+    return blind_set.scenarios(int(sha256[:15], 16))
 
 
 def evaluate_blind_drives(
-    sha256: str, estimators: Mapping[str, Estimator[TestDrive]]
+    catalog: Catalog, sha256: str, estimators: Mapping[str, Estimator[TestDrive]]
 ) -> list[dict[str, Any]]:
     """Evaluate estimators on the blind drives of a model version.
 
     Returns `results` by estimator over all drives together, then by class of road, by weather and
     by drive. The reference is the simulator's own, not quantised as in a log.
     """
-    runs = evaluate(simulate_drives(blind_scenarios(sha256)), estimators)
+    drives = simulate_drives(catalog.signals, blind_scenarios(sha256, catalog.configs))
+    runs = evaluate(drives, estimators)
     groups = {"all": list(runs)}
     for word in (0, -1):
         for run in runs:

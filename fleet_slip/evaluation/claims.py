@@ -543,7 +543,7 @@ def easily_implemented(report: ReportContext) -> Finding:
         report.signals <= MAX_MULTIPLICATIONS,
         f"an intercept and {report.signals} coefficients",
         "It has no state, no matrix and no iteration. The published model, "
-        f"{version.reference}, on board: {describe_costs(version.manifest)}.",
+        f"{version.reference}, on board: {describe_costs(version)}.",
     )
 
 

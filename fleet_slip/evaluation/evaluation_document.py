@@ -137,16 +137,17 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
 
 def evaluations_of(warehouse: Warehouse, kind: str = "") -> DocumentFolder:
     """Return the folder of stored evaluations; kind `measured` for those on measured drives."""
-    folder = warehouse.root / "evaluations"
-    return DocumentFolder(folder / kind if kind else folder)
+    return DocumentFolder(warehouse.root, f"evaluations/{kind}" if kind else "evaluations")
 
 
 def store_evaluation(documents: DocumentFolder, content: Mapping[str, Any]) -> Evaluation:
     """Append an evaluation unless the latest one is equal; return the stored one."""
 
     def attempt(newest: int) -> Document | None:
-        if newest and (latest := documents.read(newest)).sha256 == checksum(content):
-            return latest
+        if newest in documents.numbers():  # else its loss was accepted
+            latest = documents.read(newest)
+            if latest.sha256 == checksum(content):
+                return latest
         return documents.create(newest + 1, content)
 
     return Evaluation(**vars(documents.after_newest(attempt)))

@@ -15,7 +15,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
@@ -41,11 +41,12 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import Selection, select
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 TABLE_ONE = "table1"
@@ -73,12 +74,15 @@ class LinearEstimate:
 class PublishedEstimate:
     """A published model on counts, as on an ECU: the integers that its Gram rows are made of."""
 
+    signal_catalog: SignalCatalog
     predictor: Predictor
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick."""
         names = self.predictor.plan.signals
-        return self.predictor(as_counts(drive.signals, names, drive.vehicle_attributes))
+        return self.predictor(
+            as_counts(self.signal_catalog, drive.signals, names, drive.vehicle_attributes)
+        )
 
 
 @dataclass(frozen=True)
@@ -103,10 +107,11 @@ class TrainedModels:
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }
+        signals = version.catalog.signals
         bank: EstimatorBank = {}
         for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
             weights = {
-                catalogue()[signal].column: weight for signal, weight in model.model.weights.items()
+                signals[signal].column: weight for signal, weight in model.model.weights.items()
             }
             bank[name] = (
                 LinearEstimate(model.model.offset, weights),
@@ -120,7 +125,7 @@ class TrainedModels:
                 },
             )
         bank[version.reference] = (
-            PublishedEstimate(Predictor.of(manifest)),
+            PublishedEstimate(signals, Predictor.of(signals, manifest)),
             {
                 **common,
                 "published": version.reference,
@@ -144,7 +149,7 @@ class TrainedModels:
 def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
     """Fit Table I on a published model's cohort as it is now. Raises `DataError` if it is empty."""
     cohort = load_cohort(warehouse, version.manifest.trained_on.cohort)
-    models = load_model_list(TABLE_ONE)
+    models = load_model_list(warehouse.catalog, TABLE_ONE)
     return TrainedModels(version, select(cohort, models.model, models.folds))
 
 
@@ -371,7 +376,7 @@ class TuningDrives:
             "car": car.model_dump(mode="json"),
             "program": checksum_of_sources(),
         }
-        folder = DocumentFolder(self.warehouse.root / "tuned")
+        folder = DocumentFolder(self.warehouse.root, "tuned")
         documents = (folder.read(number).content for number in reversed(folder.numbers()))
         stored = next((content for content in documents if content["key"] == key), None)
         return stored or folder.append({"key": key, **self._tuned(car, executor)}).content
@@ -402,25 +407,27 @@ class TuningDrives:
                 classes.setdefault(model, []).append(replace(drive, car=None))
         for model, drives in sorted(classes.items()):
             chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
-            yield model, identify(Measured.of(load_vehicle(model)), chosen, executor)
+            car = load_vehicle(model, self.warehouse.configs)
+            yield model, identify(Measured.of(car), chosen, executor)
 
     @cached_property
     def drives(self) -> tuple[LabelledDrive, ...]:
         """The beginning of each drive, as filters meet it: with unknown biases."""
-        with connect(self.warehouse.root, query="SELECT 1 FROM log") as database:
+        signals, configs = self.warehouse.catalog.signals, self.warehouse.configs
+        with open_views(self.warehouse, "SELECT 1 FROM log") as database:
             return tuple(
                 replace(
-                    read_drive(database, name).beginning(TUNING_S * SAMPLE_RATE_HZ),
-                    car=class_car(model, mass_kg),
+                    read_drive(signals, database, name).beginning(TUNING_S * SAMPLE_RATE_HZ),
+                    car=class_car(model, mass_kg, configs),
                 )
                 for name, model, mass_kg in self.keys
             )
 
 
-def class_car(model: str, mass_kg: float | None) -> VehicleParameters | None:
+def class_car(model: str, mass_kg: float | None, configs: Configs) -> VehicleParameters | None:
     """Return the car of a class's file, with its stated mass; None without a file."""
     try:
-        car = load_vehicle(model)
+        car = load_vehicle(model, configs)
     except ConfigError:
         return None
     return car if mass_kg is None else car.with_sprung_mass(mass_kg)

@@ -14,8 +14,6 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
@@ -30,7 +28,7 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import Selection, SelectionPlan
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 # Segments of drives: a drive and a quarter of its time. All four quarters are a whole drive.
@@ -171,24 +169,25 @@ class Learner:
         drives: Sequence[HeldOutDrive],
     ) -> "Learner":
         """Prepare a model's recipe for the drives of a cohort. Raises as `load_cohort`."""
-        plan = SelectionPlan.of(request)
+        plan = SelectionPlan.of(warehouse.catalog, request)
         cohort = load_cohort(warehouse, predicate, plan.feature_set)
         return cls(plan, cohort, drives, warehouse)
 
     @cached_property
     def quarters(self) -> Cohort:
         """Gram rows of each quarter, each as a drive of its own."""
-        name = self.plan.feature_set
-        if features().feature_set(name).change_ticks:
+        catalog, name = self.warehouse.catalog, self.plan.feature_set
+        feature_set, label = catalog.feature_set(name), catalog.signals.label
+        if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
-        workspace = Workspace(ColumnPlan.of_set(features(), name))
-        parts = Parts.of_set(features().feature_set(name))
+        workspace = Workspace(ColumnPlan.of_set(catalog, name))
+        parts = Parts.of_set(feature_set)
         attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
         rows = [
             row
             for drive in self.drives
             for quarter in range(QUARTERS)
-            for row in _gram_rows(workspace, parts, drive, quarter, attributes[drive.name])
+            for row in _gram_rows(label, workspace, parts, drive, quarter, attributes[drive.name])
         ]
         schema = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
         return with_gram_rows(self.cohort, pa.Table.from_pylist(rows, schema=schema))
@@ -213,7 +212,9 @@ class Learner:
         """Train without held-out segments; return the chosen columns and the model."""
         selection = self.choose(held_out, prior)
         manifest = with_straight_intercept(self.warehouse, manifest_of(selection, "left_out"))
-        return [*selection.winner.model.signals], Predictor.of(manifest)
+        return [*selection.winner.model.signals], Predictor.of(
+            self.warehouse.catalog.signals, manifest
+        )
 
 
 _SUMS = pa.list_(pa.int64())
@@ -224,6 +225,7 @@ def _quarter_name(drive_id: str, quarter: int) -> str:
 
 
 def _gram_rows(
+    label: str,
     workspace: Workspace,
     parts: Parts,
     drive: HeldOutDrive,
@@ -231,7 +233,6 @@ def _gram_rows(
     attributes: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return the Gram rows of a quarter's labelled rows; columns look back beyond it."""
-    label = catalogue().label
     counts = counts_of(drive.rows, workspace.plan, attributes)
     labelled = counts.present.get(label, np.ones(len(drive.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (drive.quarter == quarter)}
@@ -258,9 +259,9 @@ def read_measured_drives(warehouse: Warehouse, cohort: Cohort) -> list[HeldOutDr
     trips = {row["drive_id"]: row["trip"] for row in cohort.drives.to_pylist()}
     drives: list[HeldOutDrive] = []
     query = "SELECT * FROM log_counts WHERE drive_id = $drive ORDER BY tick"
-    with connect(warehouse.root, query="SELECT 1 FROM log, log_counts") as database:
+    with open_views(warehouse, "SELECT 1 FROM log, log_counts") as database:
         for name in choose_evenly(sorted(trips), MAX_DRIVES):
-            drive = read_drive(database, name)
+            drive = read_drive(warehouse.catalog.signals, database, name)
             if np.isfinite(drive.sideslip_rad).any():
                 rows = database.sql(query, params={"drive": name}).to_arrow_table()
                 drives.append(HeldOutDrive(**vars(drive), rows=rows, trip=trips[name]))

@@ -20,7 +20,7 @@ from pydantic import Field, FiniteFloat, ValidationError
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import number_of, sha256_of
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, faults_of
 from fleet_slip.errors import DataError, UsageError
 from fleet_slip.evaluation import ekf

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation import yaw_rate_filter
 from fleet_slip.evaluation.evaluator import (
@@ -85,7 +85,7 @@ def evaluate_measured(
     """
     cohort = load_cohort(warehouse, predicate)
     drives = read_measured_drives(warehouse, cohort)
-    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None)
+    car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None, warehouse.configs)
     car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
     competition = Competition.collect(warehouse, versions, predicate, drives, car, executor)
     folds, kinds = folds_of(drives), folds_by_kind(drives)
@@ -208,6 +208,7 @@ class Competition:
         Calibration parameters of each car, for calibrated columns.
     """
 
+    catalog: Catalog
     drives: Sequence[HeldOutDrive]
     published: Mapping[str, Predictor]
     learners: Mapping[str, tuple[str, Learner]]
@@ -229,17 +230,17 @@ class Competition:
         executor: Executor,
     ) -> "Competition":
         """Collect Table I, the versions, and filters in the car if there is one."""
-        registry = Registry.of(warehouse)
+        catalog, registry = warehouse.catalog, Registry.of(warehouse)
         recipes = {
             f"table1/{row.name}": (FITTED, SelectionRequest(model=",".join(row.signals)))
-            for row in load_model_list(TABLE_ONE).model
+            for row in load_model_list(catalog, TABLE_ONE).model
         }
         published: dict[str, Predictor] = {}
         for version in versions:
             manifest, name = version.manifest, version.reference
             is_label_free = manifest.learned_from is not None
             if is_label_free or not find_seen(warehouse, registry, manifest, predicate).trained:
-                published[name] = Predictor.of(manifest)
+                published[name] = Predictor.of(catalog.signals, manifest)
             else:
                 recipes[name] = CHOSEN, recipe_of(version)[0]
         learners = {
@@ -247,7 +248,7 @@ class Competition:
             for name, (source, request) in recipes.items()
         }
         is_calibrated = any(model.plan.numbers for model in published.values()) or any(
-            features().feature_set(learner.plan.feature_set).calibrated
+            catalog.feature_set(learner.plan.feature_set).calibrated
             for _, learner in learners.values()
         )
         vehicle = car if isinstance(car, VehicleParameters) else None
@@ -255,7 +256,7 @@ class Competition:
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
             drives = [_moving(with_acceleration(drive, measured), measured) for drive in drives]
-        return cls(drives, published, learners, vehicle, measured, cars, executor)
+        return cls(catalog, drives, published, learners, vehicle, measured, cars, executor)
 
     def fit(self, held_out: Segments) -> FittedFold:
         """Fit, tune and identify without the held-out segments."""
@@ -309,7 +310,7 @@ class Competition:
         name, feature_set = learner.plan.request.prior, learner.plan.feature_set
         if name is None:
             return None
-        campaign = load_campaign(name)
+        campaign = load_campaign(name, self.catalog.configs)
         if self.measured and identified_prior(campaign):
             if identified is None:
                 raise DataError("the car of the prior cannot be identified without these drives.")
@@ -317,7 +318,7 @@ class Competition:
             campaign = campaign.model_copy(update={"plan": plan})
         key = campaign.digest, feature_set
         if key not in self._priors:
-            self._priors[key] = simulate_prior(campaign, feature_set, self.executor)
+            self._priors[key] = simulate_prior(self.catalog, campaign, feature_set, self.executor)
         return self._priors[key]
 
     def _tune(
@@ -368,7 +369,7 @@ class Competition:
 def prior_of(version: ModelVersion) -> Campaign | None:
     """Return the campaign of a version's prior, if it has one. Raises `ConfigError`."""
     name = recipe_of(version)[0].prior if version.manifest.prior else None
-    return load_campaign(name) if name else None
+    return load_campaign(name, version.catalog.configs) if name else None
 
 
 def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:

@@ -5,8 +5,8 @@ from typing import Any
 
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
 from fleet_slip.evaluation.test_drives import TestDrive
-from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
 
 MIN_COVERAGE = 0.99
 """Share of a drive's rows with an estimate below which an estimator does not compete."""
@@ -69,13 +69,14 @@ def _standing(
 
 def _same_as(scenario: Scenario, runs: Sequence[EvaluatedDrive[TestDrive]]) -> str | None:
     """Return the first of some drives that is the same to an estimator without GPS."""
-    key = _without_gps(scenario)
-    return next((run.name for run in runs if _without_gps(run.drive.scenario) == key), None)
+    gps = scenario.sensors.gps
+    key = _with_gps(gps, scenario)
+    return next((run.name for run in runs if _with_gps(gps, run.drive.scenario) == key), None)
 
 
-def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
-    """Return the properties of a scenario that matter to an estimator without GPS."""
-    sensors = scenario.sensors.model_copy(update={"gps": load_scenario("nominal").sensors.gps})
+def _with_gps(gps: Gps, scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
+    """Return what of a scenario matters to an estimator without GPS, all with the same GPS."""
+    sensors = scenario.sensors.model_copy(update={"gps": gps})
     drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
     failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
     return drive.digest, failures

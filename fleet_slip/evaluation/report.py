@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import MEASURED
+from fleet_slip.catalog.facts import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import Status, evaluate_claims
 from fleet_slip.evaluation.evaluation_document import evaluations_of
@@ -33,7 +33,7 @@ from fleet_slip.pages.page import (
     number,
     percent,
 )
-from fleet_slip.simulation.scenario import shipped_scenarios
+from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -50,9 +50,10 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     evaluated = latest_evaluation(warehouse, version)
     trained = train_models(warehouse, version)
     evaluated.require_models(trained)
-    shipped = shipped_scenarios()
+    shipped = load_scenarios(warehouse.configs)
     names = DRAWN_SCENARIOS.intersection(evaluated.scenarios)
-    drives = simulate_drives([scenario for scenario in shipped if scenario.name in names])
+    drawn = [scenario for scenario in shipped if scenario.name in names]
+    drives = simulate_drives(warehouse.catalog.signals, drawn)
     runs = {run.name: run for run in evaluate(drives, _drawn_estimators(evaluated))}
     evaluated.require_errors(runs)
     cohort, models = trained.selection.cohort, trained.selection.models

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.evaluation_document import evaluations_of
 from fleet_slip.evaluation.evaluator import ErrorStatistics, EvaluatedDrive
@@ -180,7 +179,7 @@ class SignalOrders:
 
 def compare_orders(cohort: Cohort, signals: Sequence[str]) -> SignalOrders:
     """Rank signals in every way and by subsets. Raises `DataError` if no drive has them all."""
-    label = catalogue().label
+    label = cohort.catalog.signals.label
     total = cohort.serving(signals).table.total()
     best = best_subsets(total, signals, label, count=1)
     threshold = best[-1].best.r_squared - NEGLIGIBLE_R_SQUARED

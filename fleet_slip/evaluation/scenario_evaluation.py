@@ -36,9 +36,10 @@ def train_competitors(
     bank: EstimatorBank = {}
     for models in trained:
         bank |= models.bank()
-    with_mass = "mass_kg" in Predictor.of(one_car.manifest).plan.facts
+    with_mass = "mass_kg" in Predictor.of(warehouse.catalog.signals, one_car.manifest).plan.facts
     drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
-    return trained, bank | filter_bank(drives, load_scenario("nominal").car, executor)
+    car = load_scenario("nominal", warehouse.configs).car
+    return trained, bank | filter_bank(drives, car, executor)
 
 
 def evaluate_scenarios(
@@ -51,7 +52,7 @@ def evaluate_scenarios(
     """Evaluate a model and its competitors on scenarios; return the document."""
     (first, *fleet_models), bank = train_competitors(warehouse, one_car, fleets, executor)
     estimators = {name: estimator for name, (estimator, _) in bank.items()}
-    runs = evaluate(simulate_drives(scenarios), estimators)
+    runs = evaluate(simulate_drives(warehouse.catalog.signals, scenarios), estimators)
     gps = {name for name, (_, about) in bank.items() if about.get("gps")}
     return {
         "format": 1,
@@ -83,7 +84,7 @@ def evaluate_blind(
         "package_version": package_version("fleet-slip"),
         "model": model.reference,
         "estimators": {name: about for name, (_, about) in bank.items()},
-        "drives": evaluate_blind_drives(model.sha256, estimators),
+        "drives": evaluate_blind_drives(warehouse.catalog, model.sha256, estimators),
     }
 
 

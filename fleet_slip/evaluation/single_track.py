@@ -13,7 +13,7 @@ import duckdb
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
@@ -74,9 +74,11 @@ class LabelledDrive:
         return replace(self, signals=DriveSignals(**arrays), sideslip_rad=self.sideslip_rad[:rows])
 
 
-def read_drive(database: duckdb.DuckDBPyConnection, drive_id: str) -> LabelledDrive:
+def read_drive(
+    signals: SignalCatalog, database: duckdb.DuckDBPyConnection, drive_id: str
+) -> LabelledDrive:
     """Read a drive from the view `log`. Raises `QuestionError` if there is no such drive."""
-    label = catalogue()[catalogue().label].column
+    label = signals[signals.label].column
     columns = [*(field.name for field in fields(DriveSignals)), label]
     with reading_files(database, f"reading the drive {drive_id!r}"):
         rows = database.execute(

@@ -11,7 +11,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.job import update_grams
@@ -40,7 +40,7 @@ class TestDrive:
     time_s
         Time since the drive began.
     signals
-        Signals that estimators may read, by SI column: the inputs of the catalogue and satellite
+        Signals that estimators may read, by SI column: the inputs of the catalog and satellite
         navigation; NaN where null.
     vx_mps, vy_mps
         True velocity of the centre of gravity.
@@ -119,9 +119,9 @@ class Section:
     rows: BoolArray
 
 
-def visible_signals() -> tuple[str, ...]:
+def visible_signals(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the names of the signals that an estimator may read: never a truth."""
-    return (*catalogue().inputs, *GPS_SIGNALS)
+    return (*signals.inputs, *GPS_SIGNALS)
 
 
 def simulate_scenarios(
@@ -138,30 +138,30 @@ def simulate_scenarios(
     return report
 
 
-def simulate_drives(scenarios: Sequence[Scenario]) -> tuple[TestDrive, ...]:
+def simulate_drives(signals: SignalCatalog, scenarios: Sequence[Scenario]) -> tuple[TestDrive, ...]:
     """Simulate the drives of scenarios with their failures; write nothing.
 
     Signals are those of the log, the truth is exact. A log quantises vy to 0.005 m/s, which at
     25 m/s is half the error of good estimates.
     """
     drives = {scenario.drive_id: scenario.batch().drives[0] for scenario in scenarios}
-    logs = dict(zip(drives, simulate_logs(list(drives.values()), MOTION), strict=True))
-    return tuple(_test_drive(scenario, logs[scenario.drive_id]) for scenario in scenarios)
+    logs = dict(zip(drives, simulate_logs(signals, list(drives.values()), MOTION), strict=True))
+    return tuple(_test_drive(signals, scenario, logs[scenario.drive_id]) for scenario in scenarios)
 
 
-def _test_drive(scenario: Scenario, log: DriveLog) -> TestDrive:
+def _test_drive(signals: SignalCatalog, scenario: Scenario, log: DriveLog) -> TestDrive:
     time_s = np.arange(log.rows) / SAMPLE_RATE_HZ
-    signals = {}
-    for name in visible_signals():
-        values = log.measurement.counts[name] * float(catalogue()[name].scale)
+    visible = {}
+    for name in visible_signals(signals):
+        values = log.measurement.counts[name] * float(signals[name].scale)
         missing = name in GPS_SIGNALS and ~log.measurement.gps_fix
-        signals[name] = np.where(missing, np.nan, values)
+        visible[name] = np.where(missing, np.nan, values)
     for failure in scenario.failures:
-        signals = apply_failure(signals, time_s, failure)
+        visible = apply_failure(visible, time_s, failure)
     return TestDrive(
         scenario=scenario,
         time_s=time_s,
-        signals={catalogue()[name].column: values for name, values in signals.items()},
+        signals={signals[name].column: values for name, values in visible.items()},
         **log.motion,
         lost_control_s=log.lost_control_s,
     )

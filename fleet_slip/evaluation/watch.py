@@ -13,8 +13,8 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray, float_column
-from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.definitions import Definition
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
@@ -22,13 +22,13 @@ from fleet_slip.evaluation.test_drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
-from fleet_slip.resources import config_names
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import MOTION
 from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
 
 if TYPE_CHECKING:
@@ -101,19 +101,19 @@ class DriveFrames:
         return replace(self, **changed)
 
 
-def is_scenario(name: str) -> bool:
+def is_scenario(name: str, configs: Configs) -> bool:
     """Return True for the name or path of a scenario, False for a drive."""
-    return name.endswith(".toml") or name in config_names("scenarios")
+    return name.endswith(".toml") or name in configs.names("scenarios")
 
 
 def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a drive of the logs. Raises `QuestionError`."""
-    names = [signal.column for signal in catalogue().signals.values()]
+    names = [signal.column for signal in warehouse.catalog.signals.signals.values()]
     query = (
         "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
         f"{', '.join(names)} FROM log"
     )
-    with connect(warehouse.root, query=query) as database:
+    with open_views(warehouse, query) as database:
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:
@@ -121,17 +121,20 @@ def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> 
             f"{drive_id!r} is neither a drive nor a scenario. See: "
             'fleet-slip sql "SELECT drive_id FROM drives"'
         )
-    traffic = _traffic_of(drive_id, rows["campaign"][0].as_py(), rows["day"][0].as_py())
+    campaign, day = rows["campaign"][0].as_py(), rows["day"][0].as_py()
+    traffic = _traffic_of(drive_id, campaign, day, warehouse.configs)
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
     return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
 
 
-def _traffic_of(drive_id: str, campaign: str | None, day: date) -> "TrafficDrive | None":
-    """Compute the traffic of a drive of a shipped campaign again."""
+def _traffic_of(
+    drive_id: str, campaign: str | None, day: date, configs: Configs
+) -> "TrafficDrive | None":
+    """Compute the traffic of a drive of a campaign again."""
     try:
-        drives = load_campaign(campaign or "").drives(day)
+        drives = load_campaign(campaign or "", configs).drives(day)
     except ConfigError:
         return None
     return next((drive.in_traffic for drive in drives if drive.drive_id == drive_id), None)
@@ -147,7 +150,7 @@ def frames_of(
 ) -> DriveFrames:
     """Return the frames of a drive. Raises `DataError` without a velocity.
 
-    The columns are those of the catalogue, shape (ticks,), NaN where null; `facts` are the model
+    The columns are those of the catalog, shape (ticks,), NaN where null; `facts` are the model
     and mass of the car, its `drive_id`, and its `track` if it has one.
     """
     frames = np.flatnonzero(
@@ -158,8 +161,8 @@ def frames_of(
     constants = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
     estimate = version.predict(pa.table({**constants, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
-    x, y, heading, track = _places(columns, facts, time_s, vx, vy, traffic)
-    gates = gates_on(version.manifest, columns, facts)
+    x, y, heading, track = _places(version.catalog.configs, columns, facts, time_s, vx, vy, traffic)
+    gates = gates_on(version.catalog.signals, version.manifest, columns, facts)
     return DriveFrames(
         title=title,
         model=version.reference,
@@ -201,6 +204,7 @@ def _smooth(values: FloatArray) -> FloatArray:
 
 
 def _places(
+    configs: Configs,
     columns: Mapping[str, FloatArray],
     facts: Mapping[str, Any],
     time_s: FloatArray,
@@ -211,7 +215,7 @@ def _places(
     """Return x, y and heading of the car, and the centre line of its track if it has one."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    track = traffic.profile.track if traffic else _load_track(facts.get("track"))
+    track = traffic.profile.track if traffic else _find_track(facts.get("track"), configs)
     if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
@@ -228,10 +232,10 @@ def _places(
     return x, y, heading, (empty, empty)
 
 
-def _load_track(name: str | None) -> Track | None:
-    """Return a track by name; None if no such track ships."""
+def _find_track(name: str | None, configs: Configs) -> Track | None:
+    """Return a track by name; None if its file is not here, as of a campaign by path."""
     try:
-        return load_track(name) if name else None
+        return load_track(name, configs) if name else None
     except ConfigError:
         return None
 
@@ -256,7 +260,10 @@ def _other_cars(
 
 
 def gates_on(
-    manifest: Manifest, signals: Mapping[str, FloatArray], facts: Mapping[str, Any]
+    signals: SignalCatalog,
+    manifest: Manifest,
+    columns: Mapping[str, FloatArray],
+    facts: Mapping[str, Any],
 ) -> Mapping[str, FloatArray]:
     """Return the opening of each gate by tick: 0 at the first knot, 1 at the last, linear."""
     gates: dict[str, tuple[Definition, set[int]]] = {}
@@ -274,10 +281,10 @@ def gates_on(
         {},
         {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},
     )
-    columns = compute_columns(plan, as_counts(signals, plan.signals, facts))
+    opening = compute_columns(plan, as_counts(signals, columns, plan.signals, facts))
     return {
         name: np.interp(column, sorted(knots), np.linspace(0, 1, len(knots)))
-        for (name, (_, knots)), column in zip(gates.items(), columns, strict=True)
+        for (name, (_, knots)), column in zip(gates.items(), opening, strict=True)
     }
 
 
@@ -324,8 +331,8 @@ def _listed(values: FloatArray, digits: int) -> list[float | None]:
 
 def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a test drive, which is simulated. Raises `ConfigError`."""
-    scenario = load_scenario(name)
-    (drive,) = simulate_drives([scenario])
+    scenario = load_scenario(name, version.catalog.configs)
+    (drive,) = simulate_drives(version.catalog.signals, [scenario])
     traffic = scenario.batch().drives[0].in_traffic
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
     facts = {**drive.vehicle_attributes, "track": scenario.way.name, "drive_id": scenario.drive_id}

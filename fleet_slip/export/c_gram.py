@@ -29,7 +29,8 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     BESIDE,
     COARSER,
     COLUMNS,
@@ -40,10 +41,10 @@ from fleet_slip.catalogue.course import (
     YAW_RATE,
     course_units,
 )
-from fleet_slip.catalogue.definitions import plain_column
-from fleet_slip.catalogue.facts import CALIBRATION, DELAY
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.definitions import plain_column
+from fleet_slip.catalog.facts import CALIBRATION, DELAY
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.operations import Lowering
 from fleet_slip.columns.sql import rows_of
 from fleet_slip.errors import RefusedError
@@ -76,11 +77,13 @@ class OnBoard:
     """A feature set as a car counts it.
 
     Attributes:
+        label: name of the label signal.
         of: the set.
         columns: of it that are counted.
         complete: whether rows that lack some of these, and tell nothing then, are left out.
     """
 
+    label: str
     of: CountedSet
     columns: tuple[str, ...]
     complete: bool = False
@@ -88,8 +91,8 @@ class OnBoard:
     @property
     def computed(self) -> tuple[str, ...]:
         """The columns that are computed at each tick; of changes, the others come from fixes."""
-        beside = (*BESIDE, catalogue().label) if self.of.times else ()
-        return tuple(name for name in self.columns if name not in beside)
+        from_fixes = (*BESIDE, self.label) if self.of.times else ()
+        return tuple(name for name in self.columns if name not in from_fixes)
 
     @property
     def kept_ticks(self) -> int:
@@ -107,28 +110,34 @@ class OnBoard:
         return [self.of.columns.index(name) for name in self.columns]
 
 
-def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
+def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     """Return what a car counts that has a model, the logged signals first.
 
     Raises `QuestionError` if the model's feature set is defined otherwise now, and `RefusedError`
     for one that cars cannot count.
     """
-    plain = _whole(PLAIN)
+    label, counted_set = catalog.signals.label, counted_sets(catalog)
+
+    def whole(name: str) -> OnBoard:
+        counted = counted_set[catalog.identity(name)]
+        return OnBoard(label, counted, counted.columns)
+
+    plain = whole(PLAIN)
     if manifest.learned_from is None:
         return (plain,)
-    name = features().name_of(manifest.trained_on.feature_set)
-    counted = counted_sets().get(features().identity(name))
+    name = catalog.name_of(manifest.trained_on.feature_set)
+    counted = counted_set.get(catalog.identity(name))
     if counted is None:
         raise RefusedError(f"cars cannot count the feature set {name}: it has too many columns.")
-    known = features().calibrated
-    wanted = {known[one].of if one in known else one for one in manifest.signals}
-    wanted |= {*COLUMNS, *BESIDE, catalogue().label}
-    columns = tuple(column for column in counted.columns if column in wanted)
-    over_time = [name for name in columns if name in features().time_columns]
+    calibrated = catalog.calibrated
+    used = {calibrated[one].of if one in calibrated else one for one in manifest.signals}
+    used |= {*COLUMNS, *BESIDE, label}
+    columns = tuple(column for column in counted.columns if column in used)
+    over_time = [name for name in columns if name in catalog.time_columns]
     unknown = [
         name
         for name in over_time
-        if any(part.fact for part in features().time_columns[name].definition.parts)
+        if any(part.fact for part in catalog.time_columns[name].definition.parts)
     ]
     if unknown or len(columns) > MOST_SIGNALS:
         has = unknown[0] if unknown else number_of(len(columns), "column")
@@ -136,42 +145,35 @@ def sets_on_board(manifest: Manifest) -> tuple[OnBoard, ...]:
             f"{manifest.name} has {has}: cars count up to {MOST_SIGNALS} columns of a feature set, "
             "and no properties of the car. Export without them: fleet-slip export NAME --to c"
         )
-    delay = _on_board_counted(DELAY)
-    telling = tuple(column for column in delay.columns if column in delay_columns())
-    told = OnBoard(delay, telling, complete=True)
-    sets = (plain, OnBoard(counted, columns), told, _whole(CALIBRATION))
+    delay = counted_set[catalog.identity(DELAY)]
+    of_delay = tuple(column for column in delay.columns if column in delay_columns())
+    delays = OnBoard(label, delay, of_delay, complete=True)
+    sets = (plain, OnBoard(label, counted, columns), delays, whole(CALIBRATION))
     if manifest.through_origin:
         return sets
-    base, levels = levels_of(manifest)
-    of = _on_board_counted(base)
-    there = {*levels, catalogue().label}
-    return (*sets, OnBoard(of, tuple(name for name in of.columns if name in there)))
+    base, levels = levels_of(catalog, manifest)
+    source = counted_set[catalog.identity(base)]
+    columns = tuple(name for name in source.columns if name in {*levels, label})
+    return (*sets, OnBoard(label, source, columns))
 
 
-def _whole(name: str) -> OnBoard:
-    return OnBoard(_on_board_counted(name), _on_board_counted(name).columns)
-
-
-def _on_board_counted(name: str) -> CountedSet:
-    return counted_sets()[features().identity(name)]
-
-
-def lower(sets: Sequence[OnBoard]) -> tuple[Steps, Mapping[str, int]]:
+def lower(catalog: Catalog, sets: Sequence[OnBoard]) -> tuple[Steps, Mapping[str, int]]:
     """Return the steps of all columns, and the step of each by its name."""
-    known, signals = features(), catalogue()
     used = {name for one in sets for name in one.of.signals}
     names = dict.fromkeys(name for one in sets for name in one.computed)
     if any(one.of.times for one in sets):
         names |= dict.fromkeys((COURSE, YAW_RATE))
     windows = {
-        name: known.time_columns[name].definition for name in names if name in known.time_columns
+        name: catalog.time_columns[name].definition
+        for name in names
+        if name in catalog.time_columns
     }
     single = {name: plain_column(name) for name in names if name not in windows}
-    rows = rows_of(single | known.rows(names), windows)
+    rows = rows_of(single | catalog.rows(names), windows)
     used &= {signal for row in rows.values() for signal in row.signals}
     inputs = tuple(
         Input(name, one.column, one.unit, one.scale, one.min_count, one.max_count)
-        for name, one in signals.signals.items()
+        for name, one in catalog.signals.signals.items()
         if name in used
     )
     lowered = Lowering({one.name: place for place, one in enumerate(inputs)})
@@ -191,22 +193,22 @@ MOST_PARTS = 4
 _HELPER = re.compile(r"^static \w+ (\w+)\(", re.MULTILINE)
 
 
-def c_gram_header(prefix: str, sets: Sequence[OnBoard]) -> str:
+def c_gram_header(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> str:
     """Return the header: what is kept, and the functions."""
-    return fill_template("templates/gram.h", **_words(prefix, sets))
+    return fill_template("templates/gram.h", **_words(catalog, prefix, sets))
 
 
-def c_gram_source(prefix: str, sets: Sequence[OnBoard]) -> str:
+def c_gram_source(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> str:
     """Return the source that goes with the header."""
-    text = fill_template("templates/gram.c", **_words(prefix, sets))
+    text = fill_template("templates/gram.c", **_words(catalog, prefix, sets))
     for name in _HELPER.findall(text):  # the model's own functions may have these names
         text = re.sub(rf"\b{name}\(", f"gram_{name}(", text)
     return text
 
 
-def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
+def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
     """Return the words of the templates of header and source."""
-    steps, places = lower(sets)
+    steps, places = lower(catalog, sets)
     writer = StepWriter(steps)
     changed = [(number, one) for number, one in enumerate(sets) if one.of.times]
     rows = [[writer.kept(places[name]) for name in one.computed] for one in sets]
@@ -237,7 +239,7 @@ def _words(prefix: str, sets: Sequence[OnBoard]) -> Mapping[str, Any]:
         "counted": _counted(sets, parts, numbers),
     }
     if changed:
-        words |= _words_of_changes(steps, writer, places, sets, changed)
+        words |= _words_of_changes(catalog.signals, steps, writer, places, sets, changed)
     words |= {"lines": [*writer.lines, *words.get("keeps", ())], "helpers": helper_texts(writer)}
     return words
 
@@ -262,6 +264,7 @@ def _counted(
 
 
 def _words_of_changes(
+    signals: SignalCatalog,
     steps: Steps,
     writer: StepWriter,
     places: Mapping[str, int],
@@ -269,7 +272,7 @@ def _words_of_changes(
     changed: Sequence[tuple[int, OnBoard]],
 ) -> dict[str, Any]:
     """Return the words of what counts changes of columns from fix to fix."""
-    units, track = course_units(), max(one.kept_ticks for _, one in changed)
+    units, track = course_units(signals), max(one.kept_ticks for _, one in changed)
     course, yaw_rate = (writer.kept(places[name]) for name in (COURSE, YAW_RATE))
     keeps = keep_lines(steps, writer)
     writer.done["nearest_64"] += 1

@@ -10,7 +10,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
@@ -18,14 +19,15 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 
 
-def compile_program(manifest: Manifest) -> Program:
+def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
     """Return what a published version computes.
 
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    _ = Predictor.of(manifest).plan.program  # raises for what the kernel could not compute
-    return write_program(manifest)
+    # Raises for what the kernel could not compute.
+    _ = Predictor.of(catalog.signals, manifest).plan.program
+    return write_program(catalog, manifest)
 
 
 # Checks of a program that travel with it: ticks of made-up drives, and the angles.
@@ -61,7 +63,7 @@ class Check:
     angles: tuple[int | None, ...]
 
 
-def make_checks(manifest: Manifest, program: Program) -> tuple[Check, ...]:
+def make_checks(signals: SignalCatalog, manifest: Manifest, program: Program) -> tuple[Check, ...]:
     """Return a smooth drive and hostile ones, each with the angle at every tick."""
     hostile = _hostile_car(program)
     drives: dict[str, tuple[Car, Iterable[Sample]]] = {
@@ -71,15 +73,20 @@ def make_checks(manifest: Manifest, program: Program) -> tuple[Check, ...]:
         "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
     }
     return tuple(
-        _check(manifest, program, name, car, samples) for name, (car, samples) in drives.items()
+        _check(signals, manifest, program, name, car, samples)
+        for name, (car, samples) in drives.items()
     )
 
 
 def angles_by_kernel(
-    manifest: Manifest, program: Program, car: Car, samples: Sequence[Sample]
+    signals: SignalCatalog,
+    manifest: Manifest,
+    program: Program,
+    car: Car,
+    samples: Sequence[Sample],
 ) -> list[int | None]:
     """Return the angle of each tick, by the columns of the kernel and exact integers."""
-    predictor = Predictor.of(manifest)
+    predictor = Predictor.of(signals, manifest)
     drive = drive_counts(program, predictor, car, samples)
     return angles_of_columns(program, compute_columns(predictor.plan, drive))
 
@@ -120,10 +127,15 @@ def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
 
 
 def _check(
-    manifest: Manifest, program: Program, name: str, car: Car, samples: Iterable[Sample]
+    signals: SignalCatalog,
+    manifest: Manifest,
+    program: Program,
+    name: str,
+    car: Car,
+    samples: Iterable[Sample],
 ) -> Check:
     ticks = tuple(samples)
-    angles = tuple(angles_by_kernel(manifest, program, car, ticks))
+    angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
     counts = car.fact_counts(program), car.number_counts(program)
     return Check(name, car.facts, *counts, ticks, angles)
 

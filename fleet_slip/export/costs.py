@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.base import Record, number_of
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c import StepWriter, state_bytes, step_lines
 from fleet_slip.export.program import Program, write_program
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.registry import ModelVersion
 
 COEFFICIENT_BYTES = 8
 """Two words of 32 bits."""
@@ -62,9 +64,9 @@ class Costs(Record):
         )
 
 
-def cost_on_board(manifest: Manifest) -> Costs:
+def cost_on_board(catalog: Catalog, manifest: Manifest) -> Costs:
     """Count what a published version costs. Raises what `write_program` raises."""
-    return count_costs(write_program(manifest))
+    return count_costs(write_program(catalog, manifest))
 
 
 def count_costs(program: Program) -> Costs:
@@ -88,18 +90,18 @@ def count_costs(program: Program) -> Costs:
     )
 
 
-def describe_costs(manifest: Manifest) -> str:
+def describe_costs(version: ModelVersion) -> str:
     """Return what a version costs in words; or why it cannot run on board."""
     try:
-        return str(cost_on_board(manifest))
+        return str(cost_on_board(version.catalog, version.manifest))
     except FleetSlipError as error:
         return f"cannot be exported: {error}"
 
 
-def costs_content(manifest: Manifest) -> dict[str, Any]:
+def costs_content(version: ModelVersion) -> dict[str, Any]:
     """Return the same for a JSON document: what it costs, or `error`."""
     try:
-        return cost_on_board(manifest).as_dict()
+        return cost_on_board(version.catalog, version.manifest).as_dict()
     except FleetSlipError as error:
         return {"error": str(error)}
 

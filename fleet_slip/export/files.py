@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.definitions import LARGEST_FACT
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.definitions import LARGEST_FACT
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.columns.operations import CarFact
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
@@ -180,8 +180,8 @@ def export_files(
 def _subject(
     version: ModelVersion, warehouse: Warehouse | None, *, with_gram: bool = False
 ) -> Subject:
-    program = compile_program(version.manifest)
-    checks = make_checks(version.manifest, program)
+    program = compile_program(version.catalog, version.manifest)
+    checks = make_checks(version.catalog.signals, version.manifest, program)
     drives = None
     if warehouse is not None:
         drives = Registry.of(warehouse).trained_drives(version.manifest).content
@@ -208,11 +208,11 @@ def _json(subject: Subject) -> dict[str, str]:
 def _c(subject: Subject) -> dict[str, str]:
     version, program = subject.version, subject.program
     prefix = c_prefix(version)
-    sets = sets_on_board(version.manifest) if subject.with_gram else ()
+    sets = sets_on_board(version.catalog, version.manifest) if subject.with_gram else ()
     gram = (
         {
-            f"{prefix}_gram.h": c_gram_header(prefix, sets),
-            f"{prefix}_gram.c": c_gram_source(prefix, sets),
+            f"{prefix}_gram.h": c_gram_header(version.catalog, prefix, sets),
+            f"{prefix}_gram.c": c_gram_source(version.catalog, prefix, sets),
         }
         if sets
         else {}

@@ -4,30 +4,35 @@ import json
 from pathlib import Path
 from typing import Any
 
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import predict
+from fleet_slip.warehouse.tables import open_warehouse
 
 
 class LoggedVersion:
     """A version as a pyfunc model.
 
     Attributes:
+        signals: of the configs that the environment names, else the shipped ones.
         manifest: of the version.
     """
 
-    def __init__(self, manifest: Manifest) -> None:
-        """Take a manifest."""
+    def __init__(self, signals: SignalCatalog, manifest: Manifest) -> None:
+        """Take the signals and a manifest."""
+        self.signals = signals
         self.manifest = manifest
 
     def predict(self, model_input: Any, params: Any = None) -> Any:  # noqa: ARG002 - MLflow passes it
         """Return a frame with the angle in rad of each row; raises what `predict` raises."""
-        angles = predict(self.manifest, model_input)
+        angles = predict(self.signals, self.manifest, model_input)
         return angles.to_frame()
 
 
 def _load_pyfunc(path: str) -> LoggedVersion:
     """Return the model of an exported document; MLflow calls it."""
     content = json.loads(Path(path).read_text("utf-8"))
-    manifest = parse_document(content["model"]["manifest"], Manifest, path, "its manifest")
-    return LoggedVersion(manifest)
+    signals = open_warehouse().catalog.signals
+    manifest = content["model"]["manifest"]
+    return LoggedVersion(signals, parse_document(manifest, Manifest, path, "its manifest", signals))

@@ -19,7 +19,6 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.operations import (
     GIVEN,
     POWERS,
@@ -138,8 +137,8 @@ def error_bound(version: ModelVersion, program: Program, kind: FloatName) -> flo
 
 def _radians(version: ModelVersion) -> list[Fraction]:
     """Return the intercept, and the coefficients of counts, in the unit of the angle."""
-    exact = version.manifest.counts_model()
-    unit = Fraction(catalogue()[version.manifest.label.signal].scale)
+    exact = version.manifest.counts_model(version.catalog)
+    unit = Fraction(version.catalog.signals[version.manifest.label.signal].scale)
     return [one * unit for one in (exact.intercept, *exact.coefficients)]
 
 

@@ -13,9 +13,10 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Literal
 
-from fleet_slip.catalogue.arithmetic import parse
-from fleet_slip.catalogue.definitions import plain_column
-from fleet_slip.catalogue.signals import COUNT_MAX, catalogue
+from fleet_slip.catalog.arithmetic import parse
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import plain_column
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
     CarCount,
     CarFact,
@@ -249,24 +250,24 @@ UNKNOWN_CAR = Car({}, {})
 """A car of which nothing is known."""
 
 
-def write_program(manifest: Manifest) -> Program:
+def write_program(catalog: Catalog, manifest: Manifest) -> Program:
     """Return the program of definitions that are known to agree.
 
     Raises `RefusedError` if counts mean something else now, or no bound of the error can be stated,
     and `DataError` for a feature of no signal.
     """
-    signals = _inputs(manifest)
+    signals = _inputs(catalog.signals, manifest)
     columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
     lowered, places = Lowering.of([one.name for one in signals], columns)
     steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
     ranges = lowered.ranges([(one.min_count, one.max_count) for one in signals])
-    exact = manifest.counts_model()
+    exact = manifest.counts_model(catalog)
     fixed = fixed_point(
         exact.intercept * OUTPUT_COUNTS,
         [one * OUTPUT_COUNTS for one in exact.coefficients],
         [size_of(ranges[place]) for place in places],
     )
-    label = catalogue()[manifest.label.signal]
+    label = catalog.signals[manifest.label.signal]
     angle = Angle(
         name=manifest.label.signal,
         column=label.column,
@@ -279,7 +280,7 @@ def write_program(manifest: Manifest) -> Program:
     return Program(signals, facts, numbers, steps, angle)
 
 
-def _inputs(manifest: Manifest) -> tuple[Input, ...]:
+def _inputs(signals: SignalCatalog, manifest: Manifest) -> tuple[Input, ...]:
     used: set[str] = set()
     for term in manifest.terms:
         parts = term.definition.parts if term.definition else (term,)
@@ -289,6 +290,6 @@ def _inputs(manifest: Manifest) -> tuple[Input, ...]:
     return tuple(
         # -32768 is a missing count on board, so that a cyclic signal lacks its half turn there.
         Input(name, s.column, s.unit, s.scale, max(s.min_count, -COUNT_MAX), s.max_count)
-        for name, s in catalogue().signals.items()
+        for name, s in signals.signals.items()
         if name in used
     )

@@ -3,7 +3,7 @@
 DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a layer of its own.
 """
 
-from fleet_slip.catalogue.signals import COUNT_MAX
+from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.columns.sql import PLAIN_SQL, SqlLayers, fact_sql
 from fleet_slip.export.program import Program
 from fleet_slip.export.templating import fill_in_version

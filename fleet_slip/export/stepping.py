@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping
 from fractions import Fraction
 from typing import Any
 
-from fleet_slip.catalogue.arithmetic import COMPUTED, nearest
-from fleet_slip.catalogue.facts import round_number
+from fleet_slip.catalog.arithmetic import COMPUTED, nearest
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import round_number
 from fleet_slip.columns.operations import operation_of, plain_of, power
 from fleet_slip.errors import InputError
 from fleet_slip.export.compile import compile_program
@@ -35,12 +36,14 @@ class Estimator:
         columns: names in SI units that a sample has.
     """
 
-    def __init__(self, manifest: Manifest, car: Mapping[str, Any] | None = None) -> None:
+    def __init__(
+        self, catalog: Catalog, manifest: Manifest, car: Mapping[str, Any] | None = None
+    ) -> None:
         """Take a version, and what is known of the car: facts, and numbers in SI units, by name.
 
         Raises `InputError` for what the version does not use, and what `compile_program` raises.
         """
-        self._program = program = compile_program(manifest)
+        self._program = program = compile_program(catalog, manifest)
         known = _known(manifest, program, car or {})
         self.columns = tuple(one.column for one in program.signals)
         self._manifest = manifest

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 from fleet_slip.base import sha256_of
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.export.program import Program, Steps
 from fleet_slip.models.registry import ModelVersion
 

@@ -22,19 +22,18 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import COLUMNS, turned_scale
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COLUMNS, TURNED, turned_scale
+from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import (
     KINDS,
     LACKING,
     LASTING_BY_SATELLITE,
     CarEstimate,
+    CarTerms,
     Estimates,
     bank_of_bends,
-    course_terms,
     estimate_numbers,
     kinds_by_set,
 )
@@ -185,12 +184,12 @@ BEYOND = "it is outside the range of 16 bits"
 class CarEvidence:
     """Sums of the drives of all cars, and the variance of residuals as drives differ."""
 
-    def __init__(self, sums: Mapping[str, DriveSums]) -> None:
+    def __init__(self, catalog: Catalog, sums: Mapping[str, DriveSums]) -> None:
         """Take the sums by kind of plane, and learn the variances."""
-        self.sums = sums
+        self.sums, self._terms = sums, CarTerms(catalog)
         self._moments = {kind: one.table.moments() for kind, one in sums.items()}
         self.cars = sorted({car for one in sums.values() for car in one.cars})
-        banks = [bank_of_bends(self._totals(self.slices(car))) for car in self.cars]
+        banks = [bank_of_bends(self._terms, self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])
         self._whole = {car: self._estimate(self.slices(car)) for car in self.cars}
         self.estimates = {car: _known(whole) for car, whole in self._whole.items()}
@@ -213,7 +212,7 @@ class CarEvidence:
         totals = self._totals(self.slices(car))
         if not (course := totals.get("course")):
             return [Fraction(0) for _ in terms]
-        sums = ExactSums(course, course_terms())
+        sums = ExactSums(course, self._terms.course)
         return [sums.mean(term) for term in terms]
 
     def _totals(self, slices: Mapping[str, slice]) -> dict[str, Gram]:
@@ -228,7 +227,7 @@ class CarEvidence:
         return _known(self._estimate(slices))
 
     def _estimate(self, slices: Mapping[str, slice]) -> Estimates:
-        return estimate_numbers(self._totals(slices), self._banked)
+        return estimate_numbers(self._terms, self._totals(slices), self._banked)
 
     def influence(self, estimate: CarEstimate, at: slice) -> tuple[FloatArray, FloatArray] | None:
         """Return how far drives move a number, and their shares of its variance."""
@@ -496,12 +495,12 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
     With those of the sets that satellites determine more by, as far as there are any.
     """
     sums = collect_sums(opened.batches(condition), KINDS, lacking=LACKING)
-    known = features()
-    for name, kinds in kinds_by_set().items():
-        if name in known.sets:
-            beside = replace(opened, identity=known.identity(name))
-            sums |= collect_sums(beside.batches(condition), kinds)
-    evidence = CarEvidence(sums)
+    catalog = opened.catalog
+    for name, kinds in kinds_by_set(catalog.signals.label).items():
+        if name in catalog.sets:
+            satellite = replace(opened, identity=catalog.identity(name))
+            sums |= collect_sums(satellite.batches(condition), kinds)
+    evidence = CarEvidence(catalog, sums)
     cars: dict[str, dict[NumberName, CalibratedNumber]] = {}
     missing: dict[str, dict[NumberName, str]] = {}
     for car in evidence.cars:
@@ -523,16 +522,19 @@ def calibrate(
     `QuestionError` for an invalid condition, and `DataError` if no drive satisfies it or the Gram
     rows of `calibration` are missing.
     """
-    condition = parse_condition(condition)
+    catalog = source.catalog
+    condition = parse_condition(catalog.signals, condition)
     with open_grams(source, CALIBRATION, condition) as opened:
-        found = calibration_of(opened, condition)
-        if receivers and DELAY in features().sets:
-            of_delay = replace(opened, identity=features().identity(DELAY))
-            found = replace(found, receivers=receiver_delays(of_delay.batches(condition)))
-    if not found.cars:
+        calibration = calibration_of(opened, condition)
+        if receivers and DELAY in catalog.sets:
+            delays = receiver_delays(
+                replace(opened, identity=catalog.identity(DELAY)).batches(condition)
+            )
+            calibration = replace(calibration, receivers=delays)
+    if not calibration.cars:
         of = "" if condition.text == ALL_DRIVES else f" of {condition.shown}"
         raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
-    return found
+    return calibration
 
 
 # What the course of each drive comes to, from the Gram rows of any set of changes of it.
@@ -546,20 +548,20 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
 
     Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
     """
-    label = catalogue().label
-    known = {name: float(scale) for name, scale in input_scales().items()}
-    known |= {COLUMNS[-1]: turned_scale(), label: float(catalogue()[label].scale)}
-    columns = (*COLUMNS, label)
-    scales = np.array([1.0, *(known[name] for name in columns)])
-    for name in features().sets:
-        one = features().feature_set(name)
-        if one.change_ticks and set(COLUMNS) <= set(one.columns):
+    catalog = reader.catalog
+    columns = (*COLUMNS, catalog.signals.label)
+    scale_of: dict[str, Fraction | float] = {**catalog.input_scales}
+    scale_of[TURNED] = turned_scale(catalog.signals)
+    scales = np.array([1.0, *(float(scale_of[name]) for name in columns)])
+    for name in catalog.sets:
+        feature_set = catalog.feature_set(name)
+        if feature_set.change_ticks and set(COLUMNS) <= set(feature_set.columns):
             try:
                 opened = reader.opened(name, condition)
             except DataError:  # it has not been computed, or not for all
                 continue
-            found = collect_sums(opened.batches(condition), {"course": columns}, unnamed=True)
-            if sums := found.get("course"):
+            by_kind = collect_sums(opened.batches(condition), {"course": columns}, unnamed=True)
+            if sums := by_kind.get("course"):
                 moments = sums.table.moments() * np.outer(scales, scales)
                 return {
                     car: {sums.drives[i][2]: moments[i] for i in range(at.start, at.stop)}

@@ -12,18 +12,17 @@ it is taken out of their squares.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from functools import cache
+from functools import cached_property
 
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     FEWEST_CHANGES,
     LEAST_TURNED_RAD,
     LEVERS_M,
     TURNED,
     turned_scale,
 )
-from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, NumberName
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
 
@@ -118,33 +117,39 @@ LACKING = {STANDSTILL: "slowness"}
 """Column whose rows are not of a kind."""
 
 
-def _si(**weights: int) -> dict[str, Fraction]:
-    scales = input_scales()
-    return {name: weight * scales[name] for name, weight in weights.items()}
+@dataclass(frozen=True)
+class CarTerms:
+    """The terms of the relations, in SI units: sums of columns of a catalog."""
+
+    catalog: Catalog
+
+    def si(self, **weights: int) -> dict[str, Fraction]:
+        """Return the term of weighted columns."""
+        scales = self.catalog.input_scales
+        return {name: weight * scales[name] for name, weight in weights.items()}
+
+    @cached_property
+    def course(self) -> Terms:
+        """The terms of the relations of course and wheels."""
+        speed = self.catalog.input_scales["speed"] / 4
+        return {
+            **{name: self.si(**{name: 1}) for name in ("yaw_rate", "ay", *_COURSE[-3:])},
+            "speed": dict.fromkeys(WHEEL_SPEEDS, speed),
+            "wheels": self.si(wheel_rr=1, wheel_rl=-1, wheel_fr=1, wheel_fl=-1),
+        }
+
+    def steering(self, yaw_rate_offset: Fraction) -> Terms:
+        """Return the terms of the relation of steering."""
+        slowness = {name: -yaw_rate_offset * w for name, w in self.si(slowness=1).items()}
+        steer = self.si(steer_fl=1, steer_fr=1)
+        return {
+            **self.course,
+            "steer": {name: weight / 2 for name, weight in steer.items()},
+            "bend": {**self.si(curvature=1), **slowness},
+        }
 
 
-@cache
-def course_terms() -> Terms:
-    """Return the terms of the relations of course and wheels."""
-    speed = input_scales()["speed"] / 4
-    return {
-        **{name: _si(**{name: 1}) for name in ("yaw_rate", "ay", *_COURSE[-3:])},
-        "speed": dict.fromkeys(WHEEL_SPEEDS, speed),
-        "wheels": _si(wheel_rr=1, wheel_rl=-1, wheel_fr=1, wheel_fl=-1),
-    }
-
-
-def steering_terms(yaw_rate_offset: Fraction) -> Terms:
-    """Return the terms of the relation of steering."""
-    slowness = {name: -yaw_rate_offset * w for name, w in _si(slowness=1).items()}
-    return {
-        **course_terms(),
-        "steer": {name: weight / 2 for name, weight in _si(steer_fl=1, steer_fr=1).items()},
-        "bend": {**_si(curvature=1), **slowness},
-    }
-
-
-def estimate_numbers(sums: Mapping[str, Gram], banked: bool) -> Estimates:
+def estimate_numbers(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> Estimates:
     """Return the numbers that the sums of a car's drives determine, by kind; exactly.
 
     `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
@@ -152,55 +157,57 @@ def estimate_numbers(sums: Mapping[str, Gram], banked: bool) -> Estimates:
     evenly to separate it from noise. What satellites determine replaces what its own sensors do,
     and the bias at standstill both.
     """
-    found = _by_own_sensors(sums, banked)
-    return found | _speed_ratio(sums) | _slip(sums) | _standstill(sums)
+    estimates = _by_own_sensors(terms, sums, banked)
+    satellite = _speed_ratio(terms, sums) | _slip(terms, sums)
+    return estimates | satellite | _standstill(terms, sums)
 
 
-def _by_own_sensors(sums: Mapping[str, Gram], banked: bool) -> Estimates:
+def _by_own_sensors(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> Estimates:
     course, steering = sums.get("course"), sums.get("steering")
     every = (*OF_COURSE, *OF_STEERING)
     if course is None or course.n == 0:
         return dict.fromkeys(every, NO_COURSE)
-    of_course = ExactSums(course, course_terms())
-    noise = gyroscope_noise(course, steering)
+    of_course = ExactSums(course, terms.course)
+    noise = gyroscope_noise(terms, course, steering)
     if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
         return dict.fromkeys(every, STRAIGHT)
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
         return dict.fromkeys(every, EVEN)
-    of_plane = _estimate_course(of_course, noise if banked else None)
+    of_plane = _estimate_course(terms, of_course, noise if banked else None)
     if isinstance(of_plane, str):
         return dict.fromkeys(every, of_plane)
-    found: Estimates = {**of_plane}
+    estimates: Estimates = {**of_plane}
     if steering is None or steering.n == 0:
-        found |= dict.fromkeys(OF_STEERING, NO_STEERING)
+        estimates |= dict.fromkeys(OF_STEERING, NO_STEERING)
     else:
-        found |= _estimate_steering(of_plane, steering, noise if banked else Fraction(0))
+        error = noise if banked else Fraction(0)
+        estimates |= _estimate_steering(terms, of_plane, steering, error)
     if of_course.variance("curvature") > TIGHT_1PM**2:
-        found["speed_ratio"] = TIGHT_BENDS
-    return found
+        estimates["speed_ratio"] = TIGHT_BENDS
+    return estimates
 
 
-def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
+def bank_of_bends(terms: CarTerms, sums: Mapping[str, Gram]) -> Fraction | None:
     """Return s, what of ay grows with curvature, m^2/s^2; None if undetermined."""
     course = sums.get("course")
-    if course is None or (noise := gyroscope_noise(course, sums.get("steering"))) is None:
+    if course is None or (noise := gyroscope_noise(terms, course, sums.get("steering"))) is None:
         return None
-    solution = solve(COURSE.system(ExactSums(course, course_terms()), noise))
+    solution = solve(COURSE.system(ExactSums(course, terms.course), noise))
     return solution[-1] if solution else None
 
 
-def gyroscope_noise(course: Gram, steering: Gram | None) -> Fraction | None:
+def gyroscope_noise(terms: CarTerms, course: Gram, steering: Gram | None) -> Fraction | None:
     """Return what no other sensor says of the yaw rate: the variance of the gyroscope's noise."""
     inputs = ("wheels", "speed", "course_rate")
     if steering is None:
-        return ExactSums(course, course_terms()).residual_variance("yaw_rate", inputs)
-    sums = ExactSums(steering, steering_terms(Fraction(0)))
+        return ExactSums(course, terms.course).residual_variance("yaw_rate", inputs)
+    sums = ExactSums(steering, terms.steering(Fraction(0)))
     return sums.residual_variance("yaw_rate", (*inputs, "steer"))
 
 
 def _estimate_course(
-    sums: ExactSums, noise: Fraction | None
+    terms: CarTerms, sums: ExactSums, noise: Fraction | None
 ) -> dict[NumberName, CarEstimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
@@ -228,7 +235,7 @@ def _estimate_course(
     if not least <= ratio <= most:
         return NO_TYRE
     values = (yaw_rate_offset, ay_offset, ratio)
-    of = ("course", relation, course_terms(), noise)
+    of = ("course", relation, terms.course, noise)
     return {
         name: CarEstimate(*of, value, gradient, by_lean=Fraction(name == "ay_offset"))
         for (name, gradient), value in zip(gradients.items(), values, strict=True)
@@ -236,11 +243,11 @@ def _estimate_course(
 
 
 def _estimate_steering(
-    found: Mapping[NumberName, CarEstimate], gram: Gram, noise: Fraction
+    terms: CarTerms, course: Mapping[NumberName, CarEstimate], gram: Gram, noise: Fraction
 ) -> Estimates:
-    yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
-    terms = steering_terms(yaw_rate_offset)
-    sums = ExactSums(gram, terms)
+    yaw_rate_offset, ay_offset = course["yaw_rate_offset"].value, course["ay_offset"].value
+    columns = terms.steering(yaw_rate_offset)
+    sums = ExactSums(gram, columns)
     solution = solve(STEERING.system(sums, noise))
     if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
         return dict.fromkeys(OF_STEERING, STRAIGHT)
@@ -250,7 +257,7 @@ def _estimate_steering(
         "yaw_rate_offset": float(by_bend * sums.mean("slowness")),
         "ay_offset": float(understeer),
     }
-    of_plane = ("steering", STEERING, terms, noise)
+    of_plane = ("steering", STEERING, columns, noise)
     value = straight + understeer * ay_offset
     gradient = (1.0, 0.0, float(ay_offset))
     return {
@@ -271,7 +278,7 @@ STILL = Relation.least_squares("yaw_rate", (ONE, "wheels"))
 """The yaw rate by 1 and the wheels' differences: b, and one over the tracks. Least squares."""
 
 
-def _standstill(sums: Mapping[str, Gram]) -> Estimates:
+def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     """Return the bias of the gyroscope of a car that stood still, in place of what driving tells.
 
     Also in place of the course: of a car that turns to one side alone that has a part of its scale.
@@ -279,13 +286,13 @@ def _standstill(sums: Mapping[str, Gram]) -> Estimates:
     gram = sums.get(STANDSTILL)
     if gram is None or gram.n < FEWEST_STILL:
         return {}
-    terms = {name: course_terms()[name] for name in ("yaw_rate", "speed", "wheels")}
-    still = ExactSums(gram, terms)
+    columns = {name: terms.course[name] for name in ("yaw_rate", "speed", "wheels")}
+    still = ExactSums(gram, columns)
     solution = solve(STILL.system(still, 0))
     if solution is None or still.mean("speed") >= LONGEST_ROLL_MPS:
         return {}
-    one = CarEstimate(STANDSTILL, STILL, terms, Fraction(0), solution[0], (1.0, 0.0))
-    return {"yaw_rate_offset": one}
+    bias = CarEstimate(STANDSTILL, STILL, columns, Fraction(0), solution[0], (1.0, 0.0))
+    return {"yaw_rate_offset": bias}
 
 
 # What a satellite receiver determines of a car beyond its own sensors: its speed, and how it slips.
@@ -293,7 +300,7 @@ def _standstill(sums: Mapping[str, Gram]) -> Estimates:
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
 # bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
 # the side-slip angle does, which on roads is l r/v + K ay: the rear axle is l behind the centre of
-# gravity, and gives way by K (`catalogue/course.py`). Both are of speeds by wheels of .31
+# gravity, and gives way by K (`catalog/course.py`). Both are of speeds by wheels of .31
 # m.
 
 SATELLITE = "satellite_speed"
@@ -325,45 +332,46 @@ CHANGE = Relation.least_squares(SLIP, (ONE, "curvature", "ay", TURNED))
 Least squares."""
 
 
-def kinds_by_set() -> dict[str, dict[str, tuple[str, ...]]]:
+def kinds_by_set(label: str) -> dict[str, dict[str, tuple[str, ...]]]:
     """Return the columns of each kind of sums, by the feature set that has them."""
     return {
         BY_SATELLITE: {SATELLITE: (*WHEEL_SPEEDS, "slowness", SATELLITE)},
-        BY_COURSE: {SLIP: ("curvature", "ay", TURNED, catalogue().label)},
+        BY_COURSE: {SLIP: ("curvature", "ay", TURNED, label)},
     }
 
 
-def _speed_ratio(sums: Mapping[str, Gram]) -> Estimates:
+def _speed_ratio(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     gram = sums.get(SATELLITE)
     if gram is None or gram.n == 0:
         return {}
-    terms = {"speed": course_terms()["speed"], SATELLITE: _si(**{SATELLITE: 1})}
-    solution = solve(SPEED.system(ExactSums(gram, terms), 0))
+    columns = {"speed": terms.course["speed"], SATELLITE: terms.si(**{SATELLITE: 1})}
+    solution = solve(SPEED.system(ExactSums(gram, columns), 0))
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
-    one = CarEstimate(SATELLITE, SPEED, terms, Fraction(0), solution[0], (1.0,))
-    return {"speed_ratio": one}
+    ratio = CarEstimate(SATELLITE, SPEED, columns, Fraction(0), solution[0], (1.0,))
+    return {"speed_ratio": ratio}
 
 
-def _slip(sums: Mapping[str, Gram]) -> Estimates:
+def _slip(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     gram = sums.get(SLIP)
     if gram is None or gram.n == 0:
         return dict.fromkeys(OF_SLIP, NO_RECEIVER)
-    terms = {
-        **{name: _si(**{name: 1}) for name in ("curvature", "ay")},
-        TURNED: {TURNED: Fraction(turned_scale())},
-        SLIP: _si(**{catalogue().label: 1}),
+    catalog = terms.catalog
+    columns = {
+        **{name: terms.si(**{name: 1}) for name in ("curvature", "ay")},
+        TURNED: {TURNED: Fraction(turned_scale(catalog.signals))},
+        SLIP: terms.si(**{catalog.signals.label: 1}),
     }
-    exact = ExactSums(gram, terms)
+    exact = ExactSums(gram, columns)
     if gram.n < FEWEST_CHANGES or exact.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
         return dict.fromkeys(OF_SLIP, FEW_TURNS)
     solution = solve(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
         return dict.fromkeys(OF_SLIP, NO_CAR)
-    of = (SLIP, CHANGE, terms, Fraction(0))
+    of = (SLIP, CHANGE, columns, Fraction(0))
     # Over so much time the heading changes by the bias too much, and the label by as little.
-    by_bias = -1 / Fraction(features().feature_set(BY_COURSE).change_s[0])
+    by_bias = -1 / Fraction(catalog.feature_set(BY_COURSE).change_s[0])
     of_bias = (float(by_bias), 0.0, 0.0, 0.0)
     return {
         "yaw_rate_offset": CarEstimate(*of, by_bias * solution[0], of_bias),

@@ -1,4 +1,4 @@
-"""The changes from fix to fix of one drive, as `catalogue/course.py` defines them.
+"""The changes from fix to fix of one drive, as `catalog/course.py` defines them.
 
 Only rows with a fix are kept, at most one in ten: they fit into memory.
 """
@@ -6,16 +6,19 @@ Only rows with a fix are kept, at most one in ten: they fit into memory.
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.course import COARSER, COURSE, course_units, split_late
-from fleet_slip.catalogue.signals import HALF_TURN
+from fleet_slip.catalog.course import COARSER, COURSE, CourseUnits, split_late
+from fleet_slip.catalog.signals import HALF_TURN
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 
 
 class Fixes:
     """The rows of a drive that have a fix."""
 
-    def __init__(self, workspace: Workspace, drive: DriveCounts, late: int = 0) -> None:
+    def __init__(
+        self, units: CourseUnits, workspace: Workspace, drive: DriveCounts, late: int = 0
+    ) -> None:
         """Find those of the loaded drive, its course and yaw rate last, `late` by so much."""
+        self.units = units
         self.ticks = drive.ticks.astype(np.int64)
         whole, self.gain = split_late(late)
         self.at, self.course = _fixes(drive, self.ticks, whole)
@@ -38,16 +41,15 @@ class Fixes:
         The rows with a change, their columns, which end in `BESIDE` and the label and are NaN where
         missing, shape (columns, changes), and how many were clipped in each.
         """
-        at, yaw_rate = self.at, self.yaw_rate
+        at, yaw_rate, units = self.at, self.yaw_rate, self.units
         before, now = _pairs(self.ticks[at], apart)
         turned, known = _twice_turned(self.ticks, yaw_rate, at[before], at[now])
         before, now, turned = before[known], now[known], turned[known]
         rest = self.gain * (yaw_rate[at[now]] - yaw_rate[at[before]]).astype(np.int64)
-        change, sound = _change(self.course[now] - self.course[before], turned, rest)
+        change, sound = _change(units, self.course[now] - self.course[before], turned, rest)
         before, now, turned, change = before[sound], now[sound], turned[sound], change[sound]
         # Straight on by the yaw rate at both fixes and in between.
         fastest = np.maximum(np.abs(yaw_rate[at[before]]), np.abs(yaw_rate[at[now]]))
-        units = course_units()
         straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
         beside = [_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
         began = self.ticks[:1] == 0  # no change: so a drive without a course is remembered
@@ -87,9 +89,10 @@ def _twice_turned(
     return turned, whole & (gaps[now] == gaps[before]) & ~missing[before]
 
 
-def _change(course: IntArray, turned: IntArray, rest: IntArray) -> tuple[IntArray, BoolArray]:
+def _change(
+    units: CourseUnits, course: IntArray, turned: IntArray, rest: IntArray
+) -> tuple[IntArray, BoolArray]:
     """Return the change of the side-slip angle in counts of the label, and where it is one."""
-    units = course_units()
     left = units.turn * course - 2 * HALF_TURN * turned + rest
     whole = 2 * HALF_TURN * units.turn
     left -= whole * _rounded(left, whole)

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received
@@ -70,15 +70,15 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
     for file in chosen:
         drives += _compare_ways(warehouse, file, PLAIN, where.get(file.path, ()))
         progress(1, len(chosen))
-    known = features()
+    catalog = warehouse.catalog
     wide = tuple(
         name
         for name in warehouse.feature_sets()
-        if known.feature_set(name).windows
-        and grams.landed(unit_name(known.identity(name))) is not None
+        if catalog.feature_set(name).windows
+        and grams.landed(unit_name(catalog.identity(name))) is not None
     )
     for name in wide:
-        missing = find_backlog(logs, grams, known.identity(name)).missing
+        missing = find_backlog(logs, grams, catalog.identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
         for file in _evenly(computed, max(1, count // SQL_COSTS), begin):
             wide_drives += _compare_ways(warehouse, file, name, [one.path for one in grams.files])
@@ -94,14 +94,14 @@ def _compare_ways(
     warehouse: Warehouse, file: TableFile, feature_set: str, places: Iterable[str]
 ) -> int:
     """Compare the kernel with what is stored, if it is there, and with SQL; count drives."""
-    identity = features().identity(feature_set)
+    identity = warehouse.catalog.identity(feature_set)
     stored = stored_grams(warehouse, [file], places, identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
     late = recorded_cars(warehouse.grams.snapshot(), identity, file.path)
     rows = wide_grams(warehouse, [file], feature_set, late)
     computed, others = grams_of(rows), {"the stored Gram rows": stored}
-    if has_statement(feature_set):
+    if has_statement(warehouse.catalog, feature_set):
         others["SQL"] = grams_of(by_sql(warehouse, [file], feature_set))
     for other, found in others.items():
         if drives := differing_drives(computed, found):

@@ -17,9 +17,9 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN, features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
 from fleet_slip.grams.expansion import expansion_of
 from fleet_slip.grams.folding import (
@@ -73,6 +73,7 @@ class Cohort:
     A drive has several rows if a signal is in some of its rows only, or if its set has parts.
 
     Attributes:
+        catalog: what the columns of the Gram rows are.
         condition: which drives, by the columns of the view `drives`.
         logs_version, grams_version, feature_set: what was read.
         left_out: drives of the condition that have no such Gram rows: their cars sent no log.
@@ -84,6 +85,7 @@ class Cohort:
             with this weight, where the others have 1.
     """
 
+    catalog: Catalog
     condition: Condition
     logs_version: int
     grams_version: int
@@ -119,19 +121,19 @@ class Cohort:
 
         With a prior those that it has as well.
         """
-        known = {name for kind in _kinds(self.drives) for name in kind.split(",")}
+        present = {name for kind in _kinds(self.drives) for name in kind.split(",")}
         if self.prior is not None:
-            known &= set(self.prior.inputs)
-        return tuple(n for n in features().searched(self.feature_set) if n in known)
+            present &= set(self.prior.inputs)
+        return tuple(n for n in self.catalog.search_inputs(self.feature_set) if n in present)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
         """Return the SQL condition on the view `grams` of the rows that a model is made of."""
-        known = features().calibrated
-        stored = dict.fromkeys(known[name].of if name in known else name for name in inputs)
-        wanted = ", ".join(f"'{name}'" for name in [*stored, catalogue().label])
+        catalog, columns = self.catalog, self.catalog.calibrated
+        stored = dict.fromkeys(columns[name].of if name in columns else name for name in inputs)
+        names = ", ".join(f"'{name}'" for name in [*stored, catalog.signals.label])
         return (
-            f"feature_set = '{features().identity(self.feature_set)}' AND {self.condition.sql} AND "
-            f"list_has_all(string_split(signals, ','), [{wanted}])"
+            f"feature_set = '{catalog.identity(self.feature_set)}' AND {self.condition.sql} AND "
+            f"list_has_all(string_split(signals, ','), [{names}])"
         )
 
     def hash_drives_with(self, signals: Collection[str]) -> Hashes:
@@ -169,7 +171,7 @@ class Cohort:
         if self.sums is not None and self.source is not None:
             again = load_cohort(self.source, self.condition, self.feature_set, folding)
             return again._own_folds(by, count)
-        require_divided(self.feature_set, by)
+        require_divided(self.catalog, self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
 
@@ -177,7 +179,7 @@ class Cohort:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
             return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
-        table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
+        table, mask = serving_drives(self.tables, [*inputs, self.catalog.signals.label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
             self.drive_numbers[rows], return_index=True, return_inverse=True
@@ -231,9 +233,10 @@ def load_cohort(
     fold, or if the set was not computed for all logs, `RefusedError` for drives of evaluation
     scenarios.
     """
-    condition = parse_cohort(condition)
+    catalog = source.catalog
+    condition = parse_cohort(catalog.signals, condition)
     if folding is not None:
-        require_divided(feature_set, folding.by)
+        require_divided(catalog, feature_set, folding.by)
     with open_grams(source, feature_set, condition) as opened:
         if folding is None:
             rows = opened.rows(condition)
@@ -246,10 +249,11 @@ def load_cohort(
             grams, drives = _add_up(opened, condition, names, fold_of)
             kept = {"drives": drives, "sums": _used_folds(names, grams, drives), "folding": folding}
         return Cohort(
+            catalog=catalog,
             condition=condition,
             logs_version=opened.logs_version,
             grams_version=opened.grams_version,
-            feature_set=features().name_of(opened.identity),
+            feature_set=catalog.name_of(opened.identity),
             left_out=opened.count_left_out(condition),
             source=source,
             **kept,
@@ -300,12 +304,12 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
             f"all {number_of(left_out, 'drive')} of the cohort {condition.shown} have no log: "
             "their cars sent Gram rows of logged signals. Use --features signals."
         )
-    one = features().feature_set(features().name_of(opened.identity))
-    if one.change_s:
+    feature_set = opened.catalog.feature_set(opened.catalog.name_of(opened.identity))
+    if feature_set.change_s:
         return DataError(
-            f"no drive of the cohort {condition.shown} has satellite fixes {one.change_text} "
-            "apart, so there is no course to learn from. Choose another cohort, or map the "
-            "course and ingest again: docs/course.md."
+            f"no drive of the cohort {condition.shown} has satellite fixes "
+            f"{feature_set.change_text} apart, so there is no course to learn from. Choose another "
+            "cohort, or map the course and ingest again: docs/course.md."
         )
     examples = opened.database.execute(
         "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
@@ -414,8 +418,8 @@ def sum_days(
     feature_set: str = PLAIN,
 ) -> DailySums:
     """Add up a cohort's Gram rows with label and inputs, day by day. Raises like `load_cohort`."""
-    signals = (*inputs, catalogue().label)
-    condition = parse_cohort(condition)
+    signals = (*inputs, source.catalog.signals.label)
+    condition = parse_cohort(source.catalog.signals, condition)
     with open_grams(source, feature_set, condition) as opened:
         found = opened.values_of("day", condition).sort()
         days: list[date] = found.to_pylist()
@@ -483,6 +487,7 @@ def drive_folds(
     assignment = assign_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
-    folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
+    label, scales = cohort.catalog.signals.label, cohort.catalog.input_scales
+    folds = CohortFolds.of([served.table], assignment).serving(inputs, label)
     moments = clustered_moments(served, cluster, intercept=intercept)
-    return TrainingFolds(folds, moments, input_scales(), intercept), assignment.fold
+    return TrainingFolds(folds, moments, scales, intercept), assignment.fold

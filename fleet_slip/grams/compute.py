@@ -19,10 +19,11 @@ from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.course import COURSE_LATE
-from fleet_slip.catalogue.definitions import COUNT_BITS, Slope, rows_behind
-from fleet_slip.catalogue.features import PLAIN, FeatureSet, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog, FeatureSet
+from fleet_slip.catalog.course import COURSE_LATE, course_units
+from fleet_slip.catalog.definitions import COUNT_BITS, Slope, rows_behind
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_absent, with_columns
@@ -42,7 +43,7 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
 
     As in SQL, none without a row of tick 0.
     """
-    drive_columns = tuple(catalogue().drive)
+    drive_columns = tuple(warehouse.catalog.signals.drive)
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
     wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
     rows = warehouse.logs.read(file.path, wanted)
@@ -155,35 +156,35 @@ MOST_SUMS = 8_000
 longer than its block of 262,144 bytes."""
 
 
-def has_statement(feature_set: str) -> bool:
-    """Whether SQL computes a feature set, too; else the kernel alone does."""
-    one = features().feature_set(feature_set)
-    k, windows = len(one.columns), features().definitions(feature_set)
+def has_statement(catalog: Catalog, feature_set: str) -> bool:
+    """Return True if SQL can compute a feature set; otherwise only the kernel can."""
+    resolved = catalog.feature_set(feature_set)
+    k, windows = len(resolved.columns), catalog.definitions(feature_set)
     slopes = any(isinstance(row.made, Slope) for row in rows_behind(windows).values())
-    divided = one.change_ticks or one.block_ticks
+    divided = resolved.change_ticks or resolved.block_ticks
     return not (divided or slopes) and k + k * (k + 1) // 2 <= MOST_SUMS
 
 
 def gram_statement(
-    feature_set: str = PLAIN, *, whole: bool = False, absent: Sequence[str] = ()
+    catalog: Catalog, feature_set: str = PLAIN, *, whole: bool = False, absent: Sequence[str] = ()
 ) -> str:
     """Return the statement that computes the Gram rows of a feature set.
 
     `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
     Raises `QuestionError` for an unknown set, and for one that the kernel alone computes.
     """
-    known, signals = features(), catalogue()
-    one = known.feature_set(feature_set)
-    if not has_statement(feature_set):
+    signals = catalog.signals
+    resolved = catalog.feature_set(feature_set)
+    if not has_statement(catalog, feature_set):
         raise QuestionError(
             f"SQL cannot compute the Gram rows of {feature_set}: only the compiled kernel has "
             "changes of the course, blocks of time, slopes and sets of many columns. Its columns: "
             "fleet-slip features --sql"
         )
-    names = one.columns
-    windows = known.definitions(feature_set)
-    used = known.rows(one.features)
-    logs = with_absent(LOGS, absent)
+    names = resolved.columns
+    windows = catalog.definitions(feature_set)
+    used = catalog.rows(resolved.features)
+    logs = with_absent(signals, LOGS, absent)
     rows = with_columns(logs, used, windows)
     wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
@@ -231,7 +232,7 @@ def aggregate(
     late: Late = None,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
-    in_time = features().feature_set(feature_set).in_time
+    in_time = warehouse.catalog.feature_set(feature_set).in_time
     empty = warehouse.computed_schema(in_time=in_time).empty_table()
     rows = compute_grams(warehouse, files, no_progress, feature_set, late=late)
     return pa.concat_tables([empty, *rows])
@@ -252,8 +253,8 @@ def compute_grams(
     """
     if not files:
         return
-    one = features().feature_set(feature_set)
-    wide = bool(one.windows or one.block_ticks)
+    resolved = warehouse.catalog.feature_set(feature_set)
+    wide = bool(resolved.windows or resolved.block_ticks)
     if executor is None and not wide:
         total = sum(file.rows for file in files)
         with open_database(reading=warehouse.logs.folder) as database:
@@ -313,16 +314,17 @@ def _query(
     files: Sequence[TableFile],
     feature_set: str,
 ) -> pa.Table:
+    catalog = warehouse.catalog
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
     # Whether each signal is in all rows of a file or in none, by the Delta log's statistics.
     whole = feature_set == PLAIN and all(
         file.null_counts.get(signal, file.rows) in (0, file.rows)
         for file in files
-        for signal in catalogue().gram_signals
+        for signal in catalog.signals.gram_signals
     )
-    absent = absent_columns(files, catalogue().stored_columns)
-    statement = gram_statement(feature_set, whole=whole, absent=absent)
-    identity = features().identity(feature_set)
+    absent = absent_columns(files, catalog.signals.stored_columns)
+    statement = gram_statement(catalog, feature_set, whole=whole, absent=absent)
+    identity = catalog.identity(feature_set)
     doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
@@ -352,43 +354,47 @@ def wide_grams(
     `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
     cannot be looked back on, `StorageError` for sums of more than 64 bits.
     """
-    warehouse.look_for_lines()
-    one, line = features().feature_set(feature_set), features().line_of(feature_set)
+    catalog = warehouse.catalog
+    resolved, model = catalog.feature_set(feature_set), catalog.first_stage_model(feature_set)
     workspaces: dict[str | None, Workspace] = {
-        None: Workspace(ColumnPlan.of_set(features(), feature_set))
+        None: Workspace(ColumnPlan.of_set(catalog, feature_set))
     }
     plan = workspaces[None].plan
-    identity = features().identity(feature_set)
-    schema = warehouse.computed_schema(in_time=one.in_time)
+    identity = catalog.identity(feature_set)
+    schema = warehouse.computed_schema(in_time=resolved.in_time)
     rows: list[dict[str, Any]] = []
     # Files are shared out among threads; a BLAS with threads of its own would be in their way.
     with threadpool_limits(1, user_api="blas"):
-        for file in sorted(files, key=lambda one: one.path):
+        for file in sorted(files, key=lambda file: file.path):
             drives = read_drives(warehouse, file, plan)
             for drive in sorted(drives, key=lambda drive: str(drive.facts["drive_id"])):
-                fold = line.fold_of(str(drive.facts["drive_id"])) if line else None
+                fold = model.fold_of(str(drive.facts["drive_id"])) if model else None
                 if fold not in workspaces:
-                    workspaces[fold] = Workspace(ColumnPlan.of_set(features(), feature_set, fold))
+                    workspaces[fold] = Workspace(ColumnPlan.of_set(catalog, feature_set, fold))
                 delay = (late or {}).get(drive.facts["vehicle_id"])
-                known = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
-                known |= {"file": file.path, "day": file.day}
-                rows += _rows_of_drive(workspaces[fold], one, drive, known)
+                metadata = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
+                metadata |= {"file": file.path, "day": file.day}
+                rows += _rows_of_drive(catalog.signals, workspaces[fold], resolved, drive, metadata)
     return pa.Table.from_pylist(rows, schema=schema)
 
 
 def _rows_of_drive(
-    workspace: Workspace, one: FeatureSet, drive: DriveCounts, known: Mapping[str, Any]
+    signals: SignalCatalog,
+    workspace: Workspace,
+    feature_set: FeatureSet,
+    drive: DriveCounts,
+    metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
-    parts = Parts.of_set(one)
+    parts = Parts.of_set(feature_set)
     try:
-        if one.change_ticks:
-            late = (known[COURSE_LATE] or 0) if one.in_time else 0
-            found = change_sums(workspace, drive, one.change_ticks, late)
+        if feature_set.change_ticks:
+            late = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
+            sums = change_sums(signals, workspace, drive, feature_set.change_ticks, late)
         else:
-            found = drive_sums(workspace, parts, drive)
+            sums = drive_sums(workspace, parts, drive)
     except DataError as error:
-        raise DataError(f"{known['file']}: drive {known['drive_id']}: {error}") from None
-    return gram_rows(found, one.columns, parts, known)
+        raise DataError(f"{metadata['file']}: drive {metadata['drive_id']}: {error}") from None
+    return gram_rows(sums, feature_set.columns, parts, metadata)
 
 
 def gram_rows(
@@ -452,11 +458,15 @@ def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[
 
 
 def change_sums(
-    workspace: Workspace, counts: DriveCounts, times: Sequence[int], late: int = 0
+    signals: SignalCatalog,
+    workspace: Workspace,
+    counts: DriveCounts,
+    times: Sequence[int],
+    late: int = 0,
 ) -> dict[Kind, PartSums]:
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
     _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
-    fixes = Fixes(workspace, counts, late)
+    fixes = Fixes(course_units(signals), workspace, counts, late)
     found: dict[Kind, PartSums] = {}
     for part, apart in enumerate(times):
         rows, columns, clipped = fixes.changes(apart)

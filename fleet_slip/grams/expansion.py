@@ -13,10 +13,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.course import BESIDE, TURNED
-from fleet_slip.catalogue.definitions import Number
-from fleet_slip.catalogue.facts import ALL_DRIVES, CALIBRATION
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.course import BESIDE, TURNED
+from fleet_slip.catalog.definitions import Number
+from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION
 from fleet_slip.grams.calibration import calibration_of
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import OpenedGrams
@@ -155,16 +154,16 @@ def expand(
 
 def expansion_of(opened: OpenedGrams) -> Expansion:
     """Return what adds a set's calibrated columns, by the numbers of all of a car's drives now."""
-    known = features()
-    one = known.feature_set(known.name_of(opened.identity))
-    names, sweep = one.calibrated, bool(one.change_ticks)
+    catalog = opened.catalog
+    feature_set = catalog.feature_set(catalog.name_of(opened.identity))
+    names, sweep = feature_set.calibrated, bool(feature_set.change_ticks)
     if not names:
         return Expansion({}, {}, sweep)
     columns = {}
     for name in names:
-        number = known.time_columns[name].definition.number
+        number = catalog.time_columns[name].definition.number
         if number is not None:
-            columns[name] = (known.calibrated[name].of, number)
-    calibration = replace(opened, identity=known.identity(CALIBRATION))
-    cars = calibration_of(calibration, parse_condition(ALL_DRIVES)).counts()
+            columns[name] = (catalog.calibrated[name].of, number)
+    calibration = replace(opened, identity=catalog.identity(CALIBRATION))
+    cars = calibration_of(calibration, parse_condition(catalog.signals, ALL_DRIVES)).counts()
     return Expansion(columns, cars, sweep)

@@ -5,8 +5,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field
 
-from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import LONGEST_PAUSE_S
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.regression.folds import FoldAssignment, by_band, by_hash, by_value
@@ -61,14 +61,13 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
         ) from None
 
 
-def require_divided(feature_set: str, by: str) -> None:
+def require_divided(catalog: Catalog, feature_set: str, by: str) -> None:
     """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
-    one = features().feature_set(feature_set)
-    if by == PARTS and not one.block_s:
-        known = ", ".join(name for name, other in features().sets.items() if other.block_s)
+    if by == PARTS and not catalog.feature_set(feature_set).block_ticks:
+        divided = ", ".join(name for name, entry in catalog.sets.items() if entry.block_ticks)
         raise QuestionError(
             f"the feature set {feature_set} does not divide the rows of a drive. Feature sets with "
-            f"blocks of time: {known}."
+            f"blocks of time: {divided}."
         )
 
 

@@ -5,8 +5,9 @@ Each file is of one feature set; they are neither too many nor too large.
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
+from hashlib import blake2b, sha256
 from itertools import accumulate
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -15,8 +16,8 @@ from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import ConflictError
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
@@ -28,15 +29,18 @@ Hashes = NDArray[np.uint64]
 """Hashes of drives or cars: what tells one from others, in 8 bytes."""
 
 
-def by_signals(batch: pa.RecordBatch) -> Iterator[tuple[str, pa.RecordBatch, BoolArray]]:
-    """Yield each set of signals in a batch of Gram rows, its rows, and which those are."""
+Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
+
+
+def by_signals(batch: Rows) -> Iterator[tuple[str, Rows, BoolArray]]:
+    """Yield each set of signals in some Gram rows, its rows, and which those are."""
     names = batch["signals"].unique().to_pylist()
     if len(names) == 1:
         yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
         return
     for signals in names:
         mask = pc.equal(batch["signals"], signals)
-        yield signals, batch.filter(mask), mask.to_numpy(zero_copy_only=False)
+        yield signals, batch.filter(mask), np.asarray(mask)
 
 
 def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
@@ -67,6 +71,50 @@ def hash_names(ids: pa.Array | pa.ChunkedArray) -> Hashes:
     """Return the hash of each id of a drive or a car, see `Hashes`."""
     first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
     return np.frombuffer(first, dtype=">u8").astype(np.uint64)
+
+
+# Digests identify Gram rows by their counts, whatever their drive, car or day is called.
+
+MIN_EVENTFUL_ROWS = 256
+MIN_EVENTFUL_SIGNALS = 2
+"""Signals with a variance of one count or more. Rows with less, as of a car that stands, can be
+equal by chance."""
+
+
+def find_eventful(table: GramTable) -> BoolArray:
+    """Return which Gram rows vary so much that no two drives have equal ones."""
+    n, column = table.n[:, None], np.arange(len(table.signals))
+    variances = table.products[:, column * (column + 3) // 2] / n - (table.sums / n) ** 2
+    varying: BoolArray = (variances >= 1).sum(axis=1) >= MIN_EVENTFUL_SIGNALS
+    return varying & (table.n >= MIN_EVENTFUL_ROWS)
+
+
+def gram_digests(rows: pa.Table) -> tuple[list[str], BoolArray]:
+    """Return 16 characters for each Gram row that depend on its counts, and which are eventful.
+
+    Those of a row that is not depend on its car and day too, as those of `digest_counts` do.
+    """
+    digests, eventful = np.empty(len(rows), dtype=object), np.zeros(len(rows), dtype=np.bool_)
+    for signals, alike, mask in by_signals(rows):
+        numbers, is_eventful = alike["n"].to_numpy()[:, None], eventful[mask]
+        if signals:
+            table = gram_table(signals, alike)
+            numbers = np.column_stack([table.n, table.sums, table.products])
+            eventful[mask] = is_eventful = find_eventful(table)
+        columns = ("feature_set", "part", "vehicle_id", "day")
+        names = zip(*(alike[name].to_pylist() for name in columns), strict=True)
+        digests[mask] = [
+            _digest(feature_set, part, signals, "" if alone else f"{vehicle}\n{day}", row)
+            for (feature_set, part, vehicle, day), alone, row in zip(
+                names, is_eventful, numbers, strict=True
+            )
+        ]
+    return digests.tolist(), eventful
+
+
+def _digest(feature_set: str, part: str | None, signals: str, owner: str, numbers: IntArray) -> str:
+    text = f"{feature_set}\n{part or ''}\n{signals}\n{owner}\n"
+    return blake2b(text.encode() + numbers.tobytes(), digest_size=8).hexdigest()
 
 
 # How files are written, and written again.
@@ -264,7 +312,7 @@ def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
         for file in logs.table.folder.files()
         if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
     }
-    return written - logs.removed() if written else set()
+    return written.difference(logs.removals) if written else set()
 
 
 def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:

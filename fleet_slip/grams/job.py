@@ -15,8 +15,8 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.facts import DELAY
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalog.facts import DELAY
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
@@ -90,7 +90,8 @@ def update_grams(
     receivers' delays bring `delay` up to date first, and are computed again where these moved.
     Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
     """
-    if features().feature_set(feature_set).in_time and DELAY in features().sets:
+    catalog = warehouse.catalog
+    if catalog.feature_set(feature_set).in_time and DELAY in catalog.sets:
         update_grams(warehouse, progress, DELAY, executor, among)
     return _update_once(warehouse, progress, feature_set, executor, among)
 
@@ -102,10 +103,10 @@ ROWS_ON_THE_WAY = 4_000_000
 def update_if_quick(warehouse: Warehouse, feature_set: str, cohort: str) -> None:
     """Make the Gram rows of a feature set that a cohort's logs lack, if that takes seconds."""
     grams, logs = gram_snapshots(warehouse)
-    missing = find_backlog(logs, grams, features().identity(feature_set)).missing
+    missing = find_backlog(logs, grams, warehouse.catalog.identity(feature_set)).missing
     if not missing:
         return
-    condition = parse_cohort(cohort)
+    condition = parse_cohort(warehouse.catalog.signals, cohort)
     with open_grams(warehouse, PLAIN, condition) as opened:
         files = opened.files(condition)
     rows = sum(file.rows for file in missing if file.path in files)
@@ -117,9 +118,9 @@ def update_if_quick(warehouse: Warehouse, feature_set: str, cohort: str) -> None
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
     """Bring up to date what was computed here before, but for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
-    identities = {name: features().identity(name) for name in warehouse.feature_sets()}
+    identities = {name: warehouse.catalog.identity(name) for name in warehouse.feature_sets()}
     used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
-    over_time = [name for name in used if features().feature_set(name).windows]
+    over_time = [name for name in used if warehouse.catalog.feature_set(name).windows]
     drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
     reports = []
     for name in used:
@@ -163,7 +164,7 @@ def _update_once(
     # Gram rows after this snapshot of them, and this job's commit is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
-    identity = features().identity(feature_set)
+    identity = warehouse.catalog.identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
     missing, stale = backlog.missing, backlog.stale
     if logs.version is None and stale:
@@ -173,9 +174,9 @@ def _update_once(
             "a backup."
         )
     late, again = None, frozenset[str]()
-    if features().feature_set(feature_set).in_time:
+    if warehouse.catalog.feature_set(feature_set).in_time:
         active = {file.path: file for file in logs.files}
-        late = course_delays(grams, frozenset(active))
+        late = course_delays(warehouse, grams, frozenset(active))
         again = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
         missing += tuple(active[path] for path in sorted(again))
     if among is not None:
@@ -257,7 +258,7 @@ def land_ahead(
     """
     files = [_as_file(action) for action in new]
     for name in warehouse.feature_sets():
-        identity = features().identity(name)
+        identity = warehouse.catalog.identity(name)
         grams = warehouse.grams.snapshot()
         done, _ = named_files(grams, identity)
         missing = [file for file in files if file.path not in done]
@@ -268,8 +269,9 @@ def land_ahead(
         logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())  # in whatever scales
         require_active(logs, replaced)
         late = None
-        if features().feature_set(name).in_time:
-            late = course_delays(grams, frozenset(file.path for file in logs.files))
+        if warehouse.catalog.feature_set(name).in_time:
+            active = frozenset(file.path for file in logs.files)
+            late = course_delays(warehouse, grams, active)
         rows = aggregate(warehouse, missing, feature_set=name, late=late)
         _land(grams, logs, identity, write_rows(warehouse, [rows]))
 

@@ -6,9 +6,8 @@ instead of a log file the row names `received/` and the digest of the table's fi
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -18,8 +17,17 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import canonical_json, number_of, sha256_of, shown
-from fleet_slip.catalogue.course import (
+from fleet_slip.base import (
+    MAX_NAME_CHARACTERS,
+    canonical_json,
+    find_name_fault,
+    normalize_name,
+    number_of,
+    sha256_of,
+    shown,
+)
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
     BESIDE,
     COARSER,
     COURSE,
@@ -32,23 +40,26 @@ from fleet_slip.catalogue.course import (
     YAW_RATE,
     course_units,
 )
-from fleet_slip.catalogue.definitions import limit_of
-from fleet_slip.catalogue.facts import RECEIVED_FILES
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import COUNT_MAX, SAMPLE_TIME_S, Signal, catalogue
-from fleet_slip.catalogue.time_columns import Feature
+from fleet_slip.catalog.definitions import limit_of
+from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
+from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.compute import Parts
 from fleet_slip.grams.gram_files import (
     by_signals,
     files_to_rewrite,
+    gram_digests,
     gram_table,
     in_schema,
     rows_to_keep,
     write_rows,
 )
+from fleet_slip.grams.parquet_sizes import DELTA_BYTE_ARRAY, read_page_headers, read_row_groups
 from fleet_slip.grams.reader import BATCH_ROWS
+from fleet_slip.ingest.formats.tables import require_small_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
@@ -81,7 +92,7 @@ class CountedSet:
     Attributes:
         name, identity: of the set.
         ranges: the smallest and the largest count of each column of its Gram rows, in order.
-        signals: what a car must know to count it, in catalogue order.
+        signals: what a car must know to count it, in catalog order.
         times: over how many ticks columns change; none where they stand for themselves.
         parts: what those parts of a drive are called; None alone where it is not divided.
         in_time: whether the course is moved by its delay.
@@ -108,24 +119,22 @@ class CountedSet:
         return tuple(self.ranges)
 
 
-@cache
-def counted_sets() -> dict[str, CountedSet]:
+def counted_sets(catalog: Catalog) -> dict[str, CountedSet]:
     """Return the sets by their identities, which Gram rows carry, the logged signals first."""
-    known = features()
-    found = {}
-    for name in (PLAIN, *known.sets):
-        one = known.feature_set(name)
-        if not one.block_ticks and len(one.columns) <= MOST_COLUMNS:
-            found[known.identity(name)] = _counted(name, known.identity(name))
-    return found
+    sets = {}
+    for name in (PLAIN, *catalog.sets):
+        feature_set = catalog.feature_set(name)
+        if not feature_set.block_ticks and len(feature_set.columns) <= MOST_COLUMNS:
+            identity = catalog.identity(name)
+            sets[identity] = _counted(catalog, name, identity)
+    return sets
 
 
-def _counted(name: str, identity: str) -> CountedSet:
-    known, signals = features(), catalogue()
-    one = known.feature_set(name)
-    used = {*one.signals, *([COURSE, YAW_RATE] if one.change_ticks else [signals.label])}
-    used |= {signal for f in one.features for signal in known.features[f].inputs}
-    used |= {signal for d in known.definitions(name).values() for signal in d.signals}
+def _counted(catalog: Catalog, name: str, identity: str) -> CountedSet:
+    signals, resolved = catalog.signals, catalog.feature_set(name)
+    used = {*resolved.signals, *([COURSE, YAW_RATE] if resolved.change_ticks else [signals.label])}
+    used |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
+    used |= {signal for d in catalog.definitions(name).values() for signal in d.signals}
     made_of = {signal: about for signal, about in signals.signals.items() if signal in used}
     defined: list[Any] = [
         [signal, f"{about.scale:f}", about.min_count, about.max_count]
@@ -136,26 +145,26 @@ def _counted(name: str, identity: str) -> CountedSet:
     return CountedSet(
         name,
         identity,
-        {column: _range(column, one.change_ticks) for column in one.columns},
+        {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
         tuple(made_of),
-        one.change_ticks,
-        Parts.of_set(one).times or (None,),
-        one.in_time,
+        resolved.change_ticks,
+        Parts.of_set(resolved).times or (None,),
+        resolved.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )
 
 
-def _range(column: str, times: Sequence[int]) -> Range:
-    label = catalogue().label
+def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
+    signals, label = catalog.signals, catalog.signals.label
     if times and column in (*BESIDE, label):
         if column == STRAIGHT:
             return 0, 1
-        units = course_units()
+        units = course_units(signals)
         most = units.largest // units.divisor + 1
         if column == TURNED:
             most = 2 * max(times) * COUNT_MAX // COARSER + 1
         return -most, most
-    of = catalogue()[column] if column == label else features().of(column)
+    of = signals[column] if column == label else catalog.input(column)
     if isinstance(of, Signal):
         least, most = of.min_count, of.max_count
     else:
@@ -258,10 +267,16 @@ COLUMNS = pa.schema(
 """The table of Gram rows; `part` and `course_late` may be null or absent (`docs/export.md`)."""
 
 OPTIONAL = ("part", COURSE_LATE)
-LARGEST_BYTES, MOST_UNPACKED_BYTES = 2**28, 2**30
-MOST_ROWS = 500_000
+NAMES = ("vehicle_id", "drive_id")
+TEXTS = tuple(field.name for field in COLUMNS if field.type == pa.string())
+MAX_FILE_BYTES = 2**28
+MAX_ROWS, MAX_DECODED_BYTES = 500_000, 2**30
+MAX_TEXT_BYTES = 2**28
+"""Texts of a file; as many rows as a file may have have some 300 bytes of them each."""
+BATCH_ROWS_READ = 2**12
+"""Rows that are decoded at once; a row of 200 columns has 160,000 bytes."""
 LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
-"""Rows of a day: a drive is over by then."""
+"""Rows of a day: the drives of a car that begin on one day have no more together."""
 ONE_AT_A_TIME = "receive"
 """Unit of every such commit: two at once, which could bring the same drive, are a conflict."""
 
@@ -287,7 +302,7 @@ class CountedReport(Answer):
 
 def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
     """Load the Gram rows of a file, once. Raises `InputError`, `RepeatedError`, `ConflictError`."""
-    content = read_named_file(file, LARGEST_BYTES, InputError)
+    content = read_named_file(file, MAX_FILE_BYTES, InputError)
     table = _read(file, content)
     digest = hashlib.sha256(content).hexdigest()
     unit = Unit(f"receive/{digest}", 1)
@@ -296,21 +311,24 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
     report = CountedReport(str(file), new, len(table), drives, rows or 0)
     if not new:
         return report
-    _require_possible(file, table)
-    mine = _gram_rows(table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
+    sets = counted_sets(warehouse.catalog)
+    _require_possible(sets, file, table)
+    new_rows = _gram_rows(sets, table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
+    numbered = _numbered(_with_digests(new_rows))
+    _require_different(file, numbered)
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
         if grams.landed(unit.name) is not None:  # meanwhile, by another process
             return
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-        _require_allowed(file, warehouse, mine)
-        _require_new(file, grams, mine)
+        _require_allowed(file, warehouse, numbered)
+        _require_new(file, grams, numbered)
         replaced = files_to_rewrite(grams, frozenset())
-        kept = list(rows_to_keep(grams, replaced, frozenset()))
+        merged = list(rows_to_keep(grams, replaced, frozenset()))
         single = Unit(ONE_AT_A_TIME, (grams.version or 0) + 1)
         grams.commit_or_discard(
-            Change(write_rows(warehouse, [*kept, mine]), replaced, [unit, single], _NOTE)
+            Change(write_rows(warehouse, [*merged, new_rows]), replaced, [unit, single], _NOTE)
         )
 
     retry_conflicts(attempt)
@@ -319,65 +337,143 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
 
 def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
+    stream = pa.BufferReader(content)
+    require_small_footer(stream, file)
     try:
-        parquet = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-        rows = parquet.metadata.num_rows
-        unpacked_bytes = _require_checksums(file, content, parquet.metadata)
-        if not rows:
-            raise InputError(f"{file}: has no Gram rows.")
-        if rows > MOST_ROWS or unpacked_bytes > MOST_UNPACKED_BYTES:
-            raise InputError(
-                f"{file}: more than {MOST_ROWS:,} Gram rows, or than 1 GiB of them. Split it."
-            )
-        table = parquet.read()
-        absent = [name for name in COLUMNS.names if name not in {*table.column_names, *OPTIONAL}]
-        if absent:
-            raise InputError(
-                f"{file}: not a table of Gram rows, column {absent[0]} is missing. {_SEE}"
-            )
-        return in_schema(table, COLUMNS).combine_chunks()
+        _require_decodable(file, content)
+        parquet = pq.ParquetFile(stream)
+        columns = _documented_columns(file, parquet.schema_arrow)
+        # Texts stay in dictionaries until their length is known: one can stand in every row.
+        texts = [
+            name
+            for name in TEXTS
+            if name in columns and not pa.types.is_null(parquet.schema_arrow.field(name).type)
+        ]
+        parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
+        batches = list(_decode(file, parquet.iter_batches(BATCH_ROWS_READ, columns=columns)))
     except (pa.ArrowException, OSError, ValueError, IndexError):
         raise InputError(f"{file}: not a table of Gram rows (docs/export.md). {_SEE}") from None
+    if not batches:
+        raise InputError(f"{file}: has no Gram rows.")
+    return pa.concat_tables(batches).combine_chunks()
 
 
 _NOTE = {"job": "receive"}
 _SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping suggest LOG"
 
 
-def _require_checksums(file: Path, content: bytes, metadata: pq.FileMetaData) -> int:
-    """Return the bytes unpacked. Raises `InputError` for pages without a checksum.
-
-    Without it a flipped bit of a product goes unseen. Arrow compares checksums where there are any,
-    and does not say where: they are the field 4 of a page's header, after type and sizes.
-    """
-    unpacked = 0
-    for group in range(metadata.num_row_groups):
-        for column in range(metadata.num_columns):
-            chunk = metadata.row_group(group).column(column)
-            unpacked += chunk.total_uncompressed_size
-            at = chunk.dictionary_page_offset or chunk.data_page_offset
-            for _ in range(3):  # a byte that says field and type, then a number of 7 bits a byte
-                at += 1
-                while content[at] & 0x80:
-                    at += 1
-                at += 1
-            if content[at] != _NEXT_FIELD_I32:
+def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
+    """Return the columns of Gram rows that a file has. Raises `InputError` for missing ones."""
+    for field in COLUMNS:
+        if field.name not in {*schema.names, *OPTIONAL}:
+            raise InputError(
+                f"{file}: not a table of Gram rows, column {field.name} is missing. {_SEE}"
+            )
+        places = schema.get_all_field_indices(field.name)
+        if len(places) > 1:
+            raise InputError(f"{file}: has two columns {field.name}. Leave one of them out.")
+        for kind in (schema.field(place).type for place in places):
+            if not _is_convertible(kind, field.type):
                 raise InputError(
-                    f"{file}: its pages have no checksums. Write it with them, as by "
-                    "pyarrow.parquet.write_table(..., write_page_checksum=True)."
+                    f"{file}: column {field.name} has the type {shown(kind)[:80]}; write it as "
+                    f"{field.type} (docs/export.md)."
                 )
-    return unpacked
+    return [name for name in COLUMNS.names if name in schema.names]
 
 
-_NEXT_FIELD_I32 = 0x15
-"""In Thrift's compact protocol: the next field, an integer of 32 bits."""
+def _is_convertible(kind: pa.DataType, to: pa.DataType) -> bool:
+    types = pa.types
+    if types.is_list(to):
+        is_list = types.is_list(kind) or types.is_large_list(kind)
+        return bool(is_list and types.is_integer(kind.value_type))
+    if to == pa.string():
+        kind = kind.value_type if types.is_dictionary(kind) else kind
+        return bool(types.is_string(kind) or types.is_large_string(kind) or types.is_null(kind))
+    is_same = types.is_date if types.is_date(to) else types.is_integer
+    return bool(is_same(kind) or types.is_null(kind))
 
 
-def _gram_rows(table: pa.Table, schema: pa.Schema, name: str) -> pa.Table:
+def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows of batches, with normalized names. Raises `InputError` for what is too long.
+
+    Texts are converted only if all of them fit.
+    """
+    first, text_bytes = 1, 0
+    for batch in batches:
+        batch.validate(full=True)  # texts are UTF-8
+        columns = {name: batch[name] for name in batch.schema.names}
+        for name in (name for name in TEXTS if name in columns):
+            texts = columns[name].cast(pa.dictionary(pa.int32(), pa.string()))
+            if name in NAMES:
+                names = [normalize_name(text) for text in texts.dictionary.to_pylist()]
+                for place, text in enumerate(names):
+                    if text and (fault := find_name_fault(text)):
+                        row = pc.index(texts.indices, place).as_py()
+                        _refuse(
+                            file, first + row, batch["drive_id"][row], f"has a {name} that {fault}"
+                        )
+                texts = pa.DictionaryArray.from_arrays(texts.indices, pa.array(names, pa.string()))
+            lengths = pc.binary_length(texts.dictionary).take(texts.indices)
+            text_bytes += pc.sum(lengths).as_py() or 0
+            if text_bytes > MAX_TEXT_BYTES:
+                raise _too_large(file)
+            columns[name] = texts.dictionary_decode()
+        yield in_schema(pa.table(columns), COLUMNS)
+        first += len(batch)
+
+
+def _too_large(file: Path) -> InputError:
+    return InputError(
+        f"{file}: it decodes to more than {MAX_ROWS:,} Gram rows, 1 GiB of them or 256 MiB of "
+        "their texts. Split it."
+    )
+
+
+def _require_decodable(file: Path, content: bytes) -> None:
+    """Raise `InputError` for pages that decode to too much, or that have no checksum.
+
+    The headers of all pages are read, since the footer can state other sizes. Without a checksum a
+    flipped bit of a product goes unseen.
+    """
+    groups = read_row_groups(content)
+    if sum(group.rows for group in groups) > MAX_ROWS:
+        raise _too_large(file)
+    decoded, pages = 0, 0
+    for group in groups:
+        for chunk in (chunk for chunk in group.chunks if chunk.column in COLUMNS.names):
+            values = 0
+            for page in read_page_headers(content, chunk):
+                if not page.has_checksum:
+                    raise InputError(
+                        f"{file}: its pages have no checksums. Write it with them, as by "
+                        "pyarrow.parquet.write_table(..., write_page_checksum=True)."
+                    )
+                if page.encoding == DELTA_BYTE_ARRAY:
+                    raise InputError(
+                        f"{file}: column {chunk.column} has the encoding DELTA_BYTE_ARRAY. Write "
+                        "it with the default encodings of pyarrow."
+                    )
+                decoded += max(page.size_bytes, page.values * VALUE_BYTES)
+                values += 0 if page.is_dictionary else page.values
+                pages += 1
+                if decoded > MAX_DECODED_BYTES or pages > MAX_PAGES:
+                    raise _too_large(file)
+            if values != chunk.values:  # the reader would go on behind the pages
+                raise ValueError("the footer and the pages state different numbers of values")
+
+
+VALUE_BYTES = 8
+MAX_PAGES = 2**18
+"""Pages of a file; a header takes some 10 µs to read."""
+
+
+def _gram_rows(
+    sets: Mapping[str, CountedSet], table: pa.Table, schema: pa.Schema, name: str
+) -> pa.Table:
     """Return rows of `grams`."""
-    identities = {one.key: identity for identity, one in counted_sets().items()}
-    sets = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
-    rows = table.set_column(table.column_names.index("feature_set"), "feature_set", sets)
+    identities = {counted.key: identity for identity, counted in sets.items()}
+    names = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
+    rows = table.set_column(table.column_names.index("feature_set"), "feature_set", names)
     rows = rows.append_column("file", pa.repeat(name, len(table)))
     return in_schema(rows.append_column("clipped", pa.repeat(0, len(table))), schema)
 
@@ -386,8 +482,8 @@ def _refuse(
     file: Path, row: int, drive: object, reason: str, error: type[InputError] = InputError
 ) -> NoReturn:
     raise error(
-        f"{file}: row {row} (drive {shown(str(drive))}) {reason}. Nothing of the file was loaded: "
-        "correct or remove the row, and load the file again."
+        f"{file}: row {row} (drive {shown(str(drive)[:MAX_NAME_CHARACTERS])}) {reason}. Nothing "
+        "of the file was loaded: correct or remove the row, and load the file again."
     )
 
 
@@ -395,47 +491,74 @@ def _numbered(table: pa.Table) -> pa.Table:
     return table.append_column("number", pa.array(range(1, len(table) + 1)))
 
 
-def _require_possible(file: Path, table: pa.Table) -> None:
+def _with_digests(rows: pa.Table) -> pa.Table:
+    digests, eventful = gram_digests(rows)
+    rows = rows.append_column("digest", pa.array(digests, pa.string()))
+    return rows.append_column("is_eventful", pa.array(eventful))
+
+
+def _require_different(file: Path, rows: pa.Table) -> None:
+    """Raise `InputError` for the first row with the counts of a row before it."""
+    seen: dict[str, str] = {}
+    drives, digests = rows["drive_id"].to_pylist(), rows["digest"].to_pylist()
+    for row, (drive, digest) in enumerate(zip(drives, digests, strict=True), 1):
+        if (other := seen.setdefault(digest, drive)) != drive:
+            _refuse(file, row, drive, f"is there twice, first as {shown(other)}")
+
+
+def _require_possible(sets: Mapping[str, CountedSet], file: Path, table: pa.Table) -> None:
     """Raise `InputError` for the first row that no drive can have."""
-    sets = {one.key: one for one in counted_sets().values()}
-    known = [
-        {"columns": one.columns, "parts": [part or "" for part in one.parts]}
-        | {"key": key, "in_time": one.in_time}
-        for key, one in sets.items()
+    by_key = {counted.key: counted for counted in sets.values()}
+    described = [
+        {"columns": counted.columns, "parts": [part or "" for part in counted.parts]}
+        | {"key": key, "in_time": counted.in_time}
+        for key, counted in by_key.items()
     ]
     late = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
     with open_database() as database, database_errors("checking Gram rows"):
         database.register("counted", _numbered(table))
-        database.register("known", pa.Table.from_pylist(known))
+        database.register("known", pa.Table.from_pylist(described))
         statement = read_sql("jobs", "counted_wrong.sql")
         wrong = database.execute(statement, {**late, "longest": LONGEST_ROWS}).fetchone()
     if wrong:
         _refuse(file, *wrong)
-    for row, reason in impossible_rows(_numbered(table), sets):
+    for row, reason in impossible_rows(_numbered(table), by_key):
         _refuse(file, row["number"], row["drive_id"], reason)
 
 
 def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:
-    """Raise `InputError` for a car or a drive that was forgotten."""
-    cars, drives = (rows[name].cast(pa.string()) for name in ("vehicle_id", "drive_id"))
-    barred = Audit(warehouse.root).barred(cars.unique().to_pylist(), drives.unique().to_pylist())
-    for row, (car, drive) in enumerate(zip(cars.to_pylist(), drives.to_pylist(), strict=True), 1):
+    """Raise `InputError` for a car or a drive that was forgotten, or that has such counts."""
+    audit = Audit(warehouse.root)
+    cars, drives = (rows[name].to_pylist() for name in NAMES)
+    barred, counts = audit.barred(set(cars), set(drives)), audit.barred_counts()
+    for row, (car, drive, digest) in enumerate(
+        zip(cars, drives, rows["digest"].to_pylist(), strict=True), 1
+    ):
         if car in barred.vehicles or drive in barred.drives:
             _refuse(file, row, drive, "was forgotten; fleet-slip forget --allow lets it come back")
+        if digest in counts:
+            _refuse(file, row, drive, "has the counts of a drive that was forgotten")
 
 
 def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
-    """Raise `RepeatedError` for a drive that is there, with a log or without, under any name."""
+    """Raise `RepeatedError` for a drive that is there, with a log or without, under any name.
+
+    Raises `InputError` for a car that would drive more than 24 hours on a day.
+    """
     if not grams.paths:
         return
-    statement = read_sql("jobs", "counted_again.sql").format(
-        received=RECEIVED_FILES, plain=features().identity(PLAIN)
-    )
     with open_database(reading=grams.table.folder) as database:
-        database.register("counted", _numbered(rows))
+        database.register("counted", rows)
         database.execute("SET VARIABLE gram_files = $files", {"files": grams.paths})
         with reading_files(database, "looking for drives that are there"):
-            found = database.execute(statement).fetchone()
-    if found:
-        row, drive, there = found
+            statement = read_sql("jobs", "counted_again.sql").format(received=RECEIVED_FILES)
+            again = database.execute(statement).fetchone()
+            statement = read_sql("jobs", "counted_time.sql")
+            over = None if again else database.execute(statement, [LONGEST_ROWS]).fetchone()
+    if again:
+        row, drive, there = again
         _refuse(file, row, drive, f"is there already, as {shown(there)}", RepeatedError)
+    if over:
+        row, drive = over
+        reason = "makes its car drive more than 24 hours on a day, with what is stored"
+        _refuse(file, row, drive, reason)

@@ -1,7 +1,6 @@
 """Opens the Gram rows of a warehouse, once for cohort after cohort."""
 
 import contextlib
-import os
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -9,28 +8,29 @@ from dataclasses import dataclass
 from datetime import date
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.course import TURNED
-from fleet_slip.catalogue.facts import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import TURNED
+from fleet_slip.catalog.facts import (
     ALL_DRIVES,
     CALIBRATION,
     LONGEST_PAUSE_S,
     RECEIVER,
     TRAINING_DRIVES,
 )
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import Condition, asking
+from fleet_slip.warehouse.connections import IdleConnection
 from fleet_slip.warehouse.tables import Warehouse, gram_snapshots, lock, open_tables
 
 BATCH_ROWS = 2**13
@@ -53,6 +53,7 @@ HASHES = ("drive_hash", "vehicle_hash", "trip_hash")
 class OpenedGrams:
     """A connection to Gram rows."""
 
+    catalog: Catalog
     database: duckdb.DuckDBPyConnection
     identity: str
     logs_version: int
@@ -64,7 +65,8 @@ class OpenedGrams:
             feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
         )
         values |= {"condition": condition.sql, "feature_set": self.identity, "trips": trips}
-        values |= {"receiver": RECEIVER if RECEIVER in catalogue().drive else f"NULL AS {RECEIVER}"}
+        has_receiver = RECEIVER in self.catalog.signals.drive
+        values |= {"receiver": RECEIVER if has_receiver else f"NULL AS {RECEIVER}"}
         return read_sql("jobs", name).format(**values)
 
     def rows(self, condition: Condition) -> pa.Table:
@@ -78,8 +80,8 @@ class OpenedGrams:
     def batches(self, condition: Condition, *more: str) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort, in any order: `SUMMED` and `more` columns of them."""
         columns = ", ".join([*SUMMED, *more])
-        one = features().feature_set(features().name_of(self.identity))
-        rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(one.columns))))
+        feature_set = self.catalog.feature_set(self.catalog.name_of(self.identity))
+        rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(feature_set.columns))))
         text = f"SELECT {columns} FROM ({self.statement('cohort.sql', condition)})"
         with asking(self.database, condition):
             yield from self.database.sql(text).to_arrow_reader(rows)
@@ -93,14 +95,14 @@ class OpenedGrams:
 
     def count_left_out(self, condition: Condition) -> int:
         """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
-        if self.identity == features().identity(PLAIN):
+        if self.identity == self.catalog.identity(PLAIN):
             return 0
         [(count,)] = self._rows(self.statement("count_without_log.sql", condition), condition)
         return int(count)
 
     def label_sources(self, condition: Condition) -> list[tuple[str, str | None, int]]:
         """Return source, campaign and number of the rows of a cohort that have the label."""
-        statement = self.statement("label_sources.sql", condition, label=catalogue().label)
+        statement = self.statement("label_sources.sql", condition, label=self.catalog.signals.label)
         return [(source, name, int(n)) for source, name, n in self._rows(statement, condition)]
 
     def files(self, condition: Condition) -> set[str]:
@@ -122,11 +124,11 @@ class GramReader:
     """The newest Gram rows of a warehouse, for one cohort after another of one thread.
 
     What was opened is used again until somebody commits: a cohort then costs its query alone. The
-    next reader of this process takes it over, since DuckDB takes 20 ms to begin.
+    next reader of the warehouse takes it over, since DuckDB takes 20 ms to begin.
     """
 
     def __init__(self, warehouse: Warehouse) -> None:
-        self._warehouse = warehouse
+        self.warehouse, self.catalog = warehouse, warehouse.catalog
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
         self._database: duckdb.DuckDBPyConnection | None = None
@@ -139,9 +141,9 @@ class GramReader:
         if kind or not self._grams or not self._logs or self._grams.size_bytes > KEPT_BYTES:
             self._close()
         elif self._database and self._uses < USES:
-            if left := _take_left(self._grams, self._logs):
-                left.database.close()
-            _left.append(_Left(os.getpid(), self._grams, self._logs, self._database, self._uses))
+            connection = IdleConnection(self._grams, self._logs, self._database, self._uses)
+            self.warehouse.connections.put(connection)
+            self._database = None
         else:
             self._close()
 
@@ -150,32 +152,33 @@ class GramReader:
 
         Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
         """
-        grams, logs = gram_snapshots(self._warehouse, self._grams, self._logs)
+        grams, logs = gram_snapshots(self.warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
             self._close()
         self._logs, self._grams = logs, grams
         if not grams.rows:
             fill = "fleet-slip simulate CAMPAIGN (or fleet-slip ingest FILE --mapping M), then "
             raise DataError(
-                f"{self._warehouse.root}: there are no Gram rows yet. "
+                f"{self.warehouse.root}: there are no Gram rows yet. "
                 f"Run: {'' if logs.rows else fill}fleet-slip gram."
             )
-        one = features().feature_set(feature_set)
-        for name in (feature_set, *([CALIBRATION] if one.calibrated else [])):
+        calibrated = self.catalog.feature_set(feature_set).calibrated
+        for name in (feature_set, *([CALIBRATION] if calibrated else [])):
             if name != PLAIN:
                 rows = partial(self._opened, grams, logs, name)
-                _require_complete(logs, grams, rows, name, condition)
+                _require_complete(self.catalog, logs, grams, rows, name, condition)
         return self._opened(grams, logs, feature_set)
 
     def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
-        if self._database is None and (left := _take_left(grams, logs)):
-            self._database, self._uses = left.database, left.uses + 1
+        if self._database is None and (idle := self.warehouse.connections.take(grams, logs)):
+            self._database, self._uses = idle.database, idle.uses + 1
         if self._database is None:
-            self._database = open_tables(self._warehouse, {"grams"}, [grams, logs])
+            self._database = open_tables(self.warehouse, {"grams"}, [grams, logs])
             lock(self._database, grams.paths)
         return OpenedGrams(
+            self.catalog,
             self._database,
-            features().identity(feature_set),
+            self.catalog.identity(feature_set),
             logs.version or 0,
             grams.version or 0,
         )
@@ -193,33 +196,6 @@ KEPT_BYTES = 2**27
 """A database of larger Gram rows waits for no other reader: it may hold them in memory."""
 
 
-class _Left(NamedTuple):
-    process: int
-    grams: Snapshot
-    logs: Snapshot
-    database: duckdb.DuckDBPyConnection
-    uses: int
-
-
-_left: list[_Left] = []
-"""What the last reader opened. What a process had before it forked stays: its threads are gone."""
-
-
-def _take_left(grams: Snapshot, logs: Snapshot) -> _Left | None:
-    """Return what the last reader opened, if that is what there is; else close it."""
-    try:
-        left = _left.pop()
-    except IndexError:
-        return None
-    if left.process != os.getpid():
-        _left.insert(0, left)
-    elif left.grams is grams and left.logs is logs:
-        return left
-    else:
-        left.database.close()
-    return None
-
-
 @contextlib.contextmanager
 def open_grams(
     source: Warehouse | GramReader,
@@ -235,18 +211,19 @@ def open_grams(
 
 
 def _require_complete(
+    catalog: Catalog,
     logs: Snapshot,
     grams: Snapshot,
     opened: Callable[[], OpenedGrams],
     feature_set: str,
     condition: Condition,
 ) -> None:
-    backlog = find_backlog(logs, grams, features().identity(feature_set))
+    backlog = find_backlog(logs, grams, catalog.identity(feature_set))
     if not backlog.missing and not backlog.stale:
         return
     files = opened().files(condition)
     if not files and feature_set != CALIBRATION:  # that may come from another root
-        unknown = find_backlog(logs, grams, features().identity(PLAIN)).missing
+        unknown = find_backlog(logs, grams, catalog.identity(PLAIN)).missing
         if unknown:
             raise NotComputedError(
                 f"{feature_set} features are missing: {len(unknown)} log files have no Gram rows "

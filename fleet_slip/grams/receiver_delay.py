@@ -19,14 +19,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
-from fleet_slip.catalogue.facts import DELAY, RECEIVED_FILES, RECEIVER
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalog.facts import DELAY, RECEIVED_FILES, RECEIVER
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
+from fleet_slip.warehouse.erased import find_erased, names_by_column
+from fleet_slip.warehouse.tables import Warehouse
 
 SPAN, STEP, STEPS = 40, 5, 12
 """Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
@@ -248,15 +249,22 @@ GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
 """What a delay is a whole number of, s."""
 
 
-def course_delays(grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
-    """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files."""
+def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
+    """Return each car's course delay in parts of a tick, of Gram rows of the `active` log files.
+
+    Rows of erased cars and drives, which an old backup brought back, do not count.
+    """
+    erased = find_erased(warehouse.root, grams.table, [grams])
     counted = pa.array(sorted(active), pa.string())
     columns = ("file", "day", "vehicle_id", "drive_id", RECEIVER)
 
     def batches() -> Iterator[pa.RecordBatch]:
-        identity = features().identity(DELAY)
+        identity = warehouse.catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
             counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
+            for column, names in names_by_column(erased).items():
+                returned = pc.is_in(rows[column].cast(pa.string()), pa.array(names, pa.string()))
+                counts = pc.and_(counts, pc.invert(returned))
             yield from rows.filter(counts).to_batches()
 
     least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE

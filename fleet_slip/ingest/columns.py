@@ -18,8 +18,8 @@ import pint
 import polars as pl
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import HALF_TURN, Identifier, Signal, catalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import HALF_TURN, Identifier, Signal, SignalCatalog
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
 
@@ -210,12 +210,12 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
         )
 
 
-def count_range(name: str, column: SignalColumn) -> tuple[Signal, int, int]:
+def count_range(signals: SignalCatalog, name: str, column: SignalColumn) -> tuple[Signal, int, int]:
     """Return the signal as which a column is checked, a course in any turn, and its counts."""
     if column.component:
-        speed = catalogue()[SATELLITE_SPEED]
+        speed = signals[SATELLITE_SPEED]
         return speed, -speed.max_count, speed.max_count
-    signal = catalogue()[name]
+    signal = signals[name]
     if name == COURSE:
         return signal, -4 * HALF_TURN, 4 * HALF_TURN
     return signal, signal.min_count, signal.max_count
@@ -367,7 +367,7 @@ _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {
 class RowCondition(Config):
     """A condition on one column, in the column's own unit; a missing value does not meet it.
 
-    Or on a signal that the mapping makes of a column, in the catalogue's unit.
+    Or on a signal that the mapping makes of a column, in the catalog's unit.
     """
 
     column: Name | None = None

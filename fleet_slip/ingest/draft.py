@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from fleet_slip.base import shown
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.guess import (
@@ -44,13 +44,15 @@ class Draft:
     """Those with doubts, or with rivals."""
     drive: dict[str, dict[str, str]]
     """The columns that identify cars and trips, by key of `[drive]`."""
+    absent: tuple[str, ...]
+    """The signals that no channel looks like."""
     open_questions: tuple[str, ...]
     """What only a person knows, and what of the file was not read."""
 
 
-def draft_mapping(file: Path, profile: FileProfile) -> Draft:
+def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> Draft:
     """Guess a mapping. Raises `InputError` if nothing in the file looks like a signal."""
-    guesses = guess_signals(profile.profiles)
+    guesses = guess_signals(signals, profile.profiles)
     if not guesses:
         names = ", ".join(repr(p.channel.name) for p in profile.profiles[:30])
         raise InputError(
@@ -66,9 +68,10 @@ def draft_mapping(file: Path, profile: FileProfile) -> Draft:
     if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SATELLITE_SPEED}  # which stand together
     sure = {name: guess for name, guess in guesses.items() if name not in asked_for}
-    left = {name: guess for name, guess in guesses.items() if name in asked_for}
+    doubtful = {name: guess for name, guess in guesses.items() if name in asked_for}
     notes = (*_notes(profile, guesses), *_refused(profile))
-    return Draft(file, profile, time, sure, left, drive_keys, notes)
+    absent = tuple(name for name in signals.signals if name not in guesses)
+    return Draft(file, profile, time, sure, doubtful, drive_keys, absent, notes)
 
 
 def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
@@ -186,10 +189,8 @@ def _signals(draft: Draft) -> str:
             if guess.readings:
                 lines.append(f"# Choose the unit too: {_choices(guess)}.")
             lines += ["# " + _line(name, o, draft.questions) for o in (guess, *guess.rivals)]
-    known = {*draft.guesses, *draft.questions}
-    absent = [name for name in catalogue().signals if name not in known]
-    if absent:
-        lines.append(f"# No channel looks like {', '.join(absent)}.")
+    if draft.absent:
+        lines.append(f"# No channel looks like {', '.join(draft.absent)}.")
     return "\n".join(lines) + "\n"
 
 

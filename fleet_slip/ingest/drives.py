@@ -12,9 +12,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.facts import MEASURED
-from fleet_slip.catalogue.signals import catalogue, digest_counts, round_chunks
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.facts import MEASURED
+from fleet_slip.catalog.signals import digest_counts, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.formats.source import EARLIEST_S
@@ -264,12 +264,14 @@ def to_ticks(
             own = _on_own_times(rows, signal, samples, resampler, intervals_s)
             values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
-        counts[signal] = round_chunks(values, catalogue()[signal])
+        counts[signal] = round_chunks(values, mapping.signal_catalog[signal])
     if COURSE in mapping.signals:
         counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
     counts |= place_label(mapping, counts)
     counts |= {
-        wheel: round_chunks([physical(counts, "steer")], catalogue()[wheel])
+        wheel: round_chunks(
+            [physical(mapping.signal_catalog, counts, "steer")], mapping.signal_catalog[wheel]
+        )
         for wheel in mapping.front_wheels
     }
     for signal in counts:
@@ -301,11 +303,11 @@ def _fixes(
         mapping.signals[COURSE],
         (samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()),
         _on_own_times(rows, COURSE, samples, resampler, intervals_s),
-        physical(counts, "yaw_rate"),
-        physical(counts, "ay") if "ay" in counts else None,
+        physical(mapping.signal_catalog, counts, "yaw_rate"),
+        physical(mapping.signal_catalog, counts, "ay") if "ay" in counts else None,
     )
-    of = zip((COURSE, SATELLITE_SPEED), fixes, strict=True)
-    return {name: round_chunks([values], catalogue()[name]) for name, values in of}
+    columns = zip((COURSE, SATELLITE_SPEED), fixes, strict=True)
+    return {name: round_chunks([values], mapping.signal_catalog[name]) for name, values in columns}
 
 
 def _resample(
@@ -316,9 +318,10 @@ def _resample(
     if not source.interpolate:
         return resampler.place(values, source.delay_s)
     longest_gap_s = source.longest_gap_s or mapping.time.longest_gap_s
-    between = resampler.hold if catalogue()[signal].stepwise else resampler.resample
+    between = resampler.hold if mapping.signal_catalog[signal].stepwise else resampler.resample
     resample = partial(between, delay_s=source.delay_s, longest_gap_s=longest_gap_s)
-    return _on_the_circle(resample, values) if signal == catalogue().label else resample(values)
+    is_label = signal == mapping.signal_catalog.label
+    return _on_the_circle(resample, values) if is_label else resample(values)
 
 
 def _resampler_of(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:

@@ -14,8 +14,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.ingest.columns import (
     CHOOSE,
     VELOCITY,
@@ -88,10 +88,10 @@ class Guess:
         return replace(self, doubts=(*self.doubts, doubt))
 
 
-def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
+def guess_signals(catalog: SignalCatalog, profiles: tuple[Profile, ...]) -> dict[str, Guess]:
     """Return the best guess for each signal that has one; a channel is one signal at most."""
-    scored = [one for p in profiles if p.is_number for one in _scored(p)]
-    scored.sort(key=lambda one: -one[0])
+    scored = [pair for p in profiles if p.is_number for pair in _scored(catalog, p)]
+    scored.sort(key=lambda pair: -pair[0])
     guesses: dict[str, Guess] = {}
     best: dict[str, float] = {}
     taken: set[str] = set()
@@ -107,10 +107,10 @@ def guess_signals(profiles: tuple[Profile, ...]) -> dict[str, Guess]:
             guesses[signal] = replace(first, rivals=(*first.rivals, guess))
     guesses = _satellites(guesses)
     signed = {name: _with_sign(guess, profiles) for name, guess in guesses.items()}
-    return {name: signed[name] for name in catalogue().signals if name in signed}
+    return {name: signed[name] for name in catalog.signals if name in signed}
 
 
-def _scored(profile: Profile) -> Iterator[tuple[float, Guess]]:
+def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, Guess]]:
     """Yield what a channel may be, with how well it fits."""
     if not profile.channel.name.isprintable():
         return
@@ -121,7 +121,7 @@ def _scored(profile: Profile) -> Iterator[tuple[float, Guess]]:
         if weak:
             score, words = best_words(signal, name, "weak")
             score *= _WEAK
-        if not score or (guess := _guess(signal, profile, words)) is None:
+        if not score or (guess := _guess(catalog, signal, profile, words)) is None:
             continue
         fits = 0.0 if guess.readings else _UNIT_FITS
         yield score + fits, replace(guess, is_weak=weak)
@@ -186,7 +186,7 @@ def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
     ]
 
 
-def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
+def _guess(catalog: SignalCatalog, signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
     name, in_brackets = split_unit(profile.channel.name)
     largest = float(np.nanquantile(np.abs(profile.values), 0.999))  # but for outliers
@@ -195,31 +195,32 @@ def _guess(signal: str, profile: Profile, words: str) -> Guess | None:
     how = "the format calls it" if profile.channel.title else "its name contains"
     named = f"{how} {words!r}"
     if unit is None:
-        several: tuple[Keys, ...] = tuple({"unit": u} for u in _UNITS_OF[_si_unit(signal)])
+        units = _UNITS_OF[_si_unit(catalog, signal)]
+        several: tuple[Keys, ...] = tuple({"unit": unit} for unit in units)
         unknown = f" that is known: {text!r}" if text else ""
         reason = f"the file has no unit{unknown}; values up to {largest:.3g}"
         readings = _OF_WHEELS if signal in WHEELS else several
         return Guess(signal, profile, {"unit": CHOOSE}, (named, reason), readings=readings)
     radii = (None, RADIUS_M) if signal in WHEELS else (None,)
-    fitting = [radius for radius in radii if measures(unit, _si_unit(signal, radius))]
+    fitting = [radius for radius in radii if measures(unit, _si_unit(catalog, signal, radius))]
     if not fitting:
         return None
     keys: Keys = {"unit": unit} | ({"radius_m": fitting[0]} if fitting[0] else {})
     guess = Guess(signal, profile, keys, (named, f"its unit is {unit}"))
-    if signal not in catalogue().signals or catalogue()[signal].cyclic:
+    if signal not in catalog.signals or catalog[signal].cyclic:
         return guess
-    factor = conversion_factor(unit, _si_unit(signal, fitting[0])) / (fitting[0] or 1.0)
-    known, in_si = catalogue()[signal], largest * factor
-    most = float(max(-known.min, known.max))
-    if in_si <= most:
+    factor = conversion_factor(unit, _si_unit(catalog, signal, fitting[0])) / (fitting[0] or 1.0)
+    entry, in_si = catalog[signal], largest * factor
+    limit = float(max(-entry.min, entry.max))
+    if in_si <= limit:
         return guess
     return guess.doubted(
-        f"in {unit} it would reach {in_si:.3g} {known.unit}; the limit of the catalogue is {most:g}"
+        f"in {unit} it would reach {in_si:.3g} {entry.unit}; the limit of the catalog is {limit:g}"
     )
 
 
-def _si_unit(signal: str, radius_m: float | None = None) -> str:
-    return VELOCITY if signal in {"north", "east"} or radius_m else catalogue()[signal].unit
+def _si_unit(catalog: SignalCatalog, signal: str, radius_m: float | None = None) -> str:
+    return VELOCITY if signal in {"north", "east"} or radius_m else catalog[signal].unit
 
 
 # Units that a file does not say: a person chooses among those of other files.

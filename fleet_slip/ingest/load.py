@@ -22,10 +22,10 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import as_arrow, catalogue
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import SignalCatalog, as_arrow
 from fleet_slip.compute.tasks import run_tasks
-from fleet_slip.errors import ConflictError, InputError, RepeatedError
+from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
@@ -107,7 +107,7 @@ class IngestReport(_Judged):
 
 @dataclass(frozen=True)
 class SignalRange:
-    """The values of a signal in a file, in the catalogue's unit."""
+    """The values of a signal in a file, in the catalog's unit."""
 
     signal: str
     unit: str
@@ -197,8 +197,14 @@ def ingest_files(
     unless it is to be replaced: then `take_out` takes it out in the same commit.
 
     At the end raises `InputError`, which names all files that cannot be used, or `RepeatedError`
-    where all of these are there already; and `ClusterError` for files that workers died of.
+    where all of these are there already; `ClusterError` for files that workers died of; and
+    `ConfigError` for a mapping of other signals.
     """
+    if mapping.signal_catalog != warehouse.catalog.signals:  # counts would have another scale
+        raise ConfigError(
+            f"the mapping {mapping.name!r} was loaded with other signals than those of "
+            f"{warehouse.root}. Load it with the configs of this data root."
+        )
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
     failures: list[InputError] = []
@@ -307,20 +313,22 @@ def write_batch(
                 written.append(one)
                 if one.report.new:
                     longest.append((one.report, stream.longest))
-        _judge_longest(longest)
+        _judge_longest(mapping.signal_catalog, longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
 
 
-def _judge_longest(found: Iterable[tuple[_Judged, MeasuredDrive | None]]) -> None:
+def _judge_longest(
+    signals: SignalCatalog, results: Iterable[tuple[_Judged, MeasuredDrive | None]]
+) -> None:
     """Add what looks wrong in the longest drive of files to the report of its file.
 
     It stands for all, since to look at a drive takes longer than to load a small file.
     """
-    drives = [(report, drive) for report, drive in found if drive is not None]
+    drives = [(report, drive) for report, drive in results if drive is not None]
     if drives:
-        report, drive = max(drives, key=lambda one: one[1].ticks.size)
-        report.suspicions += tuple(find_suspicions(signals_of(drive)))
+        report, drive = max(drives, key=lambda pair: pair[1].ticks.size)
+        report.suspicions += tuple(find_suspicions(signals, signals_of(signals, drive)))
 
 
 class _Writer:
@@ -414,9 +422,9 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     """
     previews: list[Preview] = []
     for batch in _batches(map(AskedFile, logs)):
-        found = [preview_log(asked.file, mapping) for asked in batch]
-        _judge_longest(found)
-        previews += [preview for preview, _ in found]
+        results = [preview_log(task.file, mapping) for task in batch]
+        _judge_longest(mapping.signal_catalog, results)
+        previews += [preview for preview, _ in results]
     return previews
 
 
@@ -433,10 +441,11 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
         of_rows = stream.suspicions()  # which may look into the file again
     ranges = []
     for name, some in ends.items():
-        scale = float(catalogue()[name].scale)
+        signal = mapping.signal_catalog[name]
+        scale = float(signal.scale)
         low, high = (scale * min(some), scale * max(some)) if some else (np.nan, np.nan)
         missing = 1 - values[name] / max(stream.counts.ticks, 1)
-        ranges.append(SignalRange(name, catalogue()[name].unit, low, high, missing))
+        ranges.append(SignalRange(name, signal.unit, low, high, missing))
     return Preview(str(log), stream.counts, of_rows, tuple(ranges)), stream.longest
 
 
@@ -444,14 +453,14 @@ MOST_TICKS = 200_000
 """Ticks of the longest drive that are looked at: half an hour."""
 
 
-def signals_of(drive: MeasuredDrive) -> Signals:
+def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
     """Return the signals of the beginning of a drive, as `find_suspicions` takes them."""
-    kept = drive.ticks - drive.ticks[0] < MOST_TICKS
+    selected = drive.ticks - drive.ticks[0] < MOST_TICKS
     counts = {  # by Polars: Arrow's own would load pandas
-        name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[kept]
+        name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[selected]
         for name, values in drive.counts.items()
     }
-    return on_every_tick(drive.ticks[kept], counts)
+    return on_every_tick(signals, drive.ticks[selected], counts)
 
 
 # Data files of bounded size. Nothing is committed yet.
@@ -543,16 +552,16 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     drive_of_row = np.repeat(np.arange(len(drives)), [drive.ticks.size for drive in drives])
-    columns = {}
-    for column in catalogue().log_schema:
+    columns, signal_catalog = {}, mapping.signal_catalog
+    for column in signal_catalog.log_schema:
         if column.name == "tick":
             ticks = [as_arrow(drive.ticks) for drive in drives]
             columns[column.name] = pa.chunked_array(ticks, column.type)
         elif column.name in mapping.signal_names:
             columns[column.name] = pa.chunked_array([drive.counts[column.name] for drive in drives])
-        elif column.name in catalogue().extras:
+        elif column.name in signal_catalog.extras:
             continue
-        elif column.name in catalogue().signals:
+        elif column.name in signal_catalog.signals:
             columns[column.name] = pa.nulls(drive_of_row.size, column.type)
         else:
             values = [drive.metadata.get(column.name) for drive in drives]

@@ -7,15 +7,14 @@ for a pattern, or be anything but a name.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import polars as pl
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import shown
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.base import find_name_fault, normalize_name, shown
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
     DateColumn,
@@ -203,7 +202,7 @@ def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
 # What a mapping takes from each row: values in SI units and their faults.
 
 LONGEST_TEXT = 200
-"""Characters of metadata that are accepted, and of offending values that are kept."""
+"""Characters of offending values that are kept."""
 
 
 def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
@@ -225,7 +224,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
             reasons = ("time_backwards", "time_duplicate", "isolated")
             cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
             fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
-    names = [name for name in catalogue().signals if name in mapping.signals]
+    names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
@@ -238,7 +237,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
 
 def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
-    met = pl.lit(value=True)
+    met = []
     for condition in mapping.where:
         of = condition.signal
         name = find_held(
@@ -246,13 +245,13 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
         )
         if of is not None:
             source = mapping.signals[of]
-            value = _si_value(of, source, _signed(source, name, schema, mapping)[0])
+            value = _si_value(mapping, of, source, _signed(source, name, schema, mapping)[0])
         elif condition.one_of:
             value = as_text(name, schema, mapping)
         else:
             value = as_number(name, schema, mapping)[0]
-        met &= condition.is_met(value)
-    return met
+        met.append(condition.is_met(value))
+    return pl.all_horizontal(met)
 
 
 def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> RowField:
@@ -264,11 +263,11 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
-    (signal, least, most), value = count_range(name, source), pl.col(name)
+    (signal, least, most), value = count_range(mapping.signal_catalog, name, source), pl.col(name)
     count = value / float(signal.scale)
     outside = (count <= least - 0.5) | (count >= most + 0.5)
     problem = _number_problems(name, present, (outside, "out_of_range"))
-    return RowField(name, "signal", raw, _si_value(name, source, number), problem)
+    return RowField(name, "signal", raw, _si_value(mapping, name, source, number), problem)
 
 
 def _signed(
@@ -284,8 +283,8 @@ def _signed(
     return signed, present & sign.is_not_null()
 
 
-def _si_value(name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
-    gain, bias = source.linear(catalogue()[name].unit)
+def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
+    gain, bias = source.linear(mapping.signal_catalog[name].unit)
     # Otherwise it would change nothing but the sign of zero.
     return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
 
@@ -297,9 +296,24 @@ def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
 
 
 def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    too_long = pl.col(name).str.len_chars() > LONGEST_TEXT
-    problem = find_problems((pl.col(name).is_null(), "missing"), (too_long, "out_of_range"))
-    return RowField(name, "key", pl.col(RAW + column), as_text(column, schema, mapping), problem)
+    text = as_text(column, schema, mapping)
+    value = text.map_batches(partial(_map_texts, normalize_name, pl.String), pl.String)
+    faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
+    problem = find_problems((pl.col(name).is_null(), "missing"), (faulty, "out_of_range"))
+    return RowField(name, "key", pl.col(RAW + column), value, problem)
+
+
+def _is_faulty(name: str) -> bool:
+    return find_name_fault(name) is not None
+
+
+def _map_texts(
+    function: Callable[[str], object], kind: pl.datatypes.DataTypeClass, texts: pl.Series
+) -> pl.Series:
+    """Return what a function makes of each text, called once for each different one."""
+    different = texts.drop_nulls().unique()
+    values = pl.Series([function(text) for text in different], dtype=kind)
+    return texts.replace_strict(different, values, default=None, return_dtype=kind)
 
 
 _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {

@@ -11,15 +11,17 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
+    PrivateAttr,
     ValidationError,
     ValidationInfo,
     field_validator,
     model_validator,
 )
 
-from fleet_slip.base import canonical_ascii, shown
-from fleet_slip.catalogue.course import COURSE
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, shown
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import COURSE
+from fleet_slip.catalog.signals import Identifier, SignalCatalog
 from fleet_slip.config import (
     Config,
     Name,
@@ -43,12 +45,13 @@ from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.ingest.suspicion import RADIUS_M
-from fleet_slip.resources import find_config
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
 OWN_SPEEDS = ("vx", "vehicle_speed")
 FRONT_WHEELS = ("steer_fl", "steer_fr")
+MAX_CONDITIONS = 64
+"""Conditions of one mapping. Evaluating them takes more than linear time and memory."""
 
 
 class LabelSensor(Config):
@@ -70,9 +73,8 @@ class LabelSensor(Config):
         """Whether it is not at the centre of gravity."""
         return bool(self.sensor_x_m or self.sensor_y_m)
 
-    def require_signals(self, signals: Container[str]) -> None:
+    def require_signals(self, signals: Container[str], label: str) -> None:
         """Raise `ValueError` for a mapping that lacks what the label is computed from."""
-        label = catalogue().label
         if self.from_velocities and label in signals:
             raise ValueError(f"label: from_velocities computes {label}: remove its column")
         needed = ["vx", "vy"] if self.from_velocities else [label]
@@ -90,11 +92,18 @@ class LabelSensor(Config):
 Fact = TypeVar("Fact")
 
 
+def signals_of(info: ValidationInfo) -> SignalCatalog:
+    """Return the signals that a mapping is validated against: the context of the validation."""
+    if not isinstance(info.context, SignalCatalog):
+        raise TypeError("a mapping is validated with a SignalCatalog as context")
+    return info.context
+
+
 def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
-    """Return a fact of a drive. Raises `ValueError` if the catalogue has no such column."""
-    if info.field_name not in catalogue().drive:
+    """Return a fact of a drive. Raises `ValueError` if the catalog has no such column."""
+    if info.field_name not in signals_of(info).drive:
         raise ValueError(
-            "the catalogue has no such drive column. Copy it from the shipped one: "
+            "the catalog has no such drive column. Copy it from the shipped one: "
             "configs/signals.toml"
         )
     return fact
@@ -124,18 +133,62 @@ class FromPath(Config):
 
     def find(self, file: Path) -> str:
         """Return what stands there in a file's path. Raises `InputError` for another path."""
-        known = {"{}": "([^/]+?)", "*": "[^/]*"}
-        parts = (known.get(part, re.escape(part)) for part in re.split(r"(\{\}|\*)", self.path))
+        components = self.path.split("/")
         path = os.path.abspath(file)  # noqa: PTH100 - follows no link
-        if not (found := re.search(f"/{''.join(parts)}$", path)):
-            raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
-        return found[1]
+        names = path.split("/")[1:][-len(components) :]
+        if len(names) == len(components):
+            matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
+            if None not in matches:
+                return "".join(value for value in matches if value is not None)
+        raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
+
+
+def match_name(pattern: str, name: str) -> str | None:
+    """Return the text that `{}` matches in a file's name, empty without one; None if none matches.
+
+    The time is that of the product of both lengths. A `*` takes as much as it can, the first one
+    first, and `{}` as little as it can, but one character.
+    """
+    elements = [element for element in re.split(r"(\{\}|\*)", pattern) if element]
+    positions = {len(name)}  # where the elements after the present one can begin
+    starts = [positions]
+    for element in reversed(elements):
+        if element in {"*", "{}"}:
+            positions = set(range(max(positions, default=-1) + (element == "*")))
+        else:
+            size = len(element)
+            ends = (end for end in positions if name.endswith(element, 0, end))
+            positions = {end - size for end in ends}
+        starts.insert(0, positions)
+    if 0 not in positions:
+        return None
+    position, value = 0, ""
+    for element, following in zip(elements, starts[1:], strict=True):
+        if element == "*":
+            position = max(following)
+        elif element == "{}":
+            end = min(start for start in following if start > position)
+            position, value = end, name[position:end]
+        else:
+            position += len(element)
+    return value
 
 
 Elsewhere = FromColumn | FromPath
 
+
+def _valid_name(text: str) -> str:
+    name = normalize_name(text)
+    if fault := find_name_fault(name):
+        raise ValueError(fault)
+    return name
+
+
+DriveText = Annotated[str, AfterValidator(_valid_name)]
+"""Name of a car, a track or another fact of a drive."""
+
 OptionalFact = Annotated[
-    Annotated[Name | Elsewhere, AfterValidator(require_drive_column)] | None,
+    Annotated[DriveText | Elsewhere, AfterValidator(require_drive_column)] | None,
     added(None),
 ]
 
@@ -147,9 +200,9 @@ class DriveMetadata(Config):
     """Every value of this column is a drive of its own."""
     day: date | Elsewhere | None = None
     """Date of the drive; with timestamps it may be left out and is that of the first row (UTC)."""
-    vehicle_id: Name | Elsewhere
-    vehicle_model: Name | Elsewhere
-    track: Name | Elsewhere | None = None
+    vehicle_id: DriveText | Elsewhere
+    vehicle_model: DriveText | Elsewhere
+    track: DriveText | Elsewhere | None = None
     mass_kg: PositiveFloat | Elsewhere | None = None
     tyres: OptionalFact = None
     receiver: OptionalFact = None
@@ -157,8 +210,12 @@ class DriveMetadata(Config):
 
 
 class Mapping(Config):
-    """How one kind of measured file becomes drives. Identifies itself by `name`."""
+    """How one kind of measured file becomes drives. Identifies itself by `name`.
 
+    It is validated with the signals of a catalog as context, and keeps them.
+    """
+
+    _signal_catalog: SignalCatalog = PrivateAttr()
     name: Identifier
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
@@ -171,7 +228,7 @@ class Mapping(Config):
     ]
     label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
-    where: tuple[RowCondition, ...] = added(())
+    where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
     """Conditions that a row meets, all of them, or is left out and only counted."""
 
     @field_validator("where", mode="before")
@@ -183,23 +240,24 @@ class Mapping(Config):
         return where
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Mapping":
+    def _consistent(self, info: ValidationInfo) -> "Mapping":
+        self._signal_catalog = signals_of(info)
         for condition in self.where:
             if condition.signal is not None and condition.signal not in self.signals:
                 raise ValueError(f"where: {condition.signal!r} is not a signal of this mapping")
             if condition.signal is not None and self.signals[condition.signal].component:
                 raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
-        known = catalogue().signals
+        signals = self._signal_catalog.signals
         for name, column in self.signals.items():
-            if name not in known:
-                raise ValueError(describe_unknown(name, known))
+            if name not in signals:
+                raise ValueError(describe_unknown(name, signals))
             try:
-                column.require_unit_of(name, known[name].unit)
+                column.require_unit_of(name, signals[name].unit)
             except ValueError as error:
                 raise ValueError(f"signals.{name}: {column.column} {error}") from None
         require_satellites(self.signals)
         if self.label is not None:
-            self.label.require_signals(self.signals)
+            self.label.require_signals(self.signals, self._signal_catalog.label)
         if self.drive.day is None and not self.time.is_dated:
             raise ValueError(
                 "drive.day is missing, and the time has no date. Set a date, a column or a path"
@@ -213,6 +271,11 @@ class Mapping(Config):
         """Return the hash of what identifies it."""
         return hash(self.canonical_json())
 
+    @property
+    def signal_catalog(self) -> SignalCatalog:
+        """The signals and drive columns that it was validated against."""
+        return self._signal_catalog
+
     def for_file(self, file: Path) -> "Mapping":
         """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
         given = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
@@ -220,7 +283,7 @@ class Mapping(Config):
         if not found:
             return self
         try:
-            drive = DriveMetadata.model_validate({**given, **found})
+            drive = DriveMetadata.model_validate({**given, **found}, context=self._signal_catalog)
         except ValidationError as error:
             raise InputError(f"{shown(file)}: drive: {faults_of(error)}") from None
         return self.model_copy(update={"drive": drive})
@@ -254,14 +317,16 @@ class Mapping(Config):
     def signal_names(self) -> tuple[str, ...]:
         """All signals that drives have, those computed from others too."""
         derived = self.label is not None and self.label.from_velocities
-        label = [catalogue().label] if derived else []
+        label = [self._signal_catalog.label] if derived else []
         return (*self.signals, *label, *self.front_wheels)
 
     @property
     def front_wheels(self) -> tuple[str, ...]:
         """The signals that one angle of both front wheels stands for, where it is all there is."""
         alone = "steer" in self.signals and not set(FRONT_WHEELS) & set(self.signals)
-        return tuple(name for name in FRONT_WHEELS if alone and name in catalogue().signals)
+        return tuple(
+            name for name in FRONT_WHEELS if alone and name in self._signal_catalog.signals
+        )
 
     @property
     def formats(self) -> FileFormats:
@@ -293,10 +358,10 @@ def is_number(text: str) -> bool:
     return True
 
 
-def load_mapping(name_or_path: str) -> Mapping:
+def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:
     """Load a mapping by name from `configs/mappings`, or by path. Raises `ConfigError`."""
-    file = find_config("mappings", name_or_path)
-    mapping = load_config(file, Mapping)
+    file = catalog.configs.find("mappings", name_or_path)
+    mapping = load_config(file, Mapping, catalog.signals)
     if mapping.can is not None:
         database = read_can_database(mapping.can, Path(str(file)).parent)
         mapping = mapping.model_copy(update={"can": database})
@@ -313,8 +378,8 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return what stands for whatever a mapping does not say, each with the key that says it."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
     wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEEL_PREFIX)}
-    label, course = signals.get(catalogue().label), signals.get(COURSE)
-    labelled = catalogue().label in mapping.signal_names
+    label, course = signals.get(mapping.signal_catalog.label), signals.get(COURSE)
+    labelled = mapping.signal_catalog.label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere
     unknown_radius = RADIUS_M in wheels.values() or (moved and None in wheels.values())
     naive = time.format is not None and "%z" not in time.format and time.is_dated
@@ -338,14 +403,14 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
 
 def keep_assumptions(root: Folder, mapping: Mapping) -> None:
     """Write down what a mapping of drives leaves open, unless it was the same before."""
-    kept, found = DocumentFolder(root / ASSUMPTIONS / mapping.name), assumptions_of(mapping)
+    kept, found = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
     if found != _newest(kept):
         kept.append({"assumed": found})
 
 
 def kept_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:
     """Return what the mappings of some drives leave open. Raises `StorageError`."""
-    folders = (DocumentFolder(root / ASSUMPTIONS / name) for name in sorted(mappings))
+    folders = (DocumentFolder(root, f"{ASSUMPTIONS}/{name}") for name in sorted(mappings))
     return tuple(dict.fromkeys(text for folder in folders for text in _newest(folder)))
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
 from fleet_slip.ingest.suspicion import RADIUS_M, SECOND, wrapped
@@ -331,39 +331,44 @@ def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
 # its left has the velocities (vx - r y, vy + r x). Of an angle alone the speed is needed beside it.
 
 
-def physical(counts: Named[str, pa.Array], name: str) -> FloatArray:
+def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) -> FloatArray:
     """Return a signal in SI units, NaN where there is none."""
     values = pl.Series(counts[name]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
-    return np.asarray(values * float(catalogue()[name].scale))
+    return np.asarray(values * float(signals[name].scale))
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
     """Return the counts of the label at the centre of gravity, and of velocities it is made of."""
-    sensor = mapping.label
+    sensor, signals = mapping.label, mapping.signal_catalog
     if sensor is None:
         return {}
-    found: dict[str, FloatArray] = {}
+    columns: dict[str, FloatArray] = {}
     if sensor.from_velocities:
-        found = _velocities(sensor, counts)
+        columns = _velocities(signals, sensor, counts)
     elif sensor.is_elsewhere:
-        found = _angle(sensor, _speed(mapping, counts), counts)
-    return {name: round_chunks([values], catalogue()[name]) for name, values in found.items()}
+        columns = _angle(signals, sensor, _speed(mapping, counts), counts)
+    return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
 
 
-def _velocities(sensor: LabelSensor, counts: Named[str, pa.Array]) -> dict[str, FloatArray]:
-    vx, vy = physical(counts, "vx"), physical(counts, "vy")
+def _velocities(
+    signals: SignalCatalog, sensor: LabelSensor, counts: Named[str, pa.Array]
+) -> dict[str, FloatArray]:
+    vx, vy = physical(signals, counts, "vx"), physical(signals, counts, "vy")
     if sensor.is_elsewhere:
-        yaw_rate = physical(counts, "yaw_rate")
+        yaw_rate = physical(signals, counts, "yaw_rate")
         vx, vy = vx + yaw_rate * sensor.sensor_y_m, vy - yaw_rate * sensor.sensor_x_m
     fast = np.hypot(vx, vy) >= LEAST_SPEED_MPS
-    return {"vx": vx, "vy": vy, catalogue().label: np.where(fast, np.arctan2(vy, vx), np.nan)}
+    return {"vx": vx, "vy": vy, signals.label: np.where(fast, np.arctan2(vy, vx), np.nan)}
 
 
 def _angle(
-    sensor: LabelSensor, speed: FloatArray, counts: Named[str, pa.Array]
+    signals: SignalCatalog,
+    sensor: LabelSensor,
+    speed: FloatArray,
+    counts: Named[str, pa.Array],
 ) -> dict[str, FloatArray]:
-    label = catalogue().label
-    angle, yaw_rate = physical(counts, label), physical(counts, "yaw_rate")
+    label = signals.label
+    angle, yaw_rate = physical(signals, counts, label), physical(signals, counts, "yaw_rate")
     vx = speed * np.cos(angle) + yaw_rate * sensor.sensor_y_m
     vy = speed * np.sin(angle) - yaw_rate * sensor.sensor_x_m
     return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
@@ -373,7 +378,11 @@ def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
     """Return the car's speed: as it is logged, or that of its wheels."""
     for name in OWN_SPEEDS:
         if name in counts:
-            return np.abs(physical(counts, name))
+            return np.abs(physical(mapping.signal_catalog, counts, name))
     wheels = [name for name in counts if name.startswith(WHEEL_PREFIX)]
-    speeds = [physical(counts, n) * (mapping.signals[n].radius_m or RADIUS_M) for n in wheels]
+    speeds = [
+        physical(mapping.signal_catalog, counts, name)
+        * (mapping.signals[name].radius_m or RADIUS_M)
+        for name in wheels
+    ]
     return np.asarray(np.median(speeds, axis=0), dtype=np.float64)

@@ -18,8 +18,8 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.base import canonical_ascii, number_of, shown
-from fleet_slip.catalogue.facts import LONGEST_PAUSE_S
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalog.facts import LONGEST_PAUSE_S
+from fleet_slip.catalog.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
@@ -311,6 +311,7 @@ def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
     with file_errors(file), file.open("rb") as stream:
+        _require_dense(file, stream.fileno())
         digest = hashlib.file_digest(stream, "sha256")
     content, of_folders = digest.copy(), partition_keys(file)
     used = {name for names in mapping.time_bases().values() for name in names}
@@ -319,6 +320,28 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     content.update(canonical_ascii(of_folders).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest(), content.hexdigest()
+
+
+FREE_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
+"""A file of more bytes than this is refused if it states so many times its space on disk."""
+
+
+def _require_dense(file: Path, descriptor: int) -> None:
+    """Raise `InputError` for a large file that is almost all holes, which take long to read.
+
+    A compressed file system gives a file less space too, but such a file has no hole.
+    """
+    status = os.fstat(descriptor)
+    on_disk = 512 * status.st_blocks
+    if status.st_size <= max(FREE_SPARSE_BYTES, SPARSE_RATIO * on_disk):
+        return
+    first_hole = os.lseek(descriptor, 0, os.SEEK_HOLE)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    if first_hole < status.st_size:
+        raise InputError(
+            f"{shown(file)}: its size is {status.st_size:,} bytes, but only {on_disk:,} were ever "
+            "written. Copy it again."
+        )
 
 
 def _reach(blocks: list[CheckedBlock]) -> int:

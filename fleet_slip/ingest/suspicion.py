@@ -14,21 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import (
+from fleet_slip.catalog.course import (
     COURSE,
     LARGEST_RAD,
     SATELLITE_SPEED,
     CourseRelation,
     relate,
 )
-from fleet_slip.catalogue.faults import (
+from fleet_slip.catalog.faults import (
     WITNESSES,
     Fault,
     MeanMoments,
     axes_swapped,
     find_reversed_or_swapped,
 )
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 
 # How signals of a drive go with one another: slopes and fits.
 
@@ -202,35 +202,37 @@ _SOUND_RATIOS = {
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
-def on_every_tick(ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]) -> Signals:
+def on_every_tick(
+    catalog: SignalCatalog, ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]
+) -> Signals:
     """Return counts at some ticks, NaN for none, in SI units on all ticks from the first."""
-    found = {}
+    signals = {}
     for name, values in counts.items():
-        found[name] = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
-        found[name][ticks - ticks[0]] = values * float(catalogue()[name].scale)
-    return found
+        signals[name] = np.full(int(ticks[-1] - ticks[0]) + 1, np.nan)
+        signals[name][ticks - ticks[0]] = values * float(catalog[name].scale)
+    return signals
 
 
-def find_suspicions(signals: Signals) -> list[Fault]:
+def find_suspicions(catalog: SignalCatalog, signals: Signals) -> list[Fault]:
     """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
-    found = list(_still(signals))
-    usual = _without(signals, found)
+    faults = list(_still(catalog, signals))
+    usual = _without(signals, faults)
     speed = speed_mps(usual)
-    magnitudes = {one.signals[0]: one for one in find_one_sided(usual, speed)}
-    sideslip = magnitudes.pop(catalogue().label, None)
-    found += magnitudes.values()
-    usual = _without(usual, found)
-    found += _turning(usual, speed)
+    magnitudes = {fault.signals[0]: fault for fault in find_one_sided(usual, speed)}
+    sideslip = magnitudes.pop(catalog.label, None)
+    faults += magnitudes.values()
+    usual = _without(usual, faults)
+    faults += _turning(usual, speed)
     label: list[Fault] = []
     if speed is not None:
-        found += [*_scales_differ(usual, speed), *_axles_swapped(usual, speed)]
-        if not any({"ay", "yaw_rate"} & set(one.signals) for one in found):
-            label = list(_label(usual, speed))  # which is judged by them
-    if sideslip and all(one.kind != "biased" for one in label):  # else it is off to one side
+        faults += [*_scales_differ(usual, speed), *_axles_swapped(usual, speed)]
+        if not any({"ay", "yaw_rate"} & set(fault.signals) for fault in faults):
+            label = list(_label(catalog.label, usual, speed))  # which is judged by them
+    if sideslip and all(fault.kind != "biased" for fault in label):  # else it is off to one side
         label = [sideslip]
-    if not any(SATELLITE_SPEED in one.signals for one in found):
+    if not any(SATELLITE_SPEED in fault.signals for fault in faults):
         label += itertools.islice(_course(usual), 1)
-    return [*found, *label]
+    return [*faults, *label]
 
 
 def _without(signals: Signals, faults: Sequence[Fault]) -> Signals:
@@ -246,13 +248,13 @@ def speed_mps(signals: Signals) -> FloatArray | None:
     return signals.get("vx", signals.get("vehicle_speed"))
 
 
-def _still(signals: Signals) -> Iterator[Fault]:
+def _still(catalog: SignalCatalog, signals: Signals) -> Iterator[Fault]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]
         if not present.size:
             yield Fault("absent", (name,), "it has no value at all", "Map another column.")
         elif present.size >= FEWEST_TICKS and present.min() == present.max():
-            figure = f"it is constant: {present[0]:g} {catalogue()[name].unit}"
+            figure = f"it is constant: {present[0]:g} {catalog[name].unit}"
             yield Fault("stuck", (name,), figure, "Map another column.")
 
 
@@ -339,9 +341,8 @@ def _axles_swapped(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
         yield Fault("swapped", WHEELS, figure, "Swap the front columns with the rear ones.")
 
 
-def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
+def _label(label: str, signals: Signals, speed: FloatArray) -> Iterator[Fault]:
     """Look for the label's sign, unit and offset."""
-    label = catalogue().label
     if not {label, "yaw_rate", "ay"} <= set(signals):
         return
     rows = moving(speed)
@@ -355,10 +356,12 @@ def _label(signals: Signals, speed: FloatArray) -> Iterator[Fault]:
         inputs = np.array([signals["ay"], signals["yaw_rate"] / speed])
     many = large.size >= FEWEST_TICKS and np.quantile(large, 0.9) > LARGE_RAD
     slow = rows & (speed < SLOW_MPS) & (np.abs(signals["ay"]) < GENTLE_MPS2)
-    yield from _lever(signals, inputs, slow, many=bool(many))
+    yield from _lever(label, signals, inputs, slow, many=bool(many))
 
 
-def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool) -> Iterator[Fault]:
+def _lever(
+    label: str, signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool
+) -> Iterator[Fault]:
     """Compare the label with what any car does: it needs no peers, where all are wrong alike.
 
     Turning slowly it is the distance to the rear axle times the yaw rate over the speed, less what
@@ -366,7 +369,6 @@ def _lever(signals: Signals, inputs: FloatArray, slow: BoolArray, *, many: bool)
     chapter 5). The same fit of the road wheels gives the wheelbase, which is longer. At one speed
     the two inputs are one, and nothing is said.
     """
-    label = catalogue().label
     ay, curvature = inputs[:, slow & np.isfinite(inputs).all(axis=0)]
     if ay.size < FEWEST_GENTLE_TICKS or abs(np.corrcoef(ay, curvature)[0, 1]) > LARGEST_COLLINEAR:
         return

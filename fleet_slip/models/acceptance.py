@@ -14,7 +14,6 @@ out, the median group of them must not be worse off either, each group having on
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import zip_longest
 
 import numpy as np
@@ -22,8 +21,7 @@ from pydantic import Field
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.cohort import Cohort, load_cohort
@@ -46,7 +44,7 @@ from fleet_slip.regression.folds import (
     least_squares,
 )
 from fleet_slip.regression.least_squares import LinearModel
-from fleet_slip.resources import config_file
+from fleet_slip.resources import Configs
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.warehouse.condition import parse_condition
 
@@ -63,11 +61,15 @@ class Floor(Config):
     max_columns_per_drive: float = Field(default=3.0, gt=0)
     min_rows_per_column: int = Field(default=100, ge=1)
 
+    @property
+    def worth(self) -> Worth:
+        """What a challenger may lack that is no reason to refuse it."""
+        return Worth(math.radians(self.worth_deg))
 
-@cache
-def floor() -> Floor:
-    """Return what `publish.toml` asks for."""
-    return load_config(config_file("publish.toml"), Floor)
+
+def load_floor(configs: Configs) -> Floor:
+    """Read `publish.toml`. Raises `ConfigError`."""
+    return load_config(configs.file("publish.toml"), Floor)
 
 
 LEAST_VEHICLES = 5
@@ -158,17 +160,20 @@ class Contest:
         by: what is held out, vehicle or drive.
         procedure: makes the challenger, its columns searched for anew if a search found them.
         incumbents: those that it meets, by reference, as they are, in counts.
+        worth: what the challenger may lack.
     """
 
+    catalog: Catalog
     name: str
     signals: tuple[str, ...]
     by: FoldKey
     procedure: Procedure
     incumbents: dict[str, LinearModel]
+    worth: Worth
 
     def serving(self, folds: CohortFolds) -> Folds:
         """Return the folds of drives with all signals. Raises `DataError` without."""
-        return folds.serving(self.signals, catalogue().label, sparse=True)
+        return folds.serving(self.signals, self.catalog.signals.label, sparse=True)
 
     def part(self, cohort: Cohort, wanted: BoolArray) -> Folds:
         """Return some drives in the groups that the whole cohort has. Raises `DataError`."""
@@ -189,17 +194,14 @@ class Contest:
             if name in tests
         ]
         whole = self.procedure(groups.total)
-        challenger = assemble(self.name, tested, sums, whole, input_scales())
-        others = tuple(as_it_is(*one, tested) for one in self.incumbents.items())
-        shortfalls = tuple(compare_paired(challenger, one, worth()) for one in others)
-        typical = tuple(compare_typical(challenger, one, worth()) for one in others)
+        challenger = assemble(self.name, tested, sums, whole, self.catalog.input_scales)
+        incumbents = tuple(
+            as_it_is(self.catalog, *incumbent, tested) for incumbent in self.incumbents.items()
+        )
+        shortfalls = tuple(compare_paired(challenger, one, self.worth) for one in incumbents)
+        typical = tuple(compare_typical(challenger, one, self.worth) for one in incumbents)
         by_car = self.by == "vehicle"
-        return Comparison(self.by, challenger, others, shortfalls, typical if by_car else ())
-
-
-def worth() -> Worth:
-    """Return what a challenger may lack that is no reason to refuse it."""
-    return Worth(math.radians(floor().worth_deg))
+        return Comparison(self.by, challenger, incumbents, shortfalls, typical if by_car else ())
 
 
 def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
@@ -207,22 +209,24 @@ def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Cont
 
     Raises `DataError` or `QuestionError` if the features of a version are not defined as they were.
     """
-    feature_set = selection.cohort.feature_set
+    catalog, feature_set = selection.cohort.catalog, selection.cohort.feature_set
     for version in incumbents:
-        _require_same_features(version, feature_set)
-    label, winner, found = catalogue().label, selection.winner.model, selection.searched_winner
+        _require_same_features(catalog, version, feature_set)
+    winner, found = selection.winner.model, selection.searched_winner
+    label = catalog.signals.label
     inputs = found.inputs if found is not None else winner.signals
-    models = {one.reference: one.manifest.counts_model(feature_set) for one in incumbents}
+    models = {one.reference: one.manifest.counts_model(catalog, feature_set) for one in incumbents}
     every = (name for model in models.values() for name in model.signals)
     signals = tuple(dict.fromkeys((*inputs, *every)))
     cars = selection.cohort.count_vehicles_with((*signals, label))
     by: FoldKey = "vehicle" if cars >= LEAST_VEHICLES else "drive"
     intercept = selection.intercept
     if found is not None:
-        procedure = searching(found, len(winner.signals), intercept=intercept)
+        procedure = searching(label, found, len(winner.signals), intercept=intercept)
     else:
         procedure = least_squares(inputs, label, intercept=intercept)
-    return Contest(winner.name, signals, by, procedure, models)
+    worth = load_floor(catalog.configs).worth
+    return Contest(catalog, winner.name, signals, by, procedure, models, worth)
 
 
 def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Comparison:
@@ -273,53 +277,53 @@ def _divide(
         if drives > MOST_DRIVES:
             below = 16**_HEX * MOST_DRIVES // drives
             chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-            condition &= parse_condition(chosen)
+            condition &= parse_condition(cohort.catalog.signals, chosen)
         cohort = load_cohort(cohort.source, condition, cohort.feature_set)
     numbers = hash_names(cohort.drives["drive_id"])
     known = np.any([one.among(numbers) for one in made], axis=0)
     return (cohort, known) if known.any() and not known.all() else None
 
 
-def as_it_is(name: str, model: LinearModel, folds: Folds) -> CrossValidation:
+def as_it_is(catalog: Catalog, name: str, model: LinearModel, folds: Folds) -> CrossValidation:
     """Return the figures of a published model over folds, none of which it is fitted to again."""
     tests = [error_sums(model, test) for test in folds.grams]
-    return assemble(name, folds, tests, model, input_scales())
+    return assemble(name, folds, tests, model, catalog.input_scales)
 
 
-def find_faults(manifest: Manifest, champion: Manifest | None) -> list[str]:
+def find_faults(floor: Floor, manifest: Manifest, champion: Manifest | None) -> list[str]:
     """Return in what a manifest is below the floor, and what it must be."""
-    least, figures, trained = floor(), manifest.cross_validation, manifest.trained_on
+    figures, trained = manifest.cross_validation, manifest.trained_on
     found = []
-    if figures.correlation < least.min_correlation:
-        found.append(f"its correlation is {figures.correlation:.4f}, below {least.min_correlation}")
-    if figures.rmse_deg > least.max_rmse_deg:
-        found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {least.max_rmse_deg} deg")
-    if trained.drives < least.min_drives:
+    if figures.correlation < floor.min_correlation:
+        found.append(f"its correlation is {figures.correlation:.4f}, below {floor.min_correlation}")
+    if figures.rmse_deg > floor.max_rmse_deg:
+        found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {floor.max_rmse_deg} deg")
+    if trained.drives < floor.min_drives:
         found.append(
-            f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {least.min_drives}"
+            f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {floor.min_drives}"
         )
-    if trained.vehicles < least.min_vehicles:
+    if trained.vehicles < floor.min_vehicles:
         cars = number_of(trained.vehicles, "car")
-        found.append(f"it was trained on {cars}, fewer than {least.min_vehicles}")
+        found.append(f"it was trained on {cars}, fewer than {floor.min_vehicles}")
     if champion is not None:
-        found += _shrunk(manifest, champion, least.min_part_of_champion)
+        found += _shrunk(manifest, champion, floor.min_part_of_champion)
     return found
 
 
-def find_lacks(manifest: Manifest) -> list[str]:
+def find_lacks(floor: Floor, manifest: Manifest) -> list[str]:
     """Return of what a first champion of measured drives has too little for its columns."""
     if manifest.learned_from is not None:
         return []
-    found, least = [], floor()
+    found = []
     columns, trained = len(manifest.terms), manifest.trained_on
     own_rows_only = manifest.prior is None or not manifest.prior.weight
-    if own_rows_only and columns > least.max_columns_per_drive * trained.drives:
+    if own_rows_only and columns > floor.max_columns_per_drive * trained.drives:
         drives = number_of(trained.drives, "drive")
-        most = f"{least.max_columns_per_drive:g}"
+        most = f"{floor.max_columns_per_drive:g}"
         found.append(f"it has {columns} columns on {drives}, more than {most} a drive")
-    if trained.rows < least.min_rows_per_column * columns:
+    if trained.rows < floor.min_rows_per_column * columns:
         rows = number_of(trained.rows, "row")
-        few = f"{least.min_rows_per_column} for each of its {columns} columns"
+        few = f"{floor.min_rows_per_column} for each of its {columns} columns"
         found.append(f"it was trained on {rows}, fewer than {few}")
     return found
 
@@ -337,22 +341,23 @@ def _shrunk(manifest: Manifest, champion: Manifest, part: float) -> list[str]:
     ]
 
 
-def _has_another_line(version: ModelVersion, feature_set: str) -> bool:
+def _has_another_line(catalog: Catalog, version: ModelVersion, feature_set: str) -> bool:
     """Whether a version has the same set with another line: its columns are in no Gram row here."""
-    line, then = features().line_of(feature_set), version.manifest.trained_on.feature_set
-    if line is None or then == features().identity(feature_set):
+    line, then = catalog.first_stage_model(feature_set), version.manifest.trained_on.feature_set
+    if line is None or then == catalog.identity(feature_set):
         return False
     return then.startswith(feature_set.removesuffix(line.digest))
 
 
-def _require_same_features(version: ModelVersion, feature_set: str) -> None:
-    known, then = features(), version.manifest
-    of_set = known.definitions(feature_set)
-    for name, one in then.features.items():
-        if known.rows([name]).get(name) != one:
+def _require_same_features(catalog: Catalog, version: ModelVersion, feature_set: str) -> None:
+    then = version.manifest
+    of_set = catalog.definitions(feature_set)
+    for name, feature in then.features.items():
+        if catalog.rows([name]).get(name) != feature:
             raise DataError(f"the feature {name} has changed since {version.reference}.")
     for name, definition in then.definitions.items():
-        if name not in known.inputs or (of_set.get(name) or known.definition(name)) != definition:
+        now = of_set.get(name) or catalog.definition(name) if name in catalog.inputs else None
+        if now != definition:
             raise DataError(f"the column {name} has changed since {version.reference}.")
 
 
@@ -376,7 +381,7 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
     contest = contest_of(selection, [champion])
     groups, old, new = (contest.part(cohort, mask) for mask in (np.ones_like(known), known, ~known))
     (model,) = contest.incumbents.items()
-    on_old, on_new = (as_it_is(*model, folds).pooled for folds in (old, new))
+    on_old, on_new = (as_it_is(contest.catalog, *model, folds).pooled for folds in (old, new))
     if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
     found = contest.on(groups, old)
@@ -429,10 +434,12 @@ def judge(
     selection: Selection,
 ) -> Judgement:
     """Compare a challenger with the champion, and with the best of the champions so far."""
-    problems = find_faults(manifest, champion.manifest if champion else None)
+    catalog = selection.cohort.catalog
+    floor = load_floor(catalog.configs)
+    problems = find_faults(floor, manifest, champion.manifest if champion else None)
     if champion is None:
         return Judgement(tuple(problems), "It is the first version")
-    if _has_another_line(champion, selection.cohort.feature_set):
+    if _has_another_line(catalog, champion, selection.cohort.feature_set):
         was, now = (
             champion.manifest.cross_validation.rmse_deg,
             selection.winner.model.pooled.rmse_deg,
@@ -441,7 +448,7 @@ def judge(
             f"its line was fitted again; its cross-validated RMSE is {now:.4f} deg, that of "
             f"{champion.reference} was {was:.4f} deg"
         )
-        problems += [told] if now > was + floor().worth_deg else []
+        problems += [told] if now > was + floor.worth_deg else []
         return Judgement(tuple(problems), told)
     try:
         incumbents = _incumbents(registry, champion)

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import Cohort, clustered_moments
 from fleet_slip.grams.weights import Weighed
 from fleet_slip.models.select import lost_drives
@@ -35,6 +33,7 @@ class Diagnosis(Answer):
         inflation: variance inflation of each input.
         condition_number: of the inputs' correlation matrix.
         evidence: effective rows and design effect.
+        units: of the inputs and the intercept, by name.
         weighed: the drives that `robust` of a selection would count less, by name.
     """
 
@@ -54,6 +53,7 @@ class Diagnosis(Answer):
     inflation: Mapping[str, float]
     condition_number: float
     evidence: Evidence
+    units: Mapping[str, str]
     weighed: Mapping[str, Weighed] = field(default_factory=dict)
 
     @property
@@ -64,12 +64,11 @@ class Diagnosis(Answer):
     def parts(self) -> Iterator[Part]:
         """Return the coefficients with their errors, and which drives are unusual."""
         both = zip(self.robust.estimates, self.naive.estimates, strict=True)
-        units = {INTERCEPT: catalogue()[catalogue().label].unit}
         rows = (
             {
                 "robust": robust,
                 "naive": naive,
-                "unit": units.get(robust.name) or features().of(robust.name).unit,
+                "unit": self.units[robust.name],
                 "vif": self.inflation.get(robust.name),
             }
             for robust, naive in both
@@ -103,7 +102,8 @@ def diagnose(
 
     Raises `DataError` for dependent or absent signals.
     """
-    label, scales = catalogue().label, input_scales()
+    catalog = cohort.catalog
+    label, scales = catalog.signals.label, catalog.input_scales
     served = cohort.serving(inputs)
     moments = clustered_moments(served, cluster, intercept=intercept)
     # A single drive tells nothing of how drives differ: then errors are by rows.
@@ -121,5 +121,7 @@ def diagnose(
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
         evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
+        units={name: catalog.input(name).unit for name in inputs}
+        | {INTERCEPT: catalog.signals[label].unit},
         weighed=lost_drives(served, intercept=intercept),
     )

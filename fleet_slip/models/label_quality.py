@@ -7,16 +7,14 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
-from fleet_slip.catalogue.course import STRAIGHT, STRAIGHT_COURSE, TURNED
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import STRAIGHT, STRAIGHT_COURSE, TURNED
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.regression.gram import GramTable, packed_position
-from fleet_slip.resources import find_config
+from fleet_slip.resources import Configs
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -30,23 +28,24 @@ def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
         return None
     with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
         rows = opened.label_sources(cohort.condition)
-    stated = [(n, _stated_rad(source, campaign)) for source, campaign, n in rows]
+    stated = [(n, _stated_rad(source, campaign, warehouse.configs)) for source, campaign, n in rows]
     total = sum(n for n, _ in stated)
     if not total or any(std is None for _, std in stated):
         return None
     variance = sum(n * std**2 for n, std in stated if std is not None) / total
-    step = float(catalogue()[catalogue().label].scale)
+    signals = warehouse.catalog.signals
+    step = float(signals[signals.label].scale)
     return math.degrees(math.sqrt(variance + step**2 / 12))
 
 
-def _stated_rad(source: str, campaign: str | None) -> float | None:
+def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | None:
     """Return the noise that a campaign states; None of measured drives and unknown campaigns."""
     if source != "simulated" or campaign is None:
         return None
     try:
-        content = load_toml(find_config("campaigns", campaign))
+        content = load_toml(configs.find("campaigns", campaign))
         if "sensors" not in content:
-            content = load_toml(find_config("campaigns", content["base"]))
+            content = load_toml(configs.find("campaigns", content["base"]))
         return float(content["sensors"]["sideslip_std_rad"])
     except (ConfigError, KeyError):  # its file was elsewhere
         return None
@@ -88,7 +87,7 @@ class WithoutLabel(Record):
 
 def without_label(warehouse: Warehouse, cohort: Cohort, error_deg: float) -> WithoutLabel | None:
     """Return how good a model of such an error is; None unless it was learned from changes."""
-    times = features().feature_set(cohort.feature_set).change_s
+    times = cohort.catalog.feature_set(cohort.feature_set).change_s
     if not times:
         return None
     straight: list[FloatArray] = []
@@ -104,7 +103,7 @@ def without_label(warehouse: Warehouse, cohort: Cohort, error_deg: float) -> Wit
                 turned += float(table.sums[:, at].astype(np.float64).sum())
                 square += float(table.products[:, packed_position(at, at)].astype(np.float64).sum())
                 rows += float(table.n.sum())
-    scale = math.degrees(input_scales()[catalogue().label])
+    scale = math.degrees(cohort.catalog.input_scales[cohort.catalog.signals.label])
     noise, unsure = _noise(np.concatenate([*straight, np.zeros((2, 0))], axis=1), scale)
     left = None
     if noise is not None and unsure is not None:  # fast cars have less noise than others

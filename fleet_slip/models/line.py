@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.definitions import Combination, Definition
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import FittedLine, whole_line
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.definitions import Combination, Definition
+from fleet_slip.catalog.lines import FittedLine, whole_line
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
@@ -41,31 +39,32 @@ def with_line_fitted(
     `asked` is the cohort, `condition` what of it has no fault. The Gram rows of the set, and those
     that the line needs, are made. Raises as `answer_request`.
     """
-    plan = SelectionPlan.of(request)
+    catalog = warehouse.catalog
+    plan = SelectionPlan.of(catalog, request)
     named = plan.feature_set
-    if estimate := features().learning.get(named):
+    if estimate := catalog.stacked_sets.get(named):
         if plan.model_list is None or plan.model_list.line is None:
             raise QuestionError(
                 f"the feature set {named} contains a line's estimate: choose a model list that "
                 "defines the line, such as models = learning."
             )
-        models = load_model_list(plan.model_list.line)
+        models = load_model_list(catalog, plan.model_list.line)
         about = {
             "estimate": estimate,
-            "scale": features().estimates[estimate].scale,
+            "scale": catalog.estimates[estimate].scale,
             "models": plan.model_list.line,
             "models_sha256": models.sha256,
-            "feature_set": features().identity(models.features),
+            "feature_set": catalog.identity(models.features),
             "cohort": asked,
         }
         line = _kept_line(warehouse, about, condition)
         if line is None:
             line = fit_line(warehouse, about, condition)
-            warehouse.keep_line(line)
+            warehouse.stacked_models.keep(line)
         named = f"{named}_{line.digest}"
         request = replace(request, features=named)
-    if features().line_of(named):
-        files = cohort_files(warehouse, parse_cohort(condition))
+    if catalog.first_stage_model(named):
+        files = cohort_files(warehouse, parse_cohort(catalog.signals, condition))
         update_grams(warehouse, feature_set=named, among=files)
     return request
 
@@ -75,14 +74,15 @@ def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine
 
     None if there is none, or the cohort has outgrown it.
     """
-    kept = [line for digest in warehouse.lines.names() if (line := warehouse.line(digest))]
+    models = warehouse.stacked_models
+    stored = [model for digest in models.digests() if (model := models.find(digest))]
     there = load_cohort(warehouse, condition).hash_drives_with(())
 
     def fits(line: FittedLine) -> bool:
         drives = np.frombuffer(bytes.fromhex(line.drive_hashes), dtype=">u8").astype(np.uint64)
         return about.items() <= vars(line).items() and bool(np.isin(drives, there).all())
 
-    best = max(filter(fits, kept), key=lambda line: (line.drives, line.digest), default=None)
+    best = max(filter(fits, stored), key=lambda line: (line.drives, line.digest), default=None)
     return best if best and len(there) < KEPT_UNTIL * best.drives else None
 
 
@@ -91,20 +91,21 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
 
     Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
     """
-    plan = SelectionPlan.of(SelectionRequest(models=about["models"], by="drive"))
-    files = cohort_files(warehouse, parse_cohort(condition))
+    catalog = warehouse.catalog
+    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], by="drive"))
+    files = cohort_files(warehouse, parse_cohort(catalog.signals, condition))
     update_grams(warehouse, feature_set=plan.feature_set, among=files)
     cohort = load_cohort(warehouse, condition, plan.feature_set)
-    signals, label = plan.choose(cohort).winner.model.signals, catalogue().label
+    signals, label = plan.choose(cohort).winner.model.signals, catalog.signals.label
     served = cohort.serving(signals)
     drives = served.drives["drive_id"].to_pylist()
     hashed = FOLDS if len(set(drives)) > FOLDS else None
     assignment = assign_folds(drives, "drive", FOLDS)
     folds = CohortFolds.of([served.table], assignment).serving(signals, label)
-    known = features()
-    unit = input_scales()[label] / Fraction(about["scale"])
+    unit = catalog.input_scales[label] / Fraction(about["scale"])
     columns = [
-        known.definition(one) or known.rows([one]).get(one) or Definition(of=one) for one in signals
+        catalog.definition(name) or catalog.rows([name]).get(name) or Definition(of=name)
+        for name in signals
     ]
 
     def whole(model: LinearModel) -> Combination:

@@ -20,20 +20,21 @@ from pydantic import (
     PlainValidator,
     SerializerFunctionWrapHandler,
     TypeAdapter,
+    ValidationInfo,
     model_serializer,
     model_validator,
 )
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Made,
     integer_arithmetic,
     plain_column,
 )
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier, catalogue
+from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.grams.gram_files import Hashes
@@ -145,10 +146,7 @@ class ModelTerm(Config):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The logged signals that it is computed from: itself, or what its SQL names."""
-        one = self.definition or plain_column(self.signal, self.sql)
-        if not self.sql:
-            return one.signals
-        return tuple(name for name in catalogue().signals if name in one.signals)
+        return (self.definition or plain_column(self.signal, self.sql)).signals
 
 
 class ModelLabel(Config):
@@ -258,7 +256,10 @@ _MADE: TypeAdapter[Made] = TypeAdapter(Made)
 
 
 class Manifest(Config):
-    """One model version; `trained_on` of an imported one is about another data root's tables."""
+    """One model version; `trained_on` of an imported one is about another data root's tables.
+
+    A document of unknown origin is validated with the `SignalCatalog` as context.
+    """
 
     format: Literal[1] = 1
     name: Identifier
@@ -284,7 +285,7 @@ class Manifest(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _with_what_is_made(cls, content: Any) -> Any:
+    def _with_what_is_made(cls, content: Any, info: ValidationInfo) -> Any:
         """Put what is made of columns, which stands once in `made`, where columns name it."""
         if not isinstance(content, dict) or not isinstance(content.get("made"), dict):
             return content
@@ -298,7 +299,8 @@ class Manifest(Config):
             part = {key: within(one) for key, one in part.items()}
             if isinstance(name := part.get("made"), str):
                 if name in waiting:
-                    found[name] = _MADE.validate_python(within(waiting.pop(name)))
+                    parts = within(waiting.pop(name))
+                    found[name] = _MADE.validate_python(parts, context=info.context)
                 if name not in found:
                     raise ValueError(f"made: {name} is missing, or made of itself")
                 part["made"] = found[name]
@@ -338,16 +340,16 @@ class Manifest(Config):
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
 
-    def counts_model(self, feature_set: str | None = None) -> LinearModel:
+    def counts_model(self, catalog: Catalog, feature_set: str | None = None) -> LinearModel:
         """Return the model as one of counts, exactly.
 
         For the Gram rows of a feature set of changes it has no intercept, and no column that is a
         number of the car alone: a change has none.
         """
-        changes = feature_set is not None and features().feature_set(feature_set).change_ticks
+        changes = feature_set is not None and catalog.feature_set(feature_set).change_ticks
         # Of the counts as they are now: a signal's scale may have changed since it was published.
-        self.require_same_counts()
-        scales = input_scales()
+        self.require_same_counts(catalog.signals)
+        scales = catalog.input_scales
         unit = scales[self.label.signal]
         terms = [term for term in self.terms if not (changes and term.alone)]
         return LinearModel(
@@ -362,32 +364,30 @@ class Manifest(Config):
             Fraction(0) if changes else self.intercept_exact / unit,
         )
 
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """Columns in SI units that the model needs, each once, in the order of its terms."""
-        signals = catalogue()
-        needed = (
+    def columns(self, signals: SignalCatalog) -> tuple[str, ...]:
+        """Return the columns in SI units that the model needs, each once, in term order."""
+        columns = (
             column
             for term in self.terms
             for column in (
                 [term.column] if term.logged else [signals[name].column for name in term.inputs]
             )
         )
-        return tuple(dict.fromkeys(needed))
+        return tuple(dict.fromkeys(columns))
 
     @property
     def features(self) -> dict[str, Definition]:
         """Definition of each input that is a feature of 16 bits."""
         return {term.signal: plain_column(term.signal, term.sql) for term in self.terms if term.sql}
 
-    def require_same_counts(self) -> None:
+    def require_same_counts(self, signals: SignalCatalog) -> None:
         """Raise `RefusedError` if counts that a column looks back on mean something else now."""
         for term in self.terms:
             for name, scale in (term.signal_scales or {}).items():
-                if name not in catalogue().signals or catalogue()[name].scale != scale:
+                if name not in signals.signals or signals[name].scale != scale:
                     raise RefusedError(
                         f"{self.name}: {term.signal} was defined when a count of {name} was worth "
-                        f"{scale}, and the signal catalogue says otherwise. Publish it again."
+                        f"{scale}, and the signal catalog says otherwise. Publish it again."
                     )
 
     @property

@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalogue.facts import round_number
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue, round_chunks, valid_values
+from fleet_slip.catalog.facts import round_number
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks, valid_values
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.compiling import kernel
@@ -43,16 +43,16 @@ class Predictor:
     scales: tuple[float, ...]
 
     @classmethod
-    def of(cls, manifest: Manifest) -> "Predictor":
+    def of(cls, signals: SignalCatalog, manifest: Manifest) -> "Predictor":
         """Return what a manifest publishes, by features of its own.
 
         Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
         now.
         """
-        manifest.require_same_counts()
+        manifest.require_same_counts(signals)
         coefficients = tuple(term.coefficient for term in manifest.terms)
         scales = tuple(
-            float(catalogue()[term.signal].scale if term.logged else term.scale)
+            float(signals[term.signal].scale if term.logged else term.scale)
             for term in manifest.terms
         )
         plan = ColumnPlan.of(manifest.signals, manifest.features, manifest.definitions)
@@ -181,13 +181,15 @@ def _pandas(values: pa.Array, name: str, index: Any) -> Any:
     return sys.modules["pandas"].Series(numbers, index=index, name=name, dtype="float64")
 
 
-def predict(manifest: Manifest, frame: Any, predictor: Predictor | None = None) -> Any:
+def predict(
+    signals: SignalCatalog, manifest: Manifest, frame: Any, predictor: Predictor | None = None
+) -> Any:
     """Return the angle of each row in rad; see `ModelVersion.predict`."""
-    predictor = predictor or Predictor.of(manifest)
-    opened, signals, plan = open_frame(frame), catalogue(), predictor.plan
+    predictor = predictor or Predictor.of(signals, manifest)
+    opened, plan = open_frame(frame), predictor.plan
     if not plan.signals:
         raise DataError(f"the columns of {manifest.name} use no signal. Publish it again.")
-    columns = opened.numbers(manifest.columns, f"the model {manifest.name}")
+    columns = opened.numbers(manifest.columns(signals), f"the model {manifest.name}")
     counts = {
         name: round_chunks(
             [valid_values(columns[signals[name].column], signals[name])], signals[name]

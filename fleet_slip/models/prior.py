@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
@@ -24,17 +25,22 @@ NOT_LOST = "lost_control_s IS NULL"
 
 
 def simulate_prior(
-    campaign: str | Campaign, feature_set: str, executor: Executor | None = None
+    catalog: Catalog,
+    campaign: str | Campaign,
+    feature_set: str,
+    executor: Executor | None = None,
 ) -> Cohort:
     """Return the Gram rows of a campaign's drives, or of its file's, in which no car was lost.
 
     Raises `ConfigError` for the file, `DataError` if the car was lost in every drive.
     """
     if isinstance(campaign, str):
-        campaign = load_campaign(campaign)
+        campaign = load_campaign(campaign, catalog.configs)
     workers = nullcontext(executor) if executor else ThreadPoolExecutor(os.cpu_count())
     with TemporaryDirectory(prefix="fleet-slip-prior-") as folder, workers as threads:
-        warehouse = Warehouse(LocalFolder(Path(folder)))
+        warehouse = Warehouse(LocalFolder(Path(folder)), catalog.configs)
+        if model := catalog.first_stage_model(feature_set):
+            warehouse.stacked_models.keep(model)
         simulate_campaign(warehouse, campaign, campaign.days(), threads)
         update_grams(warehouse, feature_set=feature_set)
         try:

@@ -8,10 +8,9 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
-from fleet_slip.catalogue.definitions import Definition
-from fleet_slip.catalogue.facts import MEASURED, TRAINING_DRIVES
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import Definition
+from fleet_slip.catalog.facts import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams
@@ -107,23 +106,24 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
     chosen = manifest.selected_by
     cohort = with_all_drives(manifest.trained_on.cohort)
     if chosen.asked is None:
-        return _of_list(manifest, version.reference), cohort
+        return _of_list(version), cohort
     known = {field.name for field in fields(SelectionRequest)}
     asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
     return SelectionRequest(**asked), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
 
 
-def _of_list(manifest: Manifest, reference: str) -> SelectionRequest:
+def _of_list(version: ModelVersion) -> SelectionRequest:
+    manifest = version.manifest
     name = manifest.selected_by.model_list
     if name == GIVEN:
-        feature_set = features().name_of(manifest.trained_on.feature_set)
+        feature_set = version.catalog.name_of(manifest.trained_on.feature_set)
         return SelectionRequest(model=",".join(manifest.signals), features=feature_set)
     try:
-        load_model_list(name)
+        load_model_list(version.catalog, name)
     except ConfigError:
         raise QuestionError(
-            f"{reference} was chosen from {name!r}, which is no model list here. Say what to "
-            "compare, such as models = estimator."
+            f"{version.reference} was chosen from {name!r}, which is no model list here. "
+            "Say what to compare, such as models = estimator."
         ) from None
     return SelectionRequest(models=name)
 
@@ -135,7 +135,7 @@ def is_up_to_date(
 
     It is a function of table versions, cohort, list and program. Raises `ConfigError` for the list.
     """
-    model_list = load_model_list(models)
+    model_list = load_model_list(warehouse.catalog, models)
     trained, chosen = manifest.trained_on, manifest.selected_by
     made_from = (
         trained.cohort,
@@ -148,7 +148,7 @@ def is_up_to_date(
     )
     return manifest.imported_from is None and made_from == (
         cohort,
-        features().identity(model_list.features),
+        warehouse.catalog.identity(model_list.features),
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
         warehouse.grams.snapshot().version,
         models,
@@ -187,12 +187,13 @@ def challenger_of(
 
 def manifest_of(selection: Selection, name: str) -> Manifest:
     """Describe the winner of a selection as a manifest."""
-    signals = catalogue()
+    catalog = selection.cohort.catalog
+    signals = catalog.signals
     winner = selection.winner.model
     label = signals[signals.label]
     wanted = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
-    definitions = features().definitions(selection.cohort.feature_set)
+    definitions = catalog.definitions(selection.cohort.feature_set)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -202,13 +203,13 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         intercept_exact=winner.model.intercept,
         through_origin=not selection.intercept,
         terms=tuple(
-            _term(signal, exact, definitions)
+            _term(catalog, signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
         cross_validation=_cross_validated(winner, selection),
         trained_on=TrainedOn(
             cohort=selection.cohort.condition.text,
-            feature_set=features().identity(selection.cohort.feature_set),
+            feature_set=catalog.identity(selection.cohort.feature_set),
             drives=winner.drives,
             vehicles=selection.cohort.count_vehicles_with(wanted),
             drives_without_log=selection.cohort.count_received_with(wanted) or None,
@@ -235,7 +236,7 @@ def _prior_of(selection: Selection) -> Prior | None:
         return None
     from fleet_slip.simulation.campaign import load_campaign  # noqa: PLC0415 - simulates
 
-    campaign = load_campaign(name)
+    campaign = load_campaign(name, selection.cohort.catalog.configs)
     return Prior(
         campaign=campaign.name,
         campaign_sha256=campaign.digest,
@@ -251,13 +252,15 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
 
     One through the origin keeps 0, of no cars. Raises `DataError` if no drive tells the intercept.
     """
-    name = features().name_of(manifest.trained_on.feature_set)
-    change_s = features().feature_set(name).change_s
+    catalog = warehouse.catalog
+    name = catalog.name_of(manifest.trained_on.feature_set)
+    change_s = catalog.feature_set(name).change_s
     if not change_s:
         return manifest
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
-        found = straight_on(warehouse, parse_cohort(manifest.trained_on.cohort), manifest)
+        condition = parse_cohort(catalog.signals, manifest.trained_on.cohort)
+        found = straight_on(warehouse, condition, manifest)
     learned = LearnedFrom(
         label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
@@ -267,8 +270,10 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         ),
         intercept_spread_deg=math.degrees(found.spread),
     )
-    scales = input_scales()
-    terms = (_term(column, slope / scales[column], {}) for column, slope in found.slopes.items())
+    scales = catalog.input_scales
+    terms = (
+        _term(catalog, column, slope / scales[column], {}) for column, slope in found.slopes.items()
+    )
     own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
     origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
     return manifest.model_copy(update={**own, **origin})
@@ -292,24 +297,25 @@ def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Select
 
 def drives_of(selection: Selection, name: str) -> bytes:
     """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
-    signals = (*selection.winner.model.signals, catalogue().label)
+    signals = (*selection.winner.model.signals, selection.cohort.catalog.signals.label)
     return TrainedDrives.of(name, selection.cohort.hash_drives_with(signals)).content
 
 
-def _term(name: str, coefficient: Fraction, definitions: Mapping[str, Definition]) -> ModelTerm:
+def _term(
+    catalog: Catalog, name: str, coefficient: Fraction, definitions: Mapping[str, Definition]
+) -> ModelTerm:
     """Return a term; `definitions` are those of the set's columns, which a line may have made."""
-    known = features()
-    one = known.of(name)
-    definition = definitions.get(name) or known.definition(name)
+    column, features = catalog.input(name), catalog.features
+    definition = definitions.get(name) or catalog.definition(name)
     return ModelTerm(
         signal=name,
-        column=one.column,
-        unit=one.unit,
-        scale=one.scale,
-        sql=known.features[name].sql if name in known.features and not definition else "",
+        column=column.column,
+        unit=column.unit,
+        scale=column.scale,
+        sql=features[name].sql if name in features and not definition else "",
         definition=definition,
         signal_scales=(
-            {signal: catalogue()[signal].scale for signal in definition.signals}
+            {signal: catalog.signals[signal].scale for signal in definition.signals}
             if definition
             else None
         ),

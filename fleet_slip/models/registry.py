@@ -7,7 +7,7 @@ models/<name>/history/1.json, 2.json, ...      every move of an alias, with its 
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from html import escape
@@ -17,7 +17,8 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from fleet_slip.catalogue.signals import IDENTIFIER_PATTERN, Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 #
 # A move follows the moves before it directly: of two processes that decide at once, one decides
 # again.
+
+FOLDER = "models"
 
 CHAMPION = "champion"
 """The alias of the version in use."""
@@ -183,11 +186,12 @@ class PandasFrame(Protocol):
 
 @dataclass(frozen=True)
 class ModelVersion:
-    """A manifest with its number and verified checksum."""
+    """A manifest with its number, its verified checksum, and the catalog of its data root."""
 
     version: int
     manifest: Manifest
     sha256: str
+    catalog: Catalog = field(repr=False, compare=False)
 
     def __repr__(self) -> str:
         figures = self.manifest.cross_validation
@@ -210,7 +214,7 @@ class ModelVersion:
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns in SI units that `predict` needs, named as in the view `log`."""
-        return self.manifest.columns
+        return self.manifest.columns(self.catalog.signals)
 
     @overload
     def predict(self, frame: "pl.DataFrame") -> "pl.Series": ...
@@ -247,13 +251,13 @@ class ModelVersion:
         """
         from fleet_slip.models.predict import predict  # noqa: PLC0415 - DuckDB, not for show
 
-        return predict(self.manifest, frame, self._predictor)
+        return predict(self.catalog.signals, self.manifest, frame, self._predictor)
 
     @cached_property
     def _predictor(self) -> "Predictor":
         from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
 
-        return Predictor.of(self.manifest)
+        return Predictor.of(self.catalog.signals, self.manifest)
 
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
@@ -261,14 +265,20 @@ _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)
 
 @dataclass(frozen=True)
 class Registry:
-    """All models below a folder."""
+    """All models of a data root, and the catalog of their columns."""
 
-    folder: Folder
+    root: Folder
+    catalog: Catalog
 
     @classmethod
     def of(cls, warehouse: "Warehouse") -> "Registry":
         """Return the models of a data root."""
-        return cls(warehouse.root / "models")
+        return cls(warehouse.root, warehouse.catalog)
+
+    @property
+    def folder(self) -> Folder:
+        """The folder of all models."""
+        return self.root / FOLDER
 
     def names(self) -> list[str]:
         """Return the names of all models, sorted."""
@@ -305,13 +315,19 @@ class Registry:
             if version in numbers:
                 raise
             raise _unknown(name, str(version), numbers) from None
-        manifest = parse_document(document.content, Manifest, f"{name}@{version}", "its manifest")
+        manifest = parse_document(
+            document.content,
+            Manifest,
+            f"{name}@{version}",
+            "its manifest",
+            self.catalog.signals,
+        )
         if manifest.name != name:
             raise StorageError(
                 f"{name}@{version}: its manifest names the model {manifest.name}. Restore the "
                 "file from a backup, or publish again."
             )
-        return ModelVersion(version, manifest, document.sha256)
+        return ModelVersion(version, manifest, document.sha256, self.catalog)
 
     def only(self, or_else: str = "") -> str:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""
@@ -344,7 +360,7 @@ class Registry:
 
     def history(self, name: str) -> AliasHistory:
         """Return the moves of a model's aliases."""
-        return AliasHistory(DocumentFolder(self.folder / name / "history"))
+        return AliasHistory(DocumentFolder(self.root, f"{FOLDER}/{name}/history"))
 
     def trained_drives(self, manifest: Manifest) -> TrainedDrives:
         """Return what drives made a version. Raises `StorageError`."""
@@ -368,7 +384,9 @@ class Registry:
         self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
 
         def next_version(latest: int) -> int | None:
-            if latest and self.load(name, latest).manifest.same_estimator(manifest):
+            if latest in versions.numbers() and self.load(name, latest).manifest.same_estimator(
+                manifest
+            ):
                 return latest
             document = versions.create(latest + 1, manifest.model_dump(mode="json"))
             return document.number if document else None
@@ -448,7 +466,7 @@ class Registry:
         return rows
 
     def _versions(self, name: str) -> DocumentFolder:
-        return DocumentFolder(self.folder / name / "versions")
+        return DocumentFolder(self.root, f"{FOLDER}/{name}/versions")
 
 
 _TABLE_SCHEMA = pa.schema(

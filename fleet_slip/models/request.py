@@ -6,12 +6,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_serializer, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationInfo,
+    field_serializer,
+    field_validator,
+    model_validator,
+)
 from typing_extensions import Doc
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.folding import Folding, FoldKey
@@ -19,7 +27,6 @@ from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.orders import METHODS, RANKINGS
 from fleet_slip.regression.subsets import CRITERIA
-from fleet_slip.resources import find_config
 
 if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
@@ -223,13 +230,20 @@ INPUTS_TOLD = 30
 """Inputs, or families of them, in a message."""
 
 
-def expand_families(names: Iterable[str]) -> tuple[str, ...]:
-    """Return names of inputs, of a family of windows or gates its members."""
-    return tuple(member for name in names for member in features().members(name))
+def expand_families(names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+    """Replace a family of windows or gates by its members; needs the `Catalog` as context."""
+    if (catalog := _catalog_of(info)) is None:
+        return names
+    return tuple(member for name in names for member in catalog.members(name))
+
+
+def _catalog_of(info: ValidationInfo) -> Catalog | None:
+    """Return the catalog to check names against: the context of a model list that is read."""
+    return info.context if isinstance(info.context, Catalog) else None
 
 
 Members = Annotated[tuple[Identifier, ...], AfterValidator(expand_families)]
-"""Names of inputs; families stand for their members."""
+"""Names of inputs; in a file, families stand for their members."""
 
 
 class CandidateModel(Config):
@@ -239,13 +253,15 @@ class CandidateModel(Config):
     signals: Annotated[Members, Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _signals_are_inputs(self) -> "CandidateModel":
-        inputs = features().inputs
-        for name in self.signals:
-            if name not in inputs:
-                raise ValueError(
-                    f"model {self.name!r}: {name!r} is not an input. Inputs: {name_inputs(inputs)}"
-                )
+    def _signals_are_inputs(self, info: ValidationInfo) -> "CandidateModel":
+        if catalog := _catalog_of(info):
+            inputs = catalog.inputs
+            for name in self.signals:
+                if name not in inputs:
+                    raise ValueError(
+                        f"model {self.name!r}: {name!r} is not an input. Inputs: "
+                        f"{name_inputs(catalog, inputs)}"
+                    )
         if len(set(self.signals)) < len(self.signals):
             raise ValueError(f"model {self.name!r} names a signal twice")
         return self
@@ -280,7 +296,7 @@ class ModelList(Config):
     """Candidates in their declared order, the feature set and the folds to compare them on.
 
     `label` may stand for a reference sensor. What each `search` finds joins, and the rule of the
-    first decides.
+    first decides. A file is validated with the `Catalog` as context.
     """
 
     description: str = Field(min_length=1)
@@ -310,24 +326,25 @@ class ModelList(Config):
         return self
 
     @model_validator(mode="after")
-    def _feature_set_has_the_inputs(self) -> "ModelList":
-        known = features()
-        if self.features not in {PLAIN, *known.sets} and not known.line_of(self.features):
-            raise ValueError(f"features: no feature set is called {self.features!r}")
-        if absent := self.absent_from(self.features):
-            inputs = known.feature_set(self.features).inputs
+    def _feature_set_has_the_inputs(self, info: ValidationInfo) -> "ModelList":
+        if (catalog := _catalog_of(info)) is None:
+            return self
+        try:
+            inputs = catalog.feature_set(self.features).inputs
+        except QuestionError:
+            raise ValueError(f"features: no feature set is called {self.features!r}") from None
+        if absent := self.absent_from(inputs):
             raise ValueError(
                 f"{', '.join(absent)} is not in the feature set {self.features!r}. Its inputs: "
                 f"{', '.join(inputs)}"
             )
         return self
 
-    def absent_from(self, feature_set: str) -> list[str]:
-        """Return what is compared or searched and not an input of a feature set."""
-        known = features().feature_set(feature_set).inputs
+    def absent_from(self, inputs: Sequence[str]) -> list[str]:
+        """Return the compared or searched columns that are not among the inputs."""
         named = [name for one in self.model for name in one.signals]
         named += [name for one in self.search for name in one.inputs or ()]
-        return [name for name in dict.fromkeys(named) if name not in known]
+        return [name for name in dict.fromkeys(named) if name not in inputs]
 
     @property
     def sha256(self) -> str:
@@ -336,9 +353,9 @@ class ModelList(Config):
         return sha256_of(canonical_json(content))
 
 
-def load_model_list(name_or_path: str) -> ModelList:
-    """Return a shipped model list by name, or one from a TOML file. Raises `ConfigError`."""
-    return load_config(find_config("models", name_or_path), ModelList)
+def load_model_list(catalog: Catalog, name_or_path: str) -> ModelList:
+    """Return a model list of the catalog's configs, or of a TOML file. Raises `ConfigError`."""
+    return load_config(catalog.configs.find("models", name_or_path), ModelList, catalog)
 
 
 def nested_candidates(order: Sequence[str]) -> tuple[CandidateModel, ...]:
@@ -357,42 +374,42 @@ def inputs_of(cohort: "Cohort", order: str) -> tuple[str, ...]:
     """Return the order of inputs in a text, `catalogue` being all; raises as `require_inputs`."""
     if order == WHOLE_SET:
         return cohort.inputs
-    return require_inputs(order.split(","), cohort.feature_set)
+    return require_inputs(cohort.catalog, order.split(","), cohort.feature_set)
 
 
-def require_inputs(names: Sequence[str], feature_set: str) -> tuple[str, ...]:
+def require_inputs(catalog: Catalog, names: Sequence[str], feature_set: str) -> tuple[str, ...]:
     """Return the inputs, of a family of windows or gates its members.
 
     Raises `QuestionError` for an unknown one, or one that is not odd of changes, `UsageError` for a
     repeated one.
     """
-    known = features().feature_set(feature_set).inputs
-    order = tuple(one for name in names for one in features().members(name.strip()))
-    if unknown := [name for name in order if name not in known]:
+    inputs = catalog.feature_set(feature_set).inputs
+    order = tuple(member for name in names for member in catalog.members(name.strip()))
+    if unknown := [name for name in order if name not in inputs]:
         raise QuestionError(
             f"{','.join(order)}: {', '.join(unknown)} is not an input. Inputs of the feature set "
-            f"{feature_set}: {name_inputs(known)}."
+            f"{feature_set}: {name_inputs(catalog, inputs)}."
         )
     if len(set(order)) < len(order):
         raise UsageError(f"{','.join(order)}: an input appears twice.")
-    require_odd(order, feature_set)
+    require_odd(catalog, order, feature_set)
     return order
 
 
-def require_odd(names: Sequence[str], feature_set: str) -> None:
+def require_odd(catalog: Catalog, names: Sequence[str], feature_set: str) -> None:
     """Raise `QuestionError` for columns of changes that are not odd in left and right."""
-    if not features().feature_set(feature_set).change_ticks:
+    if not catalog.feature_set(feature_set).change_ticks:
         return
-    if other := [name for name in names if not features().is_odd(name)]:
+    if even := [name for name in names if not catalog.is_odd(name)]:
         raise QuestionError(
-            f"{', '.join(other)}: does not change sign where left and right are exchanged, as the "
+            f"{', '.join(even)}: does not change sign where left and right are exchanged, as the "
             "side-slip angle does. Trained on course changes it would get a wrong constant: "
             "leave it out."
         )
 
 
-def name_inputs(inputs: Iterable[str]) -> str:
+def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
     """Return names of inputs in a line, families by their own, and how many more there are."""
-    names = list(features().families(inputs))
+    names = list(catalog.families(inputs))
     more = f" and {len(names) - INPUTS_TOLD} more (fleet-slip features)"
     return ", ".join(names[:INPUTS_TOLD]) + (more if len(names) > INPUTS_TOLD else "")

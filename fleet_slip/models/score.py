@@ -8,9 +8,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import calibrate
@@ -93,11 +92,11 @@ class Score(Answer):
             )
 
 
-def _si_rows() -> str:
+def _si_rows(signals: SignalCatalog) -> str:
     """Return a subquery: the rows of `log_counts` with the columns of the view `log`."""
     columns = [
         f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
-        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in catalogue().signals.items()),
+        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in signals.signals.items()),
     ]
     separator = ",\n            "
     return f"""(
@@ -114,7 +113,7 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     The drives that have such rows are estimated whole. Raises `QuestionError` for a condition that
     is not one expression, and `DataError` if no row has the model's signals.
     """
-    condition = cohort_of_rows(condition)
+    condition = cohort_of_rows(warehouse.catalog.signals, condition)
     estimate_rad, truth_rad, rows = _estimate_rows(warehouse, manifest, condition)
     if not len(truth_rad):
         raise DataError(
@@ -124,27 +123,30 @@ def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) 
     return _figures(estimate_rad, truth_rad, rows)
 
 
-def cohort_of_rows(condition: str | Condition) -> Condition:
+def cohort_of_rows(signals: SignalCatalog, condition: str | Condition) -> Condition:
     """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`."""
-    return condition if isinstance(condition, Condition) else parse_cohort(condition, row_columns())
+    if isinstance(condition, Condition):
+        return condition
+    return parse_cohort(signals, condition, row_columns(signals))
 
 
 def _estimate_rows(
     warehouse: Warehouse, manifest: Manifest, condition: Condition
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return estimate and label in rad of the rows of a cohort that have both, and of how many."""
-    predictor = Predictor.of(manifest)
+    signals = warehouse.catalog.signals
+    predictor = Predictor.of(signals, manifest)
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
-        columns=counts, rows=_si_rows(), condition=condition.sql
+        columns=counts, rows=_si_rows(signals), condition=condition.sql
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
     asked = 0
-    unit = float(input_scales()[label])
+    unit = float(warehouse.catalog.input_scales[label])
     with (
         connect_tables(warehouse, text) as database,
         asking(database, condition),
@@ -206,8 +208,9 @@ def find_seen(
     warehouse: Warehouse, registry: Registry, manifest: Manifest, condition: str | Condition
 ) -> SeenDrives:
     """Return which drives with a log of a cohort of rows made a version. Raises as `score`."""
-    cohort = cohort_of_rows(condition)
-    view = "log" if cohort.columns - set(drive_columns()) else "drives"
+    signals = warehouse.catalog.signals
+    cohort = cohort_of_rows(signals, condition)
+    view = "log" if cohort.columns - set(drive_columns(signals)) else "drives"
     logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, asking(database, cohort):

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from fleet_slip.base import Record
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.cohort import Cohort, drive_folds
 from fleet_slip.grams.folding import Folding
@@ -96,7 +94,7 @@ def select_inputs(
     Raises `DataError` without drives, for dependent inputs or if none is kept, and `QuestionError`
     for an unknown rule.
     """
-    label = catalogue().label
+    label = cohort.catalog.signals.label
     unit, intercept = request.cluster, request.intercept
     training, fold = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
     if rule.ranking == ALL_SUBSETS:
@@ -131,7 +129,7 @@ def try_distances(
     try:
         unit, intercept = request.cluster, request.intercept
         training, _ = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
-        return measure_distances(training, inputs, catalogue().label)
+        return measure_distances(training, inputs, cohort.catalog.signals.label)
     except (DataError, QuestionError) as error:
         return str(error)
 
@@ -179,7 +177,7 @@ def search_models(
 
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
-    label = catalogue().label
+    label = cohort.catalog.signals.label
     folds = cohort.folds(folding.by, folding.count).serving(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
@@ -197,7 +195,7 @@ def search_models(
             sums.append(held_out_errors(fitted.model, training, fold))
     name = search.name or search.method
     models = tuple(
-        assemble(f"{name} {fitted.size}", folds, sums, fitted.model, input_scales())
+        assemble(f"{name} {fitted.size}", folds, sums, fitted.model, cohort.catalog.input_scales)
         for sums, fitted in zip(tests, chosen, strict=True)
         if len(sums) == len(folds.grams)
     )
@@ -206,11 +204,11 @@ def search_models(
     return SearchedModels(search, tuple(inputs), models)
 
 
-def searching(found: SearchedModels, size: int, *, intercept: bool) -> Procedure:
+def searching(label: str, found: SearchedModels, size: int, *, intercept: bool) -> Procedure:
     """Return what searches again in given rows for so many columns, or the most that they allow."""
 
     def procedure(gram: Gram) -> LinearModel:
-        seen, label = gram if intercept else gram.about_origin(), catalogue().label
+        seen = gram if intercept else gram.about_origin()
         sets = stepwise_order(seen, found.inputs, label, found.search.method, size)
         return fit(seen, sets[-1] if sets else (), label).model
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.base import canonical_json, document_of, sha256_of
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import PLAIN, features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, load_cohort
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
@@ -156,7 +156,7 @@ class Selection(Answer):
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
             "cohort": self.cohort.condition.text,
-            "feature_set": features().identity(self.cohort.feature_set),
+            "feature_set": self.cohort.catalog.identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
             "rows_without": self.rows_without,
@@ -208,7 +208,8 @@ def select(
     is left, or no drive has the label.
     """
     divided = cohort.folds(folds.by, folds.count)
-    label = catalogue().label
+    catalog = cohort.catalog
+    label = catalog.signals.label
     if not any(label in grams[0].signals for grams in divided.tables):
         raise DataError(
             f"no drive of the cohort {cohort.condition.shown} has the label, {label}. Where cars "
@@ -216,10 +217,10 @@ def select(
         )
     models: list[CrossValidation] = []
     skipped: dict[str, str] = {}
-    scales = input_scales()
+    scales = catalog.input_scales
     for one in candidates:
         try:
-            require_odd(one.signals, cohort.feature_set)
+            require_odd(catalog, one.signals, cohort.feature_set)
             models.append(
                 cross_validate_inputs(
                     one.name, divided, one.signals, label, scales, intercept=intercept
@@ -270,7 +271,8 @@ def answer_request(
 
     Raises `UsageError` for options that do not go together.
     """
-    plan, remark = SelectionPlan.of(request), ""
+    catalog, remark = warehouse.catalog, ""
+    plan = SelectionPlan.of(catalog, request)
     usual = not request.models and plan.request.models == DEFAULT_MODELS
     try:
         answer = _answer(warehouse, plan, condition)
@@ -278,7 +280,7 @@ def answer_request(
         if not usual:
             raise
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
-        plan = SelectionPlan.of(replace(request, models=LOGGED_MODELS))
+        plan = SelectionPlan.of(catalog, replace(request, models=LOGGED_MODELS))
         answer = _answer(warehouse, plan, condition)
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
@@ -296,7 +298,7 @@ class SelectionPlan:
     feature_set: str
 
     @classmethod
-    def of(cls, request: SelectionRequest) -> "SelectionPlan":
+    def of(cls, catalog: Catalog, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
         by_inputs = request.nested or request.ordered or request.search
@@ -304,15 +306,15 @@ class SelectionPlan:
             logged = request.features or request.by == PARTS
             usual = LOGGED_MODELS if logged else DEFAULT_MODELS
             request = replace(request, models=COURSE_MODELS if request.label else usual)
-        model_list = _given(request)
+        model_list = _given(catalog, request)
         if request.models:
-            model_list = load_model_list(request.models)
+            model_list = load_model_list(catalog, request.models)
         if model_list and model_list.label and not request.label:
             request = replace(request, label=model_list.label)
             request.check()
         listed = model_list.folds if model_list else Folding()
         folds = make_folding(request.by or listed.by, request.folds, listed.count)
-        return cls(request, model_list, folds, _feature_set(request, model_list))
+        return cls(request, model_list, folds, _feature_set(catalog, request, model_list))
 
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
@@ -344,7 +346,8 @@ def _answer(warehouse: Warehouse, plan: SelectionPlan, condition: str) -> Select
     if request.prior:
         from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
-        cohort = replace(cohort, prior=simulate_prior(request.prior, plan.feature_set))
+        prior = simulate_prior(warehouse.catalog, request.prior, plan.feature_set)
+        cohort = replace(cohort, prior=prior)
     answer = plan.choose(cohort)
     if distances:
         inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
@@ -366,7 +369,7 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
     """
     alone = replace(cohort, prior=None)
     first = _compare_listed(alone, plan.request, plan.model_list, plan.folds)
-    winner, label = first.winner.model, catalogue().label
+    winner, label = first.winner.model, cohort.catalog.signals.label
     searches = _searches_of(plan.request, plan.model_list)
     named = next((one.inputs for one in searches if one.inputs), ())
     signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
@@ -374,7 +377,7 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
     weighed = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
     folds = weighed.folds(plan.folds.by, plan.folds.count).serving(signals, label, sparse=True)
     choose = least_squares(signals, label, intercept=plan.request.intercept)
-    joined = cross_validate("prior", folds, choose, input_scales())
+    joined = cross_validate("prior", folds, choose, cohort.catalog.input_scales)
     told = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
         f"the weight {weighed.weight}, {winner.pooled.rmse_deg:.4f} deg without."
@@ -405,28 +408,29 @@ def _weigh_drives(cohort: Cohort, plan: SelectionPlan) -> tuple[Cohort, dict[str
     return cohort.weighed(parts), lost
 
 
-def _given(request: SelectionRequest) -> ModelList | None:
+def _given(catalog: Catalog, request: SelectionRequest) -> ModelList | None:
     if request.model is None:
         return None
     feature_set = request.features or (COURSE_FEATURES if request.label else PLAIN)
-    signals = require_inputs(request.model.split(","), feature_set)
+    signals = require_inputs(catalog, request.model.split(","), feature_set)
     model = CandidateModel(name=GIVEN, signals=signals)
     return ModelList(description="One model", features=feature_set, model=(model,))
 
 
-def _feature_set(request: SelectionRequest, model_list: ModelList | None) -> str:
+def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelList | None) -> str:
     usual = COURSE_FEATURES if request.label else PLAIN
     named = request.features or (model_list.features if model_list else usual)
-    if request.label and not features().feature_set(named).change_ticks:
-        known = ", ".join(name for name, one in features().sets.items() if one.change_ticks)
+    if request.label and not catalog.feature_set(named).change_ticks:
+        names = ", ".join(name for name, entry in catalog.sets.items() if entry.change_s)
         raise QuestionError(
             f"the feature set {named} has no changes of the course. Feature sets that have: "
-            f"{known}."
+            f"{names}."
         )
-    if model_list and (absent := model_list.absent_from(named)):
+    inputs = catalog.feature_set(named).inputs
+    if model_list and (absent := model_list.absent_from(inputs)):
         raise QuestionError(
-            f"the feature set {named} lacks columns of {request.models}: {name_inputs(absent)}. "
-            "Take another one, or another list of models."
+            f"the feature set {named} lacks columns of {request.models}: "
+            f"{name_inputs(catalog, absent)}. Take another one, or another list of models."
         )
     return named
 

@@ -11,18 +11,17 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import ALL_DRIVES, DELAY, MEASURED
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import relate
+from fleet_slip.catalog.facts import ALL_DRIVES, DELAY, MEASURED
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
-from fleet_slip.models.acceptance import find_lacks
+from fleet_slip.models.acceptance import find_lacks, load_floor
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
@@ -53,7 +52,8 @@ def require_sound_drives(
     over.
     """
     found, looked_at, measured = _look(warehouse, manifest, made)
-    if measured and len(manifest.terms) > settled and (lacks := find_lacks(manifest)):
+    lacks = find_lacks(load_floor(warehouse.configs), manifest)
+    if measured and len(manifest.terms) > settled and lacks:
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "
             "fewer columns. To publish it anyway: --force"
@@ -78,8 +78,9 @@ def _look(
     warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
 ) -> tuple[dict[tuple[str, tuple[str, ...]], list[Fault]], int, int]:
     """Return what looks wrong in some long drives, how many these are, and of how many."""
+    signals = warehouse.catalog.signals
     found: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
-    condition = parse_condition(manifest.trained_on.cohort)
+    condition = parse_condition(signals, manifest.trained_on.cohort)
     query = _LONGEST.format(condition=condition.sql)
     with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
         drives = database.execute(query, {"source": MEASURED}).fetchall()
@@ -95,21 +96,21 @@ def _look(
                 f"LIMIT {MOST_TICKS}",
                 {"day": day, "drive": drive},
             ).fetchnumpy()
-            for one in find_suspicions(_signals(columns)):
+            for one in find_suspicions(signals, _signals(signals, columns)):
                 if one.does_harm:
                     found.setdefault((one.kind, one.signals), []).append(one)
     return found, len(chosen), measured
 
 
-def _signals(columns: Mapping[str, Any]) -> Signals:
+def _signals(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
     """Return the signals of a drive that has values of them."""
     counts = {
         name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
-        for name in catalogue().signals
+        for name in signals.signals
         if name in columns
     }
     some = {name: values for name, values in counts.items() if np.isfinite(values).any()}
-    return on_every_tick(np.asarray(columns["tick"], dtype=np.int32), some)
+    return on_every_tick(signals, np.asarray(columns["tick"], dtype=np.int32), some)
 
 
 # A course that is late looks like a side-slip angle, in all figures, and so does a heading.
@@ -124,11 +125,12 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
 
     Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
     """
-    condition = parse_cohort(manifest.trained_on.cohort)
+    signals = warehouse.catalog.signals
+    condition = parse_cohort(signals, manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, condition) as opened:
-        told = opened.batches(parse_condition(ALL_DRIVES))
+        told = opened.batches(parse_condition(signals, ALL_DRIVES))
         delays = receiver_delays(told).cars
-    feature_set = features().name_of(manifest.trained_on.feature_set)
+    feature_set = warehouse.catalog.name_of(manifest.trained_on.feature_set)
     with open_grams(warehouse, feature_set, condition) as opened:
         cars = dict(opened.course_delays(condition))
     left = {
@@ -172,7 +174,7 @@ def require_sound_course(
     warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
 ) -> None:
     """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
-    condition = parse_cohort(manifest.trained_on.cohort)
+    condition = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
         cars = course_moments(reader, condition)
     faults: dict[str, Fault] = {}

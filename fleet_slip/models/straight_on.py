@@ -16,8 +16,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.features import features, input_scales
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import NumberName
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import Calibration, calibrate
 from fleet_slip.grams.reader import DriveSums, collect_sums, open_grams
@@ -83,7 +83,8 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
         term.signal: term.coefficient_exact * Fraction(term.scale_exact) for term in manifest.terms
     }
     sums = _levels(warehouse, condition, manifest)
-    every = [_of_car(sums, car, coefficients, calibration) for car in sums.cars]
+    catalog = warehouse.catalog
+    every = [_of_car(catalog, sums, car, coefficients, calibration) for car in sums.cars]
     cars = [one for one in every if one is not None]
     if not cars:
         raise DataError(
@@ -104,7 +105,7 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     offsets = np.array([one.offsets for one in cars if one.offsets is not None]).T
     told = None
     if spread >= WORTH_RAD and known.sum() >= FEWEST_CARS:
-        told = _by_offsets(rows[known], offsets, own[known])
+        told = _by_offsets(catalog, rows[known], offsets, own[known])
     if told is None:
         return StraightOn(Fraction(0), {}, unsure, spread, len(cars))
     rest = own[known] - float(told.offset) - np.array(told.coefficients, float) @ offsets
@@ -113,17 +114,17 @@ def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) 
     return StraightOn(told.intercept, slopes, unsure, spread, len(cars))
 
 
-def levels_of(manifest: Manifest) -> tuple[str, tuple[str, ...]]:
+def levels_of(catalog: Catalog, manifest: Manifest) -> tuple[str, tuple[str, ...]]:
     """Return the set whose changes taught a model, and its columns that the intercept follows from.
 
     Raises `DataError` if there is no such set, or it lacks one of them.
     """
-    name = features().name_of(manifest.trained_on.feature_set)
-    base, known = features().feature_set(name).of, features().calibrated
-    wanted = (known[one].of if one in known else one for one in manifest.signals)
-    columns = tuple(dict.fromkeys((*PLANE, *wanted)))
-    there = features().feature_set(base).columns if base else ()
-    if absent := [column for column in columns if column not in there]:
+    name = catalog.name_of(manifest.trained_on.feature_set)
+    base, calibrated = catalog.feature_set(name).of, catalog.calibrated
+    sources = (calibrated[one].of if one in calibrated else one for one in manifest.signals)
+    columns = tuple(dict.fromkeys((*PLANE, *sources)))
+    available = catalog.feature_set(base).columns if base else ()
+    if absent := [column for column in columns if column not in available]:
         raise DataError(
             f"the intercept needs Gram rows of {', '.join(absent)}, not only of changes: set of in "
             f"the feature set {name} (configs/features.toml) to one that has them, or fit "
@@ -133,7 +134,7 @@ def levels_of(manifest: Manifest) -> tuple[str, tuple[str, ...]]:
 
 
 def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> DriveSums:
-    base, columns = levels_of(manifest)
+    base, columns = levels_of(warehouse.catalog, manifest)
     with open_grams(warehouse, base, condition) as opened:
         found = collect_sums(opened.batches(condition), {base: columns}, unnamed=True)
     if not found:
@@ -145,17 +146,21 @@ def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> D
 
 
 def _of_car(
-    sums: DriveSums, car: str, coefficients: Mapping[str, Fraction], calibration: Calibration
+    catalog: Catalog,
+    sums: DriveSums,
+    car: str,
+    coefficients: Mapping[str, Fraction],
+    calibration: Calibration,
 ) -> _Car | None:
     """Return what a car asks for; None if it drove alike all the time."""
     numbers = calibration.cars.get(car, {})
-    weights = _of_columns(coefficients, {name: one.count for name, one in numbers.items()})
+    weights = _of_columns(catalog, coefficients, {name: one.count for name, one in numbers.items()})
     table = sums.table.take(sums.cars[car])
     gram = table.total()
     bias = numbers.get("yaw_rate_offset")
     value, unsure = (Fraction(bias.value), bias.uncertainty or 0.0) if bias else (Fraction(0), 0.0)
     means = calibration.evidence.means(car, ("slowness", "speed"))
-    scales = (input_scales()[name] for name in PLANE)
+    scales = (catalog.input_scales[name] for name in PLANE)
     # Where the car does not turn, and how that moves with the gyroscope's bias.
     moved = [Fraction(0), *(mean / scale for mean, scale in zip(means, scales, strict=True))]
     point = [Fraction(1), *(value * one for one in moved[1:])]
@@ -194,14 +199,14 @@ def _of_car(
 
 
 def _of_columns(
-    coefficients: Mapping[str, Fraction], numbers: Mapping[str, int]
+    catalog: Catalog, coefficients: Mapping[str, Fraction], numbers: Mapping[str, int]
 ) -> dict[str, Fraction]:
     """Return what a model of a car multiplies each stored column by; calibrated ones have none."""
     found: dict[str, Fraction] = {}
     for name, coefficient in coefficients.items():
         of, factor = name, 1
-        if calibrated := features().calibrated.get(name):
-            number = features().time_columns[name].definition.number
+        if calibrated := catalog.calibrated.get(name):
+            number = catalog.time_columns[name].definition.number
             of = calibrated.of
             factor = numbers.get(number.name, number.less) - number.less if number else 1
         found[of] = found.get(of, Fraction(0)) + coefficient * factor
@@ -225,9 +230,11 @@ def _scatter(inputs: FloatArray, products: FloatArray, point: FloatArray) -> flo
     return float((drives - 1) / drives * ((values - values.mean()) ** 2).sum())
 
 
-def _by_offsets(rows: FloatArray, offsets: FloatArray, means: FloatArray) -> LinearModel | None:
+def _by_offsets(
+    catalog: Catalog, rows: FloatArray, offsets: FloatArray, means: FloatArray
+) -> LinearModel | None:
     """Fit the cars' intercepts in rad to their offsets in counts; None if these go together."""
-    if not set(COLUMNS) <= set(features().calibrated):
+    if not set(COLUMNS) <= set(catalog.calibrated):
         return None
     grains = np.rint(means / float(GRAIN_RAD))
     columns = np.stack([*offsets, grains]).astype(np.int64).astype(object)

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.facts import TRAINING_DRIVES
 from fleet_slip.grams.cohort import remark_left_out
 from fleet_slip.grams.folding import BANDS, PARTS
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
@@ -55,7 +55,7 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
     winner = selection.winner
     yield f"winner: {winner.model.name}. {winner.reason}"
     if selection.searched_winner is not None:
-        yield f"its columns: {in_families(winner.model.signals)}"
+        yield f"its columns: {in_families(selection.cohort.catalog, winner.model.signals)}"
     if selection.choice is not None:
         yield from _choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):
@@ -122,7 +122,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
             "pooled": one.pooled,
             "signals": number_of(len(one.signals), "column")
             if one in found
-            else in_families(one.signals),
+            else in_families(cohort.catalog, one.signals),
         }
         for one in shown
     )
@@ -177,11 +177,11 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
         yield _label_noise(selection)
 
 
-def in_families(signals: Sequence[str]) -> str:
+def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
     """Return the names of signals; of more than `MANY_SIGNALS`, whole families by their own."""
     if len(signals) <= MANY_SIGNALS:
         return " ".join(signals)
-    families = features().families(signals).items()
+    families = catalog.families(signals).items()
     told = (f"{name}({count})" if count else name for name, count in families)
     return f"{len(signals)}: " + " ".join(told)
 

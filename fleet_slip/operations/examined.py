@@ -17,9 +17,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
-from fleet_slip.catalogue.facts import MEASURED, RECEIVED
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.facts import MEASURED, RECEIVED
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import update_grams
@@ -153,9 +154,9 @@ class _Piece(NamedTuple):
         drives, rows = self.drives + other.drives, self.rows + other.rows
         return _Piece(self.first, other.last, drives, rows)
 
-    @property
-    def condition(self) -> Condition:
-        return parse_condition(f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'")
+    def condition(self, signals: SignalCatalog) -> Condition:
+        days = f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'"
+        return parse_condition(signals, days)
 
 
 def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
@@ -165,19 +166,22 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
     nothing to examine.
     """
-    measured = parse_condition(f"source IN ('{MEASURED}', '{RECEIVED}')")
-    asked = parse_condition(cohort, row_columns())
-    condition = measured if asked.columns - set(drive_columns()) else asked & measured
+    signals = warehouse.catalog.signals
+    measured = parse_condition(signals, f"source IN ('{MEASURED}', '{RECEIVED}')")
+    asked = parse_condition(signals, cohort, row_columns(signals))
+    condition = measured if asked.columns - set(drive_columns(signals)) else asked & measured
     grams, logs = gram_snapshots(warehouse)
     missing, missing_rows = _lacking(warehouse, grams, logs, condition)
     parts: list[Mapping[str, Any]] = []
     for piece in _pieces(warehouse, condition) if _has_measured(grams) else []:
         about = {"cohort": condition.text, "from": piece.first, "root": warehouse.root.uri}
-        limits = thresholds().quality.model_dump(mode="json")
+        limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
         state = [piece.rows, sha256(canonical_json(limits).encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
-        parts.append(_known(kept, state) or _examine(warehouse, condition & piece.condition))
+        parts.append(
+            _known(kept, state) or _examine(warehouse, condition & piece.condition(signals))
+        )
         content = {**parts[-1], "state": state}
         keep_json(kept, {**content, "sha256": sha256_of(canonical_json(content))})
     found = {

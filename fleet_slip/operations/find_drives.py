@@ -11,12 +11,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue, digest_counts
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import digest_counts
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
+from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
+from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.rendering import Remark
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, StoredFile
+from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
@@ -55,7 +56,7 @@ def vacuum(
     if not dry_run:
         found = [file for file in found if file.folder.remove(file)]
     return VacuumReport(
-        files=tuple(str(file).removeprefix(f"{warehouse.root}/") for file in found),
+        files=tuple(path_below(warehouse, file) for file in found),
         size_bytes=sum(file.size_bytes for file in found),
         dry_run=dry_run,
     )
@@ -69,9 +70,9 @@ def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFil
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
-        removed, expired = snapshot.removed(), snapshot.removed(retention_hours)
+        expired = snapshot.removed_before(retention_hours)
         found += [file for file in files if file.path in expired]
-        uncommitted += [file for file in files if file.path not in removed]
+        uncommitted += [file for file in files if file.path not in snapshot.removals]
     found += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
     return [file for file in found if file.age_hours >= retention_hours]
 
@@ -91,11 +92,23 @@ def find_unreferenced(table: Table) -> list[StoredFile]:
 
 
 def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
-    """Return what killed writers left under temporary names: ours, and the Delta library's."""
+    """Return temporary files of killed jobs: ours, DuckDB's, and the Delta library's."""
     return [
         file
         for file in warehouse.root.files()
-        if file.name.startswith(TEMPORARY_PREFIX) or _OF_DELTA.fullmatch(file.path)
+        if file.name.startswith(TEMPORARY_PREFIX)
+        or file.path.startswith(SPILL_PREFIX)
+        or _OF_DELTA.fullmatch(file.path)
+    ]
+
+
+def find_replaced(warehouse: Warehouse) -> list[StoredFile]:
+    """Return the files that a commit removed from its table, whatever the clock says."""
+    return [
+        file
+        for table in warehouse.tables
+        for file in find_unreferenced(table)
+        if file.path in table.snapshot().removals
     ]
 
 
@@ -107,7 +120,8 @@ def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
         return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
-    return pc.equal(rows[subject.column].cast(pa.string()), subject.value)
+    names = rows[subject.column].cast(pa.string())
+    return pc.is_in(names, pa.array(subject.select(names.unique().to_pylist()), pa.string()))
 
 
 def quarantined_of(
@@ -117,9 +131,9 @@ def quarantined_of(
 
     Rows refused before a cut at a gap name the whole drive.
     """
-    if subject.kind == "drive":
-        drives = {*drives, subject.value}
     ids = rows["drive_id"].cast(pa.string())
+    if subject.kind == "drive":
+        drives = {*drives, subject.value, *subject.select(ids.unique().to_pylist())}
     concerned = {
         name
         for name in ids.unique().to_pylist()
@@ -128,7 +142,7 @@ def quarantined_of(
     of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
     if subject.kind != "vehicle":
         return of_drives
-    return pc.or_(of_drives, pc.fill_null(rows_of(rows, subject), False))
+    return pc.or_(of_drives, rows_of(rows, subject))
 
 
 @dataclass(frozen=True)
@@ -146,7 +160,7 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
     columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
     for file in grams.files:
         rows = grams.table.read(file.path, columns)
-        whole = pc.equal(rows["feature_set"], features().identity(PLAIN))
+        whole = pc.equal(rows["feature_set"], PLAIN)
         known.update(rows["file"].filter(whole).unique().to_pylist())
         found = rows.filter(rows_of(rows, subject))
         for path, drive in zip(
@@ -179,37 +193,88 @@ def remove_uncommitted(warehouse: Warehouse, subject: Forgettable, drives: Colle
     may alone tell a car's drives. Drives before a day are not barred, and may be landing.
     """
     found: list[StoredFile] = []
-    for table in (warehouse.logs, warehouse.grams, warehouse.quarantine):
-        removed = table.snapshot().removed()
-        files = [file for file in find_unreferenced(table) if file.path not in removed]
-        for file in files if subject.kind != "before" else ():
+    for table in warehouse.tables if subject.kind != "before" else ():
+        removals = table.snapshot().removals
+        for file in find_unreferenced(table):
+            if file.path in removals:
+                continue
             with suppress(StorageError):  # half a file, or just deleted
-                rows = table.read(file.path, ["drive_id", "vehicle_id"])
-                refused = table is warehouse.quarantine
-                mine = quarantined_of(rows, subject, drives) if refused else rows_of(rows, subject)
-                if pc.any(mine).as_py():
-                    names = rows["drive_id"].filter(mine).drop_null()
-                    drives = {*drives, *names.to_pylist()}
+                matches = find_in_file(warehouse, table, file, subject, drives)
+                if matches is not None:
+                    drives = {*drives, *matches}
                     found.append(file)
     for file in reversed(found):
         file.folder.remove(file)
 
 
-def half_written(warehouse: Warehouse) -> list[str]:
-    """Return the files below tables, by path, that may be being written and may have any drive."""
+def find_in_file(
+    warehouse: Warehouse,
+    table: Table,
+    file: StoredFile,
+    subject: Forgettable,
+    drives: Collection[str],
+) -> set[str] | None:
+    """Return a subject's drives in a file; None if no row, and no dictionary, has the subject."""
+    rows = table.read(file.path, ["drive_id", "vehicle_id"])
+    is_quarantine = table is warehouse.quarantine
+    mask = quarantined_of(rows, subject, drives) if is_quarantine else rows_of(rows, subject)
+    matches = rows["drive_id"].filter(mask)
+    dictionaries = table.read_names(file.path).values()
+    if not len(matches) and not any(subject.value in names.unused for names in dictionaries):
+        return None
+    return set(matches.drop_null().to_pylist())
+
+
+def find_remains(
+    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+) -> Iterator[str]:
+    """Yield the files that are in no table and have rows of a subject, or cannot be read.
+
+    Files with drives before a day may be landing: these are not judged.
+    """
+    for table in warehouse.tables if subject.kind != "before" else ():
+        for file in find_unreferenced(table):
+            try:
+                if find_in_file(warehouse, table, file, subject, drives) is not None:
+                    yield path_below(warehouse, file)
+            except StorageError:
+                if any(file == other for other in find_unreferenced(table)):  # not just deleted
+                    yield f"{path_below(warehouse, file)} (unreadable)"
+
+
+def half_written(warehouse: Warehouse) -> list[StoredFile]:
+    """Return the temporary files that may have rows of any drive."""
     tables = {table.folder.name for table in warehouse.tables}
-    files = [file.path for file in find_temporary_files(warehouse)]
-    return [path for path in files if path.split("/")[0] in tables and "_delta_log" not in path]
+    return [
+        file
+        for file in find_temporary_files(warehouse)
+        if file.path.startswith(SPILL_PREFIX)
+        or (file.path.split("/")[0] in tables and "_delta_log" not in file.path)
+    ]
+
+
+def path_below(warehouse: Warehouse, file: StoredFile) -> str:
+    """Return the path of a file below the data root."""
+    return str(file).removeprefix(f"{warehouse.root}/")
 
 
 def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
-    """Yield what tells a subject's drives by their counts, file by file of the logs."""
+    """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
+    grams = warehouse.grams.snapshot()
+    for file in grams.files:
+        names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
+        if pc.any(selected := rows_of(names, subject)).as_py():
+            rows = read_rows(warehouse.grams, file).filter(selected)
+            on_board = pc.is_in(
+                rows["feature_set"], pa.array(list(counted_sets(warehouse.catalog)), pa.string())
+            )
+            yield from gram_digests(rows.filter(on_board))[0]
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
     for file in logs.files:
         if file.path not in drives:
             continue
-        signals = [name for name in catalogue().signals if name in file.null_counts]
+        signals = [name for name in warehouse.catalog.signals.signals if name in file.null_counts]
         rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
         ids = rows["drive_id"].cast(pa.string())
         for name in sorted(drives[file.path]):

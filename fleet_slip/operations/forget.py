@@ -7,6 +7,7 @@ that have not seen it conflict. Then Gram rows are fenced, against those that ha
 logs. What such jobs have written is deleted by them or here.
 """
 
+import shutil
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from datetime import date, timedelta
@@ -17,7 +18,7 @@ from pydantic import Field
 from fleet_slip.base import Progress, no_progress, number_of
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, is_of_received
+from fleet_slip.grams.gram_files import is_of_received
 from fleet_slip.grams.job import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
@@ -26,9 +27,12 @@ from fleet_slip.operations.find_drives import (
     VacuumReport,
     digests_of,
     drives_by_file,
+    find_remains,
+    find_replaced,
     find_unreferenced,
     half_written,
     locate,
+    path_below,
     quarantined_of,
     remove_uncommitted,
     vacuum,
@@ -42,7 +46,7 @@ from fleet_slip.operations.rewriting import (
     write_without,
 )
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.resources import config_file, find_config
+from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
@@ -67,7 +71,7 @@ class ForgetReport(Answer):
     old_files_left: int
     """Replaced files, which may have the drives, kept for readers of the last week."""
     pending: tuple[str, ...] = ()
-    """Files below the root, and runs, that may still have the drives: repeat it when they ended."""
+    """Tables and files below the root, and runs, that have or may have rows of the drives."""
 
     @property
     def changed(self) -> bool:
@@ -97,13 +101,21 @@ class ForgetReport(Answer):
             yield Remark(f"trained on them: {', '.join(self.models)}. To train again: {again}")
 
     def require_all(self) -> None:
-        """Raise `PendingError` while anything may have the drives."""
+        """Raise `PendingError` while anything has, or may have, rows of the drives."""
         if self.pending:
+            runs = any(item.startswith(RUN) for item in self.pending)
+            advice = "Repeat this command when the runs have ended." if runs else _NO_RUN
             raise PendingError(
-                f"{len(self.pending)} jobs or files may still hold its rows, unseen by readers: "
-                f"{', '.join(self.pending[:PENDING_SHOWN])}. Repeat this command when these have "
-                "ended; for files of killed jobs, after an hour."
+                f"{len(self.pending)} jobs or files may still hold its rows: "
+                f"{', '.join(self.pending[:PENDING_SHOWN])}. {advice}"
             )
+
+
+RUN = "the run "
+_NO_RUN = (
+    "No other run is under way. Run fleet-slip verify, restore or delete what it finds damaged or "
+    "unreferenced there, and repeat this command."
+)
 
 
 def forget(
@@ -150,31 +162,70 @@ def forget(
     rows += forget_received(warehouse, subject)
     remove_uncommitted(warehouse, subject, drives)
     reconcile(warehouse)
-    old = vacuum(warehouse, 0, dry_run=not now)
-    if drives or state in ("begun", ALLOWED):
+    replaced = find_replaced(warehouse)
+    deleted = sum(file.folder.remove(file) for file in replaced) if now else 0
+    look = (drives or state) and subject.kind != "before"  # such drives may be landing
+    tables = list(_tables_with(warehouse, subject, drives)) if look else []
+    if not tables and (drives or state in ("begun", ALLOWED)):
         audit.end(subject, warehouse.grams.snapshot().version)
-    under_way = [f"the run {run}" for run in runs_under_way(warehouse.root)] if now else []
+    pending: list[str] = []
+    if drives or state:
+        pending = [*tables, *_find_pending(warehouse, subject, drives, now=now)]
     return ForgetReport(
         drives=len(drives),
         rows=rows,
         files_rewritten=rewritten,
         files_removed=removed,
         models=tuple(models),
-        old_files_deleted=len(old.files) if now else 0,
-        old_files_left=0 if now else len(old.files),
-        pending=(*half_written(warehouse), *under_way) if drives or state else (),
+        old_files_deleted=deleted,
+        old_files_left=0 if now else len(replaced),
+        pending=tuple(pending),
     )
+
+
+def _tables_with(
+    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+) -> Iterator[str]:
+    """Yield the tables whose newest version still has rows of a subject."""
+    located = locate(warehouse.grams.snapshot(), subject)
+    if located.drives:
+        yield "grams"
+    if drives_by_file(warehouse.logs.snapshot(), subject, located):
+        yield "logs"
+    for file in warehouse.quarantine.snapshot().files:
+        rows = warehouse.quarantine.read(file.path)
+        if pc.any(quarantined_of(rows, subject, drives)).as_py():
+            yield "quarantine"
+            return
+
+
+def _find_pending(
+    warehouse: Warehouse, subject: Forgettable, drives: Collection[str], *, now: bool
+) -> list[str]:
+    """Return runs, and files outside the tables, that have or may have rows of a subject.
+
+    With `now`, first delete the cache of sensor checks, which has hashes of names, and temporary
+    files, unless a run that may write them is under way.
+    """
+    if now:
+        shutil.rmtree(cache_folder("examined"), ignore_errors=True)
+    files = half_written(warehouse)  # listed before the runs: a run that begins later has none
+    runs = [f"{RUN}{run}" for run in runs_under_way(warehouse.root)] if now else []
+    if now and not runs:
+        for file in files:
+            file.folder.remove(file)
+    temporary = [path_below(warehouse, file) for file in half_written(warehouse)]
+    remains = find_remains(warehouse, subject, drives) if now else ()
+    return [*remains, *temporary, *runs]
 
 
 def _require_delta_logs(warehouse: Warehouse) -> None:
     """Raise `StorageError` if a Delta log was lost: a fence begins a new one."""
     for table in (warehouse.logs, warehouse.grams):
-        files = find_unreferenced(table)
-        old = any(file.age_hours >= BEING_WRITTEN_HOURS for file in files)
-        if old and table.snapshot().version is None:
+        if table.snapshot().version is None and find_unreferenced(table):
             raise StorageError(
-                f"{table.folder}: files without a Delta log. Restore the log from a backup; if a "
-                "killed job left the files, delete them."
+                f"{table.folder}: files without a Delta log. Restore the log from a backup. If a "
+                "job is writing the first files, wait for its end; if it was killed, delete them."
             )
 
 
@@ -266,9 +317,9 @@ class RetentionReport(Answer):
         yield self.vacuumed.remark
 
 
-def load_retention(path: str | None) -> Retention:
-    """Read a retention file, the one that ships by default. Raises `ConfigError`."""
-    file = config_file("retention.toml") if path is None else find_config("retention", path)
+def load_retention(path: str | None, configs: Configs) -> Retention:
+    """Read a retention file, by default `retention.toml` of the configs. Raises `ConfigError`."""
+    file = configs.file("retention.toml") if path is None else configs.find("retention", path)
     return load_config(file, Retention)
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalogue.facts import RECEIVED
-from fleet_slip.catalogue.faults import DriveBatches, Fault
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.faults import DriveBatches, Fault
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
@@ -131,6 +131,7 @@ LEAST_GAIN = 1e-3
 
 
 def find_odd_days(
+    signals: SignalCatalog,
     table: GramTable,
     in_order: BoolArray,
     groups: Sequence[IntArray],
@@ -142,9 +143,11 @@ def find_odd_days(
     `groups` are ways to number the drives of the table, such as by day. The most unlike group is
     taken out and the rest is judged again; a group of more than half of the drives is no odd one.
     """
-    label = catalogue().label
+    label = signals.label
     if label not in table.signals or len(table.signals) < 2:
         return {}
+    # The gain comes first: it decides where a group differs in both.
+    least = {GAIN: math.log(FACTOR), OFFSET: LEAST_OFFSET / float(signals[label].scale)}
     faults: dict[int, Fault] = {}
     usual = in_order.copy()
     while usual.sum() >= limits.min_drives:
@@ -152,10 +155,10 @@ def find_odd_days(
         if figures is None:
             break
         chosen = [group[usual] for group in groups]
-        found = list(_odd(figures, chosen, cars[usual], label, limits.limit))
+        found = list(_odd(figures, chosen, cars[usual], label, least, limits.limit))
         if not found:
             rows = np.flatnonzero(usual)
-            alone = _alone(figures, label, limits.limit)
+            alone = _alone(figures, label, least, limits.limit)
             return faults | {int(rows[drive]): fault for drive, fault in alone.items()}
         _, mask, fault = max(found, key=lambda one: one[0])
         rows = np.flatnonzero(usual)[mask]
@@ -180,18 +183,15 @@ def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
     return np.stack([offsets, np.log(np.maximum(gains, LEAST_GAIN))], axis=1)
 
 
-def _least_differences(label: str) -> dict[int, float]:
-    """Return by how much a figure of a group differs at least, the gain first."""
-    return {GAIN: math.log(FACTOR), OFFSET: LEAST_OFFSET / float(catalogue()[label].scale)}
-
-
-def _alone(figures: FloatArray, label: str, limit: float) -> dict[int, Fault]:
+def _alone(
+    figures: FloatArray, label: str, least: dict[int, float], limit: float
+) -> dict[int, Fault]:
     """Return single drives that are far off by twice what a group may be."""
     apart = figures - np.median(figures, axis=0)
     spread = MAD_TO_STD * np.median(np.abs(apart), axis=0)
     found: dict[int, Fault] = {}
-    for at, least in reversed(_least_differences(label).items()):
-        far = np.abs(apart[:, at]) > max(2 * least, limit * spread[at])
+    for at in reversed(least):
+        far = np.abs(apart[:, at]) > max(2 * least[at], limit * spread[at])
         for drive in np.flatnonzero(far).tolist():
             found[drive] = _fault(label, at, float(apart[drive, at]), "of other drives")
     return found
@@ -204,7 +204,12 @@ def _fault(label: str, at: int, difference: float, of: str) -> Fault:
 
 
 def _odd(
-    figures: FloatArray, groups: Sequence[IntArray], cars: IntArray, label: str, limit: float
+    figures: FloatArray,
+    groups: Sequence[IntArray],
+    cars: IntArray,
+    label: str,
+    least: dict[int, float],
+    limit: float,
 ) -> Iterator[tuple[float, BoolArray, Fault]]:
     """Yield how sure it is that a group is odd, which drives are of it, and the fault.
 
@@ -222,8 +227,8 @@ def _odd(
             spread = MAD_TO_STD * np.median(np.abs(figures[part] - middle), axis=0)
             variance += math.pi / 2 * spread**2 / number
         scores = np.abs(own - others) / np.sqrt(variance)
-        for at, least in _least_differences(label).items():
-            if abs(own[at] - others[at]) > least and scores[at] > limit:
+        for at, difference in least.items():
+            if abs(own[at] - others[at]) > difference and scores[at] > limit:
                 fault = _fault(label, at, float(own[at] - others[at]), "of other days")
                 to_own, to_others = (np.abs(figures[:, at] - one[at]) for one in (own, others))
                 yield float(scores[at]), mask & (to_own < to_others), fault

@@ -15,14 +15,13 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import Hashes, hash_names
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
-from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
 
-def marked_models(root: Folder) -> frozenset[str]:
+def marked_models(warehouse: Warehouse) -> frozenset[str]:
     """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
-    entries = Audit(root).entries()
+    entries = Audit(warehouse.root).entries()
     found = {name for entry in entries for name in entry.get("models", ())}
     judged: dict[str, dict[str, int]] = {}
     without: dict[str, int | None] = {}
@@ -32,7 +31,6 @@ def marked_models(root: Folder) -> frozenset[str]:
             without[entry["subject"]] = None
         elif entry["event"] == "done":
             without[entry["subject"]] = entry.get("grams_version")
-    warehouse = Warehouse(root)
     registry = Registry.of(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
     hashes = cache(lambda: _hashes_of_present(warehouse))

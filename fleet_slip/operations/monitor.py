@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 from datetime import date
 from statistics import fmean, stdev
 
-from fleet_slip.catalogue.features import PLAIN, features, input_scales
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
@@ -136,9 +137,10 @@ def monitor(
     Days from `since` are new; by default those after the last day of the logs it was trained on.
     Raises `DataError` if fewer than `min_training_days` are left to learn from.
     """
-    limits, manifest = thresholds().monitor, version.manifest
-    condition = parse_cohort(condition or manifest.trained_on.cohort)
-    feature_set = features().name_of(manifest.trained_on.feature_set)
+    catalog = warehouse.catalog
+    limits, manifest = thresholds(warehouse.configs).monitor, version.manifest
+    condition = parse_cohort(catalog.signals, condition or manifest.trained_on.cohort)
+    feature_set = catalog.name_of(manifest.trained_on.feature_set)
     sums = sum_days(warehouse, manifest.signals, condition, feature_set)
     days, grams = sums.days, sums.grams
     last = _last_training_day(warehouse, version) if since is None else None
@@ -149,12 +151,12 @@ def monitor(
             f"{sum(training)} in the cohort {condition.shown}. Choose another cohort, or a later "
             "--since."
         )
-    models = _models(manifest, feature_set, grams, training)
+    models = _models(catalog, manifest, feature_set, grams, training)
     found = []
     for day, gram, drives, model, known in zip(
         days, grams, sums.drives, models, training, strict=True
     ):
-        errors = error_sums(model, gram).figures(input_scales()[model.label])
+        errors = error_sums(model, gram).figures(catalog.input_scales[model.label])
         mean_deg, std_deg = errors.error_mean_deg, errors.error_std_deg
         found.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, known))
     usual = [day for day in found if day.training]
@@ -165,12 +167,16 @@ def monitor(
 
 
 def _models(
-    manifest: Manifest, feature_set: str, grams: Sequence[Gram], training: Sequence[bool]
+    catalog: Catalog,
+    manifest: Manifest,
+    feature_set: str,
+    grams: Sequence[Gram],
+    training: Sequence[bool],
 ) -> list[LinearModel]:
     """Return the model that predicts each day: of a training day, the one made without it."""
     own = [gram for gram, known in zip(grams, training, strict=True) if known]
     total = sum(own[1:], own[0])
-    champion = manifest.counts_model(feature_set)
+    champion = manifest.counts_model(catalog, feature_set)
     refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
     return [
         refit(total - gram) if known else champion

@@ -67,7 +67,7 @@ class Nights:
         self._append("ended", content)
 
     def _newest_first(self) -> Iterator[Mapping[str, Any]]:
-        documents = DocumentFolder(self.root / NIGHTS_FOLDER)
+        documents = DocumentFolder(self.root, NIGHTS_FOLDER)
         for number in reversed(documents.numbers()):
             content = documents.read(number).content
             if content["model"] == self.model:
@@ -75,7 +75,7 @@ class Nights:
 
     def _append(self, event: str, content: Mapping[str, Any]) -> None:
         known = {"event": event, "model": self.model}
-        DocumentFolder(self.root / NIGHTS_FOLDER).append({**known, **content})
+        DocumentFolder(self.root, NIGHTS_FOLDER).append({**known, **content})
 
 
 State: TypeAlias = Literal["done", "attention", "failed", "left out"]

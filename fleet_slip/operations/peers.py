@@ -13,17 +13,17 @@ Systems, 1998).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.faults import DriveBatches, Fault, MeanMoments
+from fleet_slip.catalog.faults import DriveBatches, Fault, MeanMoments
 from fleet_slip.config import Config, load_config
 from fleet_slip.regression.gram import GramTable
-from fleet_slip.resources import config_file
+from fleet_slip.resources import Configs
 
 # The thresholds of `configs/monitor.toml`.
 
@@ -78,10 +78,9 @@ class Thresholds(Config):
     monitor: MonitorThresholds
 
 
-@cache
-def thresholds() -> Thresholds:
-    """Return the thresholds that ship with this installation."""
-    return load_config(config_file("monitor.toml"), Thresholds)
+def thresholds(configs: Configs) -> Thresholds:
+    """Return the thresholds of `monitor.toml`. Raises `ConfigError`."""
+    return load_config(configs.file("monitor.toml"), Thresholds)
 
 
 PAIRS = (("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr"), ("steer_fl", "steer_fr"))

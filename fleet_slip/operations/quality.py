@@ -11,11 +11,10 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalogue.course import relate
-from fleet_slip.catalogue.facts import TRAINING_DRIVES
-from fleet_slip.catalogue.faults import DriveBatches, Fault, find_implausible
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import relate
+from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.faults import DriveBatches, Fault, find_implausible
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
@@ -89,7 +88,7 @@ def examine_drives(
     Each drive is examined, whatever signals it has.
     Raises like `fleet_slip.grams.cohort.load_cohort`.
     """
-    drives = parse_cohort(condition)
+    drives = parse_cohort(warehouse.catalog.signals, condition)
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
         known = _faulty_courses(reader, drives)
@@ -122,7 +121,10 @@ def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]
     require_training(sources, condition)
     models = sorted(opened.values_of("vehicle_model", condition).to_pylist(), key=str)
     return [
-        parse_condition(f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}") for model in models
+        parse_condition(
+            reader.catalog.signals, f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}"
+        )
+        for model in models
     ]
 
 
@@ -132,15 +134,17 @@ def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
     One that is reversed, and one with another factor or zero since a day or in a file: what is
     wrong with many drives at once may be the usual in one vehicle model.
     """
-    limits = thresholds().quality
+    catalog = cohort.catalog
+    limits = thresholds(catalog.configs).quality
     found: dict[str, Fault] = {}
     for table, metadata in _long_drives(cohort, limits.min_rows):
         in_order = np.ones(len(table), dtype=np.bool_)
-        in_order[list(find_implausible(table, limits.min_correlation))] = False
+        in_order[list(find_implausible(table, catalog.signals, limits.min_correlation))] = False
         if in_order.sum() >= limits.min_drives:
-            faults = find_reversed_labels(table, in_order, catalogue().label)
+            faults = find_reversed_labels(table, in_order, catalog.signals.label)
             in_order[list(faults)] = False
-            faults |= find_odd_days(table, in_order, *_days_and_files(metadata), limits)
+            by_group = _days_and_files(metadata)
+            faults |= find_odd_days(catalog.signals, table, in_order, *by_group, limits)
             names = metadata["drive_id"].to_pylist()
             found |= {names[drive]: fault for drive, fault in faults.items()}
     return found
@@ -152,13 +156,14 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
     First for what no car does (`find_implausible`), then by comparison with its peers, if it has
     `min_drives` of them; see `_peer_groups`. `known` are faulty drives.
     """
-    limits = thresholds().quality
+    catalog = cohort.catalog
+    limits = thresholds(catalog.configs).quality
     drives = compared = 0
     known = {**(known or {}), **find_repeated(cohort.drives)}
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
         names = metadata["drive_id"].to_pylist()
-        faults = find_implausible(table, limits.min_correlation)
+        faults = find_implausible(table, catalog.signals, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
         faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
@@ -166,7 +171,7 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
         for group in _peer_groups(metadata, limits.min_drives):
             if in_order[group].sum() >= limits.min_drives:
                 beside_peers[group] = True
-                found = _unlike_peers(table, group, in_order, limits)
+                found = _unlike_peers(catalog.signals.label, table, group, in_order, limits)
                 faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
         drives += len(table)
         compared += int(beside_peers.sum())
@@ -235,11 +240,15 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
 
 
 def _unlike_peers(
-    table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
+    label: str,
+    table: GramTable,
+    group: BoolArray,
+    in_order: BoolArray,
+    limits: QualityThresholds,
 ) -> dict[int, Fault]:
     """Return the faults of the drives of a group that are not as the others of it."""
     peers_table = table.take(group)
-    peers, suspects = settle(peers_table, in_order[group], catalogue().label, limits)
+    peers, suspects = settle(peers_table, in_order[group], label, limits)
     if not suspects.any():
         return {}
     faults = peers.explain(DriveBatches.of(peers_table, suspects))

@@ -1,4 +1,4 @@
-"""Writes rows again, to compact the logs, to forget drives, or for another catalogue.
+"""Writes rows again, to compact the logs, to forget drives, or for another catalog.
 
 Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
 from the drives.
@@ -20,13 +20,14 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
 from fleet_slip.grams.job import land_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -325,7 +326,7 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
         yield pack
 
 
-# Brings the tables of a data root to this program and to the signal catalogue, step by step.
+# Brings the tables of a data root to this program and to the signal catalog, step by step.
 #
 # 1. Every table gets the columns that came later. No file is touched: there they are null.
 # 2. Files whose dictionaries have names that none of their rows has are written again.
@@ -333,36 +334,41 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
 
 @dataclass(frozen=True)
 class MigrationReport(Answer):
-    """What a migration did, and the columns of the logs that the catalogue has no longer."""
+    """What a migration did, and the columns of the logs that the catalog has no longer."""
 
     added: tuple[str, ...]
     retired: tuple[str, ...]
     logs_version: int | None
     files_without_names: int = 0
     """Files that were written anew because they had names that none of their rows has."""
+    sealed: tuple[str, ...] = ()
+    """Folders whose documents were brought to the present format, or anchored."""
 
     @property
     def changed(self) -> bool:
         """Whether there was anything to do."""
-        return bool(self.added or self.files_without_names)
+        return bool(self.added or self.files_without_names or self.sealed)
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was added and written anew."""
         if not self.changed:
-            yield Remark("migrate: nothing to do, the logs agree with the signal catalogue")
+            yield Remark("migrate: nothing to do, the logs agree with the signal catalog")
         if self.added:
             yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
         if self.files_without_names:
             files = number_of(self.files_without_names, "file")
             yield Remark(f"{files} written anew, without names that none of their rows has")
+        if self.sealed:
+            yield Remark(f"anchored the documents of {', '.join(self.sealed)}")
 
 
 def migrate(warehouse: Warehouse) -> MigrationReport:
-    """Make the tables agree with program and catalogue. Again, it does nothing.
+    """Make the tables agree with program and catalog. Again, it does nothing.
 
     Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
     """
     warehouse.require()
+    sealed = tuple(folder.path for folder in document_folders(warehouse.root) if folder.seal())
     found: Evolution | None = None
     for table in (warehouse.quarantine, warehouse.grams, warehouse.logs):
         delta = table.open_delta()
@@ -371,10 +377,10 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
             found = table.require_readable(delta)
             _add_columns(table, delta, found)
     if found is None:
-        return MigrationReport((), (), None)
+        return MigrationReport((), (), None, sealed=sealed)
     cleaned = drop_unused_names(warehouse)
     version = warehouse.logs.snapshot().version
-    return MigrationReport(found.added, found.retired, version, cleaned)
+    return MigrationReport(found.added, found.retired, version, cleaned, sealed)
 
 
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:

@@ -1,6 +1,7 @@
 """The health of a warehouse: freshness, backlog, last runs, disk, champions."""
 
 import contextlib
+import shlex
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +12,14 @@ import pyarrow as pa
 
 from fleet_slip.base import number_of
 from fleet_slip.errors import (
+    HIDDEN,
     AlarmError,
     DataError,
     FleetSlipError,
     QuestionError,
     RefusedError,
     StorageError,
+    printable,
 )
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
@@ -24,17 +27,22 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import read_sql
+from fleet_slip.storage.documents import find_lost
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
 from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.erased import find_erased
 from fleet_slip.warehouse.tables import Warehouse
 
 SECONDS_PER_HOUR = 3600
 LEAST_MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 _FULL = "disk {:.1%} free, below {:.0%}"
+
+RETURNED_SHOWN = 5
+"""Maximum number of commands shown for erased cars and drives."""
 
 REMEMBERED = timedelta(days=366)
 """Commands that last ran before that are not shown, so that old runs need not be read."""
@@ -150,13 +158,14 @@ def status_of(
     changed = list(find_changed_lines(warehouse.root, since))
     last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
     age = _age_hours(tables["logs"].committed_at, now)
-    least = thresholds().status.min_free_fraction
+    least = thresholds(warehouse.configs).status.min_free_fraction
     problems = [
         *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
+        *_returned(warehouse, tuple(snapshots.values())),
         *_failed(last_runs),
         *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
-        *damaged,
+        *dict.fromkeys([*damaged, *find_lost(warehouse.root)]),
         *(f"{path}: {what}" for path, what in changed),
     ]
     return WarehouseStatus(
@@ -275,12 +284,27 @@ def _stale(age: float | None, backlog_age: float | None, limit: float | None) ->
     return problems
 
 
+def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[str]:
+    """Yield the erased cars and drives that the tables have again, and what to run."""
+    erased = find_erased(warehouse.root, warehouse.grams, snapshots, ended=True)
+    options = [f"--vehicle {shlex.quote(printable(name))}" for name in sorted(erased.vehicles)]
+    options += [f"--drive {shlex.quote(printable(name))}" for name in sorted(erased.drives)]
+    if options:
+        commands = "; ".join(f"fleet-slip forget {name} --now" for name in options[:RETURNED_SHOWN])
+        yield (
+            f"the tables have rows of {number_of(len(options), 'erased name')} again, as after "
+            f"restoring an old backup. Views and models leave them out. Erase them: {commands}"
+        )
+
+
 def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     problems = []
     for run in runs:
         when = f"{run['command']} of {run['started_at']:%Y-%m-%d %H:%M}"
         if run["state"] == "failed":
-            problems.append(f"{when} failed with exit code {run['exit_code']}: {run['error']}")
+            why = f" ({HIDDEN}: a name that is not recorded)" if HIDDEN in str(run["error"]) else ""
+            code, error = run["exit_code"], run["error"]
+            problems.append(f"{when} failed with exit code {code}: {error}{why}")
         elif run["state"] in ("killed", "interrupted"):
             problems.append(f"{when} was {run['state']}")
     return problems

@@ -7,17 +7,18 @@ tables; names with the record of what was forgotten. What can be rebuilt is rebu
 
 import contextlib
 import os
+import time
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal, TypeAlias
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import (
     DamageError,
@@ -45,7 +46,7 @@ from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
-from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.encoding import Names, read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
@@ -91,7 +92,7 @@ class Verification(Answer):
     """What was looked at, what was found, and what was rebuilt and compared besides."""
 
     DOCUMENT = (
-        "files size_bytes rows log_files_recomputed documents damage remarks rebuilt "
+        "files size_bytes rows log_files_recomputed documents damage remarks rebuilt accepted "
         "grams=compared?"
     )
 
@@ -102,6 +103,8 @@ class Verification(Answer):
     documents: int = 0
     findings: list[Damage] = field(default_factory=list)
     rebuilt: Sequence[str] = ()
+    accepted: Sequence[str] = ()
+    """Lost documents whose loss was accepted."""
     repaired: bool = False
     compared: CheckReport | None = None
 
@@ -123,6 +126,8 @@ class Verification(Answer):
         """Return what was rebuilt, damage and remarks in tables, and what was read."""
         for path in self.rebuilt:
             yield Remark(f"rebuilt {path}")
+        for path in self.accepted:
+            yield Remark(f"accepted the loss of {path}; repeat the command that wrote it")
         for title in ("damage", "remarks"):
             if findings := getattr(self, title):
                 yield TextTable(title, "where|problem", findings, "{path}|{problem}", left=2)
@@ -226,7 +231,10 @@ def verify_names(
     unused = frozenset(name for one in _all(read) for name in _unused(one))
     cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
     audit = Audit(warehouse.root)
-    barred = audit.barred(cars | unused, (drives if full else frozenset()) | unused, ended=True)
+    try:
+        barred = audit.barred(cars | unused, (drives if full else frozenset()) | unused, ended=True)
+    except StorageError:  # a lost or damaged document, which is reported as such
+        return
     wrong = {"vehicle_id": barred.vehicles, "drive_id": barred.drives}
     for table, files in read.items():
         for one in files:
@@ -297,9 +305,11 @@ def verify_grams(
 
     `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
     """
+    sets = cache(lambda: counted_sets(warehouse.catalog))
     for file in grams:
         rows = warehouse.grams.read(file.path)
-        for row, why in impossible_rows(rows.filter(is_received(rows)), counted_sets()):
+        received = rows.filter(is_received(rows))
+        for row, why in impossible_rows(received, sets()) if len(received) else ():
             problem = f"the Gram row of drive {row['drive_id']}, sent by a car, {why}"
             report.note("gram", f"grams/{file.path}", problem)
     where = find_gram_files(warehouse, grams)
@@ -333,23 +343,17 @@ def _compute_grams(warehouse: Warehouse, file: TableFile) -> DriveGrams:
 
 
 def verify_documents(root: Folder, report: Verification) -> None:
-    """Look for documents and lines of the history that were changed, and gaps of documents."""
-    for folder in _document_folders(root):
-        report.documents += len(folder.numbers())
-        for file, problem in folder.faults().items():
+    """Report documents that are lost, moved or changed, and changed lines of the history."""
+    for folder in document_folders(root):
+        report.documents += len(folder.inventory().present)
+        faults = folder.faults()
+        for file, problem in faults.items():
             report.note("document", file.removeprefix(f"{root}/"), problem)
+        if not faults and folder.needs_seal():
+            problem = "documents without an anchor, or of release 0.2; run: fleet-slip migrate"
+            report.note("backlog", folder.path, problem)
     for path, problem in find_changed_lines(root):
         report.note("document", path, problem)
-
-
-def _document_folders(root: Folder) -> list[DocumentFolder]:
-    found: set[str] = set()
-    for name in root.names():
-        if not (root / name / "_delta_log").exists():
-            files = (root / name).files()
-            documents = (f"{name}/{f.path}" for f in files if f.path.endswith(".json"))
-            found.update(path.rpartition("/")[0] for path in documents)
-    return [DocumentFolder(root / path) for path in sorted(found)]
 
 
 def verify_models(
@@ -358,7 +362,10 @@ def verify_models(
     """Look for versions that nothing present can have made, and aliases that point at nothing."""
     registry = Registry.of(warehouse)
     for name in registry.names():
-        numbers = registry.versions(name)
+        try:
+            numbers = registry.versions(name)
+        except StorageError:  # a lost document, which is reported as such
+            continue
         for number in numbers:
             try:
                 manifest = registry.load(name, number).manifest
@@ -463,12 +470,15 @@ def _list_unreferenced(
 ) -> None:
     for snapshot in snapshots.values():
         try:
-            known, files = snapshot.removed(), find_unreferenced(snapshot.table)
+            known, files = snapshot.removals, find_unreferenced(snapshot.table)
         except StorageError:  # its log is damaged, as is reported: it says of no file what that is
             continue
         for file in files:
             what = "replaced" if file.path in known else "never committed"
             then = "fleet-slip compact removes it in time"
+            removed_ns = snapshot.removals.get(file.path, 0) * 10**6
+            if max(file.modified_ns, removed_ns) > time.time_ns():
+                then = "its date is in the future, so compact keeps it: check the clocks"
             if snapshot.version is None:
                 then = "if the table had a Delta log, restore that from a backup"
             _remark(warehouse, file, f"{what}; {then}", report)

@@ -14,15 +14,15 @@ from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, TypeAdapter, ValidationInfo, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import canonical_ascii, sha256_of
-from fleet_slip.catalogue.facts import SCENARIO
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.facts import SCENARIO
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
-from fleet_slip.resources import find_config
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
 from fleet_slip.simulation.plan import (
     CarOnRoad,
@@ -31,6 +31,7 @@ from fleet_slip.simulation.plan import (
     GridPlan,
     TrafficPlan,
     TrialPlan,
+    configs_of,
 )
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
@@ -173,10 +174,10 @@ class Campaign(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _inherit(cls, content: Any) -> Any:
+    def _inherit(cls, content: Any, info: ValidationInfo) -> Any:
         if not isinstance(content, dict) or not isinstance(content.get("base"), str):
             return content
-        base = load_base("campaigns", content["base"])
+        base = load_base("campaigns", content["base"], configs_of(info))
         if "base" in base:
             raise ValueError(f"the base {content['base']!r} has a base itself: take that one")
         plan = content.get("plan", {})
@@ -263,10 +264,10 @@ class Campaign(Config):
         )
 
 
-def load_base(kind: str, name: str) -> dict[str, Any]:
-    """Return what the file of a base says. Raises `ValueError` if there is none."""
+def load_base(kind: str, name: str, configs: Configs) -> dict[str, Any]:
+    """Return the content of a base's file. Raises `ValueError` if there is none."""
     try:
-        return load_toml(find_config(kind, name))
+        return load_toml(configs.find(kind, name))
     except ConfigError as error:
         raise ValueError(str(error)) from None
 
@@ -292,6 +293,6 @@ def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpe
     ]
 
 
-def load_campaign(name_or_path: str) -> Campaign:
-    """Read a campaign by the name of a shipped one or by path. Raises `ConfigError`."""
-    return load_config(find_config("campaigns", name_or_path), Campaign)
+def load_campaign(name_or_path: str, configs: Configs) -> Campaign:
+    """Read a campaign by name or path. Raises `ConfigError`."""
+    return load_config(configs.find("campaigns", name_or_path), Campaign, configs)

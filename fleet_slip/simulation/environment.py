@@ -14,7 +14,8 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.catalog import Catalog, load_catalog
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
@@ -107,10 +108,12 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         steering_rad: tuple[float, float] = (1.0, 3.5),
         adhesion: tuple[float, float] = (0.4, 1.0),
         sensors: bool = True,
+        catalog: Catalog | None = None,
     ) -> None:
         """Choose the car and the ranges that trials are drawn from: m/s, rad at the steering wheel.
 
-        Without `sensors` the signals are true. Raises `ConfigError` for an unknown car and
+        Without `sensors` the signals are true. `catalog` has the signals and the configs, by
+        default the shipped ones. Raises `ConfigError` for an unknown car and
         `UsageError` for an invalid range.
         """
         for name, (least, most) in {
@@ -122,18 +125,19 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
                 raise UsageError(
                     f"{name} = ({least}, {most}): give the least and the most, above 0."
                 )
-        known = catalogue()
-        self.signals = tuple(known.inputs)
-        self._scales = np.array([float(known[name].scale) for name in self.signals])
-        self._limits = np.array([float(known[name].max) for name in self.signals])
+        catalog = catalog or load_catalog()
+        signals = [catalog.signals[name] for name in catalog.signals.inputs]
+        self.signals = tuple(catalog.signals.inputs)
+        self._scales = np.array([float(signal.scale) for signal in signals])
+        self._limits = np.array([float(signal.max) for signal in signals])
         # The paper's initial noise, section III.A; from car to car biases are as large as there.
-        errors = load_scenario("nominal").sensors.bias_and_std
+        errors = load_scenario("nominal", catalog.configs).sensors.bias_and_std
         self._bias_std, self._noise = np.array([errors[name] for name in self.signals]).T
         limits = self._limits.astype(np.float32)
         self.observation_space = Box(-limits, limits, dtype=np.float32)
         self.action_space = Box(0.0, 1.0, (len(WHEELS),), np.float32)
         self._ranges = (speed_mps, steering_rad, adhesion)
-        self._vehicle, self._sensors = load_vehicle(vehicle), sensors
+        self._vehicle, self._sensors = load_vehicle(vehicle, catalog.configs), sensors
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

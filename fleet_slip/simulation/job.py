@@ -18,7 +18,7 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
 from fleet_slip.rendering import Answer, Part, Remark
@@ -68,7 +68,7 @@ class DriveLog:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """The columns of `SignalCatalogue.drive_schema`."""
+        """The columns of `SignalCatalog.drive_schema`."""
         spec = self.spec
         return {
             "drive_id": spec.drive_id,
@@ -123,41 +123,44 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
     require_agreement(perfect, spec.drive_id, TOLERANCE)
 
 
-def simulate_batch(batch: Batch) -> pa.Table:
+def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
     """Simulate and measure the drives of a batch, a function of the batch alone.
 
-    Columns are in the order of `SignalCatalogue.log_schema`, without unlogged extras, strings as
+    Columns are in the order of `SignalCatalog.log_schema`, without unlogged extras, strings as
     dictionaries; rows by drive, then tick.
     """
     logs: list[DriveLog] = []
     for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
-        logs += simulate_logs(batch.drives[first : first + DRIVES_AT_ONCE])
-    return tabulate(batch, logs)
+        logs += simulate_logs(signals, batch.drives[first : first + DRIVES_AT_ONCE])
+    return tabulate(signals, batch, logs)
 
 
 MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
 """What of the truth an evaluation needs, as no sensor measures it."""
 
 
-def simulate_logs(specs: Sequence[DriveSpec], kept: Sequence[str] = ()) -> list[DriveLog]:
+def simulate_logs(
+    signals: SignalCatalog, specs: Sequence[DriveSpec], channels: Sequence[str] = ()
+) -> list[DriveLog]:
     """Simulate drives together, each measured block by block by its own sensors and generator.
 
-    Of the truth itself only the named channels are `kept`.
+    The logs' motion has the named channels of the truth.
     """
-    recorders = [Recorder(s.sensors, s.generator(), s.distortion()) for s in specs]
+    recorders = [Recorder(signals, s.sensors, s.generator(), s.distortion()) for s in specs]
     receivers = [
-        ReceiverLog(s.receiver, s.satellite_generator()) if s.receiver else None for s in specs
+        ReceiverLog(signals, s.receiver, s.satellite_generator()) if s.receiver else None
+        for s in specs
     ]
-    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in kept} for _ in specs]
+    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in channels} for _ in specs]
     logs: dict[int, DriveLog] = {}
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
         recorder, receiver = recorders[block.drive], receivers[block.drive]
-        channels = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
+        truth = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
         for name, parts in motions[block.drive].items():
-            parts.append(channels[name].copy())
-        recorder.record(channels)
+            parts.append(truth[name].copy())
+        recorder.record(truth)
         if receiver:
-            receiver.record(channels)
+            receiver.record(truth)
         if block.last:
             lost = block.lost_control_tick
             logs[block.drive] = DriveLog(
@@ -179,20 +182,20 @@ def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[st
     return {**channels, "vy_mps": vy_mps, "sideslip_rad": angle_rad}
 
 
-def tabulate(batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
+def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     """Return the rows of the logs as one table."""
     rows = [log.rows for log in logs]
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
-    for column in catalogue().drive_schema:
+    for column in signals.drive_schema:
         values = pa.array([log.metadata.get(column.name) for log in logs], type=column.type)
-        if column.name not in catalogue().optional or values.null_count < len(values):
+        if column.name not in signals.optional or values.null_count < len(values):
             columns[column.name] = _repeated(values, rows)
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
-    for name in catalogue().signals:
-        if name not in catalogue().extras or any(name in log.signals for log in logs):
+    for name in signals.signals:
+        if name not in signals.extras or any(name in log.signals for log in logs):
             columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
-    names = [name for name in catalogue().log_schema.names if name in columns]
+    names = [name for name in signals.log_schema.names if name in columns]
     return pa.table({name: columns[name] for name in names})
 
 
@@ -397,7 +400,7 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     if not drives:
         return _Written(batch, (), None, 0)
     check_against_highway_env(drives)
-    rows = simulate_batch(replace(batch, drives=drives))
+    rows = simulate_batch(warehouse.catalog.signals, replace(batch, drives=drives))
     name = f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"  # before its checksum
     action = warehouse.logs.put(name, warehouse.logs.encode(rows), batch.day)
     return _Written(batch, drives, action, rows.num_rows)

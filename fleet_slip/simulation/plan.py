@@ -9,10 +9,18 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    FiniteFloat,
+    ValidationInfo,
+    model_validator,
+)
 
 from fleet_slip.config import Config, added
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.imperfections import (
     NONE,
     ImperfectionRanges,
@@ -40,18 +48,25 @@ from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters, load_
 GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
-def load_by_name(load: Callable[[str], object]) -> BeforeValidator:
-    """Let a config name another one, and report where the name stands if there is none."""
+def load_by_name(load: Callable[[str, Configs], object]) -> BeforeValidator:
+    """Let a config name another one, which is loaded from the `Configs` in the context."""
 
-    def resolve(value: Any) -> Any:
+    def resolve(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, str):
             return value
         try:
-            return load(value)
+            return load(value, configs_of(info))
         except ConfigError as error:
             raise ValueError(str(error)) from None
 
     return BeforeValidator(resolve)
+
+
+def configs_of(info: ValidationInfo) -> Configs:
+    """Return the configuration files that a config which names others is validated with."""
+    if not isinstance(info.context, Configs):
+        raise TypeError("the validation of a config that names others needs `Configs` as context")
+    return info.context
 
 
 NamedTrack = Annotated[Track, load_by_name(load_track)]
@@ -62,10 +77,13 @@ NotEmpty = Field(min_length=1)
 def _known_to_highway_env(name: str) -> str:
     from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - takes a second
 
-    return require_road(name)
+    try:
+        return require_road(name)
+    except ConfigError as error:
+        raise ValueError(str(error)) from None
 
 
-RoadWithTraffic = Annotated[str, load_by_name(_known_to_highway_env)]
+RoadWithTraffic = Annotated[str, AfterValidator(_known_to_highway_env)]
 
 
 class Traffic(Config):

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalogue.signals import HALF_TURN, catalogue
+from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
+from fleet_slip.catalog.signals import HALF_TURN, SignalCatalog
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Latency, NotNegative, Range
@@ -64,7 +64,12 @@ class ReceiverLog:
     The velocity is the centre of gravity's, as a mapping makes it, with the antenna's error left.
     """
 
-    def __init__(self, receiver: Receiver, generator: np.random.Generator) -> None:
+    def __init__(
+        self, signals: SignalCatalog, receiver: Receiver, generator: np.random.Generator
+    ) -> None:
+        course, speed = (signals[name] for name in SATELLITE_SIGNALS)
+        self._scales = float(course.scale), float(speed.scale)
+        self._fastest = speed.max_count
         self._receiver, self._generator = receiver, generator
         direction = generator.standard_normal(2)
         self._heading = np.append(direction / np.sqrt((direction**2).sum()), np.nan)
@@ -86,9 +91,7 @@ class ReceiverLog:
         east, north = np.stack(late) + lasting + white
         fix = self._outages.fixes(self._ticks, ticks)
         fix[: max(0, int(np.ceil(receiver.delay_s / SAMPLE_S)) - self._ticks)] = False
-        scales = [float(catalogue()[name].scale) for name in SATELLITE_SIGNALS]
-        fastest = catalogue()[SATELLITE_SPEED].max_count
-        course, speed = _counts(east, north, fix, (scales[0], scales[1]), fastest)
+        course, speed = _counts(east, north, fix, self._scales, self._fastest)
         self._blocks.append((course, speed, fix))
         self._ticks += ticks
 

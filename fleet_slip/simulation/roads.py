@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike
 from pydantic import Field, FiniteFloat, model_validator
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config, load_config
-from fleet_slip.resources import find_config
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.imperfections import RoadImperfections
 from fleet_slip.vehicle.batch import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
@@ -427,12 +427,12 @@ CLASSES = {
 _NAME = re.compile(rf"({'|'.join(CLASSES)})_(\d{{1,9}})")
 
 
-def load_track(name_or_path: str) -> Track:
+def load_track(name_or_path: str, configs: Configs) -> Track:
     """Read a track by name or path, or draw `country_17`: class, seed. Raises `ConfigError`."""
     drawn = _NAME.fullmatch(name_or_path)
     if drawn:
         return draw_road(drawn[1], int(drawn[2]))
-    return load_config(find_config("tracks", name_or_path), Track)
+    return load_config(configs.find("tracks", name_or_path), Track)
 
 
 def road_class(track: Track) -> str | None:

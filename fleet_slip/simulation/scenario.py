@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from datetime import date
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, ValidationInfo, model_validator
 
-from fleet_slip.catalogue.facts import SCENARIO
-from fleet_slip.catalogue.signals import Identifier, catalogue
+from fleet_slip.catalog.facts import SCENARIO
+from fleet_slip.catalog.signals import Identifier, load_signals
 from fleet_slip.config import Config, load_config
-from fleet_slip.resources import config_names, find_config
+from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Batch, DriveSpec, PacePoint, load_base, merged
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
-from fleet_slip.simulation.plan import NamedTrack, NamedVehicle, Traffic
+from fleet_slip.simulation.plan import NamedTrack, NamedVehicle, Traffic, configs_of
 from fleet_slip.simulation.roads import SpeedLimits, Track
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -38,8 +38,8 @@ class Failure(Config):
     """None: to the end of the drive."""
 
     @model_validator(mode="after")
-    def _signals_are_measured(self) -> Self:
-        measured = (*catalogue().inputs, *GPS_SIGNALS)
+    def _signals_are_measured(self, info: ValidationInfo) -> Self:
+        measured = (*load_signals(configs_of(info)).inputs, *GPS_SIGNALS)
         for name in self.signals:
             if name not in measured:
                 raise ValueError(f"{name!r} cannot fail. Signals: {', '.join(measured)}")
@@ -83,8 +83,8 @@ class Scenario(Config):
 
     @model_validator(mode="before")
     @classmethod
-    def _inherit(cls, content: Any) -> Any:
-        return _complete(content, ()) if isinstance(content, dict) else content
+    def _inherit(cls, content: Any, info: ValidationInfo) -> Any:
+        return _complete(content, (), info) if isinstance(content, dict) else content
 
     @model_validator(mode="after")
     def _pace_is_on_the_track(self) -> Self:
@@ -146,7 +146,9 @@ class Scenario(Config):
         return Batch(self.drive_id, DAY, 0, (drive,))
 
 
-def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str, Any]:
+def _complete(
+    content: Mapping[str, Any], derived: tuple[str, ...], info: ValidationInfo
+) -> dict[str, Any]:
     """Fill in what a scenario takes from its base. Raises `ValueError`."""
     name, base = content.get("name"), content.get("base")
     if "drive" in content:
@@ -155,7 +157,8 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
         return {**content, "drive": name}
     if base == name or base in derived:
         raise ValueError(f"the base {base!r} leads back to this scenario")
-    inherited = _complete(load_base("scenarios", str(base)), (*derived, str(name)))
+    inherited = load_base("scenarios", str(base), configs_of(info))
+    inherited = _complete(inherited, (*derived, str(name)), info)
     changes = sorted(set(content) - NOT_INHERITED)
     if "failures" in content and changes:
         raise ValueError(
@@ -167,16 +170,17 @@ def _complete(content: Mapping[str, Any], derived: tuple[str, ...]) -> dict[str,
     return {**merged(kept, content), "drive": drive}
 
 
-def load_scenario(name_or_path: str) -> Scenario:
-    """Read a scenario by the name of a shipped one or by path. Raises `ConfigError`."""
-    return load_config(find_config("scenarios", name_or_path), Scenario)
+def load_scenario(name_or_path: str, configs: Configs) -> Scenario:
+    """Read a scenario by name or path. Raises `ConfigError`."""
+    return load_config(configs.find("scenarios", name_or_path), Scenario, configs)
 
 
-def shipped_scenarios() -> tuple[Scenario, ...]:
-    """Return all shipped scenarios: the paper's first, in the order of its figures."""
+def load_scenarios(configs: Configs) -> tuple[Scenario, ...]:
+    """Return all scenarios: the paper's first, in the order of its figures."""
 
     def place_in_paper(scenario: Scenario) -> tuple[bool, list[int], str]:
         numbers = [int(number) for number in re.findall(r"\d+", scenario.paper or "")]
         return scenario.paper is None, numbers, scenario.name
 
-    return tuple(sorted(map(load_scenario, config_names("scenarios")), key=place_in_paper))
+    scenarios = (load_scenario(name, configs) for name in configs.names("scenarios"))
+    return tuple(sorted(scenarios, key=place_in_paper))

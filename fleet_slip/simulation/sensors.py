@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, field_validator
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, Signal, catalogue
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, Signal, SignalCatalog
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
 from fleet_slip.simulation.imperfections import Imperfections
@@ -389,7 +389,7 @@ class Sensors(Config):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One drive in counts: an int16 array per signal in catalogue order, one value a tick.
+    """One drive in counts: an int16 array per signal in catalog order, one value a tick.
 
     `gps_fix`: where GPS is valid; `saturated`: values clipped to the signal's valid range.
     """
@@ -407,8 +407,13 @@ class Recorder:
     """
 
     def __init__(
-        self, sensors: Sensors, generator: np.random.Generator, distortion: Distortion | None = None
+        self,
+        signals: SignalCatalog,
+        sensors: Sensors,
+        generator: np.random.Generator,
+        distortion: Distortion | None = None,
     ) -> None:
+        self._signals = signals
         self._distortion = distortion
         self._sensors = sensors
         self._generator = generator
@@ -425,7 +430,7 @@ class Recorder:
             truth = self._distortion.apply(truth)
         noise = np.zeros(ticks, dtype=np.float32)
         errors = self._sensors.bias_and_std
-        for name, signal in catalogue().signals.items():
+        for name, signal in self._signals.signals.items():
             if name in GPS_SIGNALS or signal.column not in truth:
                 continue
             if name in errors:
@@ -439,14 +444,14 @@ class Recorder:
         fix = self._outages.fixes(self._ticks, ticks)
         self._gps_fix.append(fix)
         for name, column in GPS_SIGNALS.items():
-            if name not in catalogue().signals:
+            if name not in self._signals.signals:
                 continue
-            seen = truth.get(catalogue()[name].column)
+            seen = truth.get(self._signals[name].column)
             fixed = (truth[column] if seen is None else seen)[fix]
             noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
             std = self._sensors.gps.velocity_std_mps
             counts = np.zeros(ticks, dtype=np.int16)
-            counts[fix], clipped = noisy_counts(fixed, noise, (0.0, std), catalogue()[name])
+            counts[fix], clipped = noisy_counts(fixed, noise, (0.0, std), self._signals[name])
             self._keep(name, counts, clipped)
 
     def _keep(self, name: str, counts: NDArray[np.int16], clipped: int) -> None:
@@ -458,7 +463,7 @@ class Recorder:
         return Measurement(
             {
                 name: _joined(self._counts.pop(name))
-                for name in catalogue().signals
+                for name in self._signals.signals
                 if name in self._counts
             },
             _joined(self._gps_fix),

@@ -10,6 +10,7 @@ import functools
 import hashlib
 import os
 import re
+import stat
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -83,6 +84,8 @@ def _check_local(path: str) -> None:
             status = Path(path).stat()
         except FileNotFoundError:
             raise gone(path) from None
+    if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for a writer
+        raise StorageError(f"{path}: not a regular file. Restore it from a backup.")
     _check_once(path, status.st_size, status.st_mtime_ns, status.st_ino)
 
 

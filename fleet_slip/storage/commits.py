@@ -207,26 +207,41 @@ def read_landed_units(table: Folder, version: int) -> dict[str, int]:
 
     Delta answers for one unit at a time, and reads its log for each.
     """
+    return dict(_logged(table, version, "txn", "appId", "version"))
+
+
+def read_removals(table: Folder, version: int) -> dict[str, int]:
+    """Return the removal time of each removed file, in ms since 1970. Raises `StorageError`.
+
+    Delta itself lists only removals before the present time of the clock. Its checkpoints drop
+    removals after a week.
+    """
+    return dict(_logged(table, version, "remove", "path", "deletionTimestamp"))
+
+
+def _logged(table: Folder, version: int, kind: str, *fields: str) -> Iterator[tuple[Any, ...]]:
+    """Yield fields of all actions of a kind up to a version, the newest last."""
     log = table / LOG
     names = log.names()
     checkpoints = {int(name[:20]) for name in names if _CHECKPOINT.fullmatch(name)}
-    base = max((one for one in checkpoints if one <= version), default=-1)
-    numbers: dict[str, int] = {}
+    base = max((number for number in checkpoints if number <= version), default=-1)
     for name in names:  # a checkpoint may be of several files
         if base >= 0 and name.startswith(f"{base:020}.checkpoint."):
             with pq.ParquetFile(pa.BufferReader(log.read(name))) as parquet:
-                columns = ["txn.appId", "txn.version"]
-                units = parquet.read(columns=columns)["txn"].combine_chunks().drop_null()
-            each = (units.field(column).to_pylist() for column in ("appId", "version"))
-            numbers.update((n, number) for n, number in zip(*each, strict=True) if n is not None)
+                rows = parquet.read(columns=[f"{kind}.{field}" for field in fields])
+            actions = rows[kind].combine_chunks().drop_null()
+            values = (actions.field(field).to_pylist() for field in fields)
+            yield from (row for row in zip(*values, strict=True) if row[0] is not None)
     for name in names:
         if _COMMIT.fullmatch(name) and base < int(name[:20]) <= version:
             try:
                 commit = read_commit(log, int(name[:20]))
             except ValueError as error:
                 raise StorageError(f"{log}/{name}: {error}") from None
-            stated = [action["txn"] for action in commit.actions if "txn" in action]
-            if not all({"appId", "version"} <= one.keys() for one in stated):
-                raise StorageError(f"{log}/{name}: was damaged: a unit of work has no name.")
-            numbers.update((one["appId"], one["version"]) for one in stated)
-    return numbers
+            for action in commit.actions:
+                content = action.get(kind)
+                if content is None:
+                    continue
+                if not set(fields) <= content.keys():
+                    raise StorageError(f"{log}/{name}: was damaged: a {kind} action is incomplete.")
+                yield tuple(content[field] for field in fields)

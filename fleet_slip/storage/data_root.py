@@ -2,7 +2,7 @@
 
 import os
 import re
-from os import environ
+import time
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -11,7 +11,6 @@ from fleet_slip.errors import StorageError
 from fleet_slip.storage.folder import Folder
 
 DEFAULT_ROOT = Path("data")
-ROOT_VARIABLE = "FLEET_SLIP_ROOT"
 UNFIT_CHARACTERS = "\\*?["
 """The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
 
@@ -26,14 +25,17 @@ _OBJECT_URL = re.compile(
 
 
 def data_root(root: Folder | Path | str | None = None) -> Folder:
-    """Return the data root: the argument, else $FLEET_SLIP_ROOT, else ./data.
+    """Return the data root: the argument, else ./data.
 
     With `://` it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, `file:///PATH`.
-    Raises `StorageError` for another, for what Delta or DuckDB misread, and inside a table.
+    Raises `StorageError` for another, for what Delta or DuckDB misread, inside a table, and where
+    the clock is before 1970, which Delta cannot write.
     """
+    if time.time() < 0:
+        raise StorageError("the clock of this machine is before 1970. Set it, and repeat.")
     if root is not None and not isinstance(root, Path | str):
         return root
-    where = root or environ.get(ROOT_VARIABLE) or DEFAULT_ROOT
+    where = root or DEFAULT_ROOT
     if isinstance(where, str) and _SCHEME.match(where):
         return _at_url(where)
     return _local(Path(where))

@@ -1,18 +1,38 @@
 """Numbered, immutable JSON documents in a folder: 1.json, 2.json, ... with a checksum each.
 
-Creating one takes the next free number, or fails as another process took it: numbers are
-consecutive, none is half there, and what follows from the newest comes right after it.
+Creating a document takes the next free number, or fails because another process took it. The
+checksum covers the folder and the number, so a moved or copied document is refused. Anchors detect
+a lost document, also the newest:
+
+    FOLDER/5.json                  the document
+    anchors/FOLDER/5.sha256        the checksum of its content, written after the document
+    anchors/FOLDER/3.lost          somebody accepted the loss of document 3
+
+A process killed between document and anchor leaves a valid folder; the next document is anchored
+again. Only the first and the newest anchor stay. The first one separates documents of release 0.2,
+whose checksum covers the content alone, from later ones.
 """
 
+import contextlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from itertools import islice
+from typing import Any, NamedTuple, TypeVar
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.errors import ConflictError, StorageError
+from fleet_slip.errors import ConflictError, QuestionError, StorageError
 from fleet_slip.storage.folder import Folder
+
+ANCHORS = "anchors"
+"""Folder of the anchors. It sorts before all others, so a copy in that order takes them first."""
+
+FORMAT = 2
+"""Format of the documents; those of release 0.2 state none."""
+
+MAX_LOST = 100
+"""Number of lost documents of a folder that are listed."""
 
 ATTEMPTS = 1000
 
@@ -20,77 +40,143 @@ T = TypeVar("T")
 
 MAX_DIGITS = 9
 
-_NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.json")
+_NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.(json|sha256|lost)")
 
 
 def checksum(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a document's canonical text, in hexadecimal."""
+    """Return the SHA-256 of a content's canonical text, in hexadecimal."""
     return sha256_of(canonical_json(content))
 
 
 @dataclass(frozen=True)
 class Document:
-    """One document: its number, its content and the checksum that was verified."""
+    """A document: its number, its content and the SHA-256 of the content."""
 
     number: int
     content: Mapping[str, Any]
     sha256: str
 
 
+class Inventory(NamedTuple):
+    """Numbers of the documents, of lost ones, and the highest number that was ever taken."""
+
+    present: list[int]
+    lost: list[int]
+    newest: int
+
+
 @dataclass(frozen=True)
 class DocumentFolder:
-    """A folder of numbered documents."""
+    """A folder of numbered documents, by its path below a data root."""
 
-    folder: Folder
+    root: Folder
+    path: str
+
+    @property
+    def folder(self) -> Folder:
+        """The folder."""
+        return self.root / self.path
+
+    @property
+    def _anchors(self) -> Folder:
+        return self.root / ANCHORS / self.path
 
     def numbers(self) -> list[int]:
-        """Return the numbers of all documents, ascending."""
-        found = map(_NUMBER.fullmatch, self.folder.names())
-        return sorted(int(number[1]) for number in found if number)
+        """Return the numbers of all documents, ascending. Raises `StorageError` if one is lost."""
+        return self._complete_inventory().present
+
+    def _complete_inventory(self) -> Inventory:
+        """Return the inventory. Raises `StorageError` if a document is lost."""
+        inventory = self.inventory()
+        if inventory.lost:
+            more = f" (and {len(inventory.lost) - 1} more)" if inventory.lost[1:] else ""
+            first = inventory.lost[0]
+            raise StorageError(f"{self.file(first)}{more}: {self._loss(first)}")
+        return inventory
+
+    def inventory(self) -> Inventory:
+        """Return which documents are present and which are lost."""
+        # Anchors first: each is written after its document.
+        anchors = self._anchors.names()
+        accepted = _numbers_in(anchors, "lost")
+        present = _numbers_in(self.folder.names(), "json")
+        newest = max(present | accepted | _numbers_in(anchors, "sha256"), default=0)
+        absent = (n for n in range(1, newest + 1) if n not in present and n not in accepted)
+        suspects = list(islice(absent, MAX_LOST))
+        # A listing may miss a document that was written meanwhile.
+        contents = self.folder.read_many(list(map(document_file, suspects))) if suspects else []
+        lost = [n for n, text in zip(suspects, contents, strict=True) if text is None]
+        present.update(set(suspects).difference(lost))
+        return Inventory(sorted(present), lost, newest)
 
     def read(self, number: int) -> Document:
-        """Return a document. Raises `StorageError` if its checksum does not match."""
+        """Return a document. Raises `StorageError` if it was changed, moved or copied."""
+        return self._read(number)[0]
+
+    def _read(self, number: int) -> tuple[Document, bool]:
+        """Return a document, and whether its file is exactly what this program writes."""
         file = self.file(number)
         text = self.folder.read(document_file(number))
         try:
             envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
             content, stated = envelope["content"], envelope["sha256"]
-            found = checksum(content)
+            place = {key: envelope[key] for key in _PLACE if "format" in envelope}
+            document = Document(number, content, checksum(content))
+            expected = _seal(place, document.sha256)
         except (ValueError, KeyError, TypeError, RecursionError):
             raise StorageError(f"{file}: not a document of this program. {_RESTORE}") from None
-        if found != stated:
+        if expected != stated:
             raise StorageError(
                 f"{file}: its content does not match its SHA-256; it was changed or damaged. "
                 f"{_RESTORE}"
             )
-        return Document(number, content, stated)
+        if place and place["format"] != FORMAT:
+            raise StorageError(
+                f"{file}: format {place['format']}, which this release cannot read. Upgrade it."
+            )
+        if place and place != self._place(number):
+            raise StorageError(
+                f"{file}: a copy of document {place['number']} of {place['folder']}. {_RESTORE}"
+            )
+        if not place and number >= min(self._anchored(), default=10**MAX_DIGITS):
+            raise StorageError(
+                f"{file}: in the format of release 0.2, but the folder is of a later one; the file "
+                f"came from another place. {_RESTORE}"
+            )
+        return document, text == _rendered(place, content, stated)
 
     def faults(self) -> dict[str, str]:
-        """Return what is wrong with the files of the folder, by file, down to the last byte."""
-        found = {}
-        numbers = self.numbers()
-        for number in sorted({*numbers, *range(1, max(numbers, default=0) + 1)}):
+        """Return the problems of the files of the folder, by file, down to the last byte."""
+        inventory = self.inventory()
+        problems = {self.file(number): self._loss(number) for number in inventory.lost}
+        anchored = sorted(self._anchored())
+        texts = self._anchors.read_many(list(map(_anchor, anchored)))  # None: removed meanwhile
+        anchors = {number: text for number, text in zip(anchored, texts, strict=True) if text}
+        for number in inventory.present:
             file = self.file(number)
             try:
-                document = self.read(number)
-                if self.folder.read(document_file(number)) != _rendered(document):
-                    found[file] = "its layout was changed"
+                document, is_exact = self._read(number)
+                if not is_exact:
+                    problems[file] = "its layout was changed"
+                elif anchors.get(number, _text_of(document)) != _text_of(document):
+                    problems[file] = f"its anchor has another checksum: it was replaced. {_RESTORE}"
             except StorageError as error:
-                found[file] = str(error).removeprefix(f"{file}: ")
-        return found
+                problems[file] = str(error).removeprefix(f"{file}: ")
+        return problems
 
     def append(self, content: Mapping[str, Any]) -> Document:
         """Add a document under the next free number, durably."""
         return self.after_newest(lambda newest: self.create(newest + 1, content))
 
     def after_newest(self, attempt: Callable[[int], T | None]) -> T:
-        """Return what an attempt to add the next document comes to, given the newest number or 0.
+        """Return the result of an attempt to add the next document, given the newest number or 0.
 
-        It is made again while it is None: another was faster. Raises `ConflictError` after very
-        many.
+        Repeats the attempt while it returns None: another process was faster. The newest document
+        may be lost, with consent. Raises `ConflictError` after `ATTEMPTS` attempts, and
+        `StorageError` if a document is lost.
         """
         for _ in range(ATTEMPTS):
-            outcome = attempt(max(self.numbers(), default=0))
+            outcome = attempt(self._complete_inventory().newest)
             if outcome is not None:
                 return outcome
         raise ConflictError(f"{self.folder}: too many writers at once. Run the same command again.")
@@ -98,23 +184,125 @@ class DocumentFolder:
     def create(self, number: int, content: Mapping[str, Any]) -> Document | None:
         """Add a document under this number, durably; return None if the number is taken."""
         document = Document(number, content, checksum(content))
-        file, text = document_file(number), _rendered(document)
+        file, text = document_file(number), self._sealed(document)
         # An object store's answer may be lost: then the attempt is made again and finds itself.
         if self.folder.create(file, text) or self.folder.read(file) == text:
+            self._anchor(document)
             return document
         return None
 
+    def _anchor(self, document: Document) -> None:
+        """Record that a document exists, and remove the anchors between the first and the last."""
+        self._anchors.create(_anchor(document.number), _text_of(document))
+        with contextlib.suppress(StorageError):  # without the right to delete, they stay
+            for number in sorted(self._anchored())[1:-1]:
+                self._anchors.delete(_anchor(number))
+
+    def needs_seal(self) -> bool:
+        """Return True if `seal` has something to do."""
+        numbers = self.inventory().present
+        return bool(numbers) and not {numbers[0], numbers[-1]} <= self._anchored()
+
+    def seal(self) -> bool:
+        """Rewrite documents of release 0.2 in the present format, and anchor the folder.
+
+        Returns False if there was nothing to do. Raises `StorageError` if a document is damaged or
+        lost.
+        """
+        if not self.needs_seal():
+            return False
+        documents = [self.read(number) for number in self.numbers()]
+        for document in reversed(documents):  # never one of 0.2 after one of the present format
+            text = self._sealed(document)
+            if self.folder.read(document_file(document.number)) != text:
+                self.folder.put(document_file(document.number), text)
+        self._anchor(documents[-1])
+        self._anchor(documents[0])
+        return True
+
+    def accept_loss(self, number: int) -> None:
+        """Go on without a lost document, for good. Its number is not taken again."""
+        self._anchors.create(f"{number}.lost", b"")
+
     def file(self, number: int) -> str:
-        """Return where a document of this number is."""
+        """Return the path of a document."""
         return f"{self.folder}/{document_file(number)}"
+
+    def _anchored(self) -> set[int]:
+        """Return the numbers of the anchors."""
+        return _numbers_in(self._anchors.names(), "sha256")
+
+    def _loss(self, number: int) -> str:
+        return (
+            "the document was written and is missing. Restore the file from a backup. Without "
+            f"one: fleet-slip verify --accept-loss {self.path}/{document_file(number)}"
+        )
+
+    def _place(self, number: int) -> dict[str, Any]:
+        return {"format": FORMAT, "folder": self.path, "number": number}
+
+    def _sealed(self, document: Document) -> bytes:
+        place = self._place(document.number)
+        return _rendered(place, document.content, _seal(place, document.sha256))
+
+
+def document_folders(root: Folder) -> list[DocumentFolder]:
+    """Return all folders below a data root that have documents, or anchors of lost ones."""
+    paths: set[str] = set()
+    for name in root.names():
+        if name == ANCHORS:
+            files = (file.path for file in (root / name).files())
+            paths.update(path.rpartition("/")[0] for path in files if path.endswith(".sha256"))
+        elif not (root / name / "_delta_log").exists():
+            files = (f"{name}/{file.path}" for file in (root / name).files())
+            paths.update(path.rpartition("/")[0] for path in files if path.endswith(".json"))
+    return [DocumentFolder(root, path) for path in sorted(paths)]
+
+
+def find_lost(root: Folder) -> Iterator[str]:
+    """Yield a message for each folder that lacks documents."""
+    for folder in document_folders(root):
+        try:
+            folder.numbers()
+        except StorageError as error:
+            yield str(error)
+
+
+def accept_losses(root: Folder, paths: Iterable[str]) -> list[str]:
+    """Accept the loss of documents, given by their files or folders below the root; return them.
+
+    Raises `QuestionError` if nothing is lost there.
+    """
+    accepted = []
+    for path in paths:
+        for folder in document_folders(root):
+            files = {f"{folder.path}/{document_file(n)}": n for n in folder.inventory().lost}
+            chosen = [file for file in files if path.rstrip("/") in (file, folder.path)]
+            for file in chosen:
+                folder.accept_loss(files[file])
+            accepted += chosen
+            if chosen:
+                break
+        else:
+            raise QuestionError(
+                f"{path}: no document is missing there. Name a file that verify reports as "
+                "missing; delete a damaged one first."
+            )
+    return accepted
+
+
+def _numbers_in(names: list[str], kind: str) -> set[int]:
+    """Return the numbers in the names of files of a kind: json, sha256 or lost."""
+    matches = map(_NUMBER.fullmatch, names)
+    return {int(match[1]) for match in matches if match and match[2] == kind}
 
 
 def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object. Raises `ValueError` for a key that stands twice: who reads which?"""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    """Return a JSON object. Raises `ValueError` for a key that appears twice."""
+    members = dict(pairs)
+    if len(members) < len(pairs):
         raise ValueError("a key appears twice")
-    return found
+    return members
 
 
 def document_file(number: int) -> str:
@@ -122,9 +310,26 @@ def document_file(number: int) -> str:
     return f"{number}.json"
 
 
-def _rendered(document: Document) -> bytes:
-    envelope = {"content": document.content, "sha256": document.sha256}
+def _anchor(number: int) -> str:
+    return f"{number}.sha256"
+
+
+def _text_of(document: Document) -> bytes:
+    """Return the content of a document's anchor."""
+    return f"{document.sha256}\n".encode()
+
+
+_PLACE = ("format", "folder", "number")
+
+
+def _seal(place: Mapping[str, Any], sha256: str) -> str:
+    """Return the checksum of a document from its place and the checksum of its content."""
+    return checksum({**place, "content": sha256}) if place else sha256
+
+
+def _rendered(place: Mapping[str, Any], content: Mapping[str, Any], sha256: str) -> bytes:
+    envelope = {**place, "content": content, "sha256": sha256}
     return (json.dumps(envelope, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-_RESTORE = "Restore the file from a backup, or publish again."
+_RESTORE = "Restore the file from a backup."

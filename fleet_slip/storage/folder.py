@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 TEMPORARY_PREFIX = ".tmp-"
 """Beginning of the name of a file that is not whole yet."""
 
+SPILL_PREFIX = ".spill-"
+"""Beginning of the name of a folder for the rows of a query that exceed its memory."""
+
 Content: TypeAlias = "bytes | pa.Buffer"
 
 

@@ -271,8 +271,9 @@ def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
     """Return a message with the arguments that are not shown replaced, wherever it quotes them."""
     for argument, instead in zip(arguments, shown, strict=True):
         if argument != instead:
-            secret = argument.partition("=")[2] if instead.endswith(f"={HIDDEN}") else argument
-            text = text.replace(secret, HIDDEN) if secret else text
+            is_option = instead.endswith(f"={HIDDEN}")
+            secret = argument.partition("=")[2] if is_option else argument
+            text = text.replace(secret, HIDDEN if is_option else instead) if secret else text
     return text
 
 
@@ -329,7 +330,8 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
 
 
 def runs_under_way(root: Folder) -> list[str]:
-    """Return other runs of the last day that have no end, but for dead ones of this machine."""
+    """Return other runs that have no end: live ones of this machine, those of others for a day."""
+    host = socket.gethostname()
     since = datetime.now(UTC) - timedelta(days=1)
     begun: dict[str, dict[str, Any]] = defaultdict(dict)
     for record in _intact_records(root, f"{since:%Y-%m}"):
@@ -338,7 +340,7 @@ def runs_under_way(root: Folder) -> list[str]:
         run_id
         for run_id, run in sorted(begun.items())
         if run_id != current_run_id()
-        and f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}"
+        and (run.get("host") == host or f"{run_id:.16}" >= f"{since:%Y%m%dT%H%M%S}")
         and state_of({"outcome": None, "host": None, "process": None, **run}) == RUNNING
     ]
 

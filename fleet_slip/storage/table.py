@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import json
-import math
 import random
 import re
 import time
@@ -28,6 +27,7 @@ from fleet_slip.storage.commits import (
     NOTE,
     checked_note,
     read_landed_units,
+    read_removals,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.storage.folder import Folder
@@ -245,15 +245,15 @@ def retrying(commit: Callable[Given, Result]) -> Callable[Given, Result]:
 # A count means nothing without its scale, so the schema in the Delta log records each.
 
 SCALE = "scale"
-"""Key of a field's metadata: the physical value of one count, as in the catalogue."""
+"""Key of a field's metadata: the physical value of one count, as in the catalog."""
 
 
 @dataclass(frozen=True)
 class Evolution:
-    """How a stored table and the catalogue differ.
+    """How a stored table and the catalog differ.
 
     Attributes:
-        added, retired: columns of the catalogue alone, and of the table alone.
+        added, retired: columns of the catalog alone, and of the table alone.
         rescaled: old and new scale of the signals whose counts mean something else.
     """
 
@@ -263,7 +263,7 @@ class Evolution:
 
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
-    """Compare the schema of the catalogue with that of a stored table."""
+    """Compare the schema of the catalog with that of a stored table."""
     try:
         stored = {field.name: field.metadata for field in delta.schema().fields}
     except DeltaError as error:
@@ -362,15 +362,18 @@ class Snapshot:
         newest = self.table.snapshot()
         return self if newest.version == version else newest
 
-    def removed(self, before_hours: float = 0) -> set[str]:
-        """Return the paths of files removed so many hours ago or earlier; of a week at least."""
-        if self.delta is None:
-            return set()
+    @cached_property
+    def removals(self) -> Mapping[str, int]:
+        """Removed files of a week at least, with the time of removal in ms since 1970."""
+        if self.version is None:
+            return {}
         with storage_errors(self.table.folder):
-            found = self.delta.vacuum(
-                math.ceil(before_hours), dry_run=True, enforce_retention_duration=False, full=False
-            )
-        return set(found)
+            return read_removals(self.table.folder, self.version)
+
+    def removed_before(self, hours: float) -> set[str]:
+        """Return the files that were removed so many hours ago or earlier, by this clock."""
+        newest = _now_ms() - hours * 3.6e6
+        return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
 
     def landed(self, unit_name: str) -> int | None:
         """Return the version of a unit of work that has landed, or None."""
@@ -553,7 +556,7 @@ class Table:
         return self.encoding.encode(rows, self.partition_by)
 
     def require_readable(self, delta: DeltaTable) -> Evolution:
-        """Return how the table and the catalogue differ.
+        """Return how the table and the catalog differ.
 
         Raises `RefusedError` if the counts are in other scales.
         """
@@ -561,8 +564,8 @@ class Table:
         if found.rescaled:
             changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
             raise RefusedError(
-                f"{self.folder}: the counts are in other scales than those of the signal catalogue "
-                f"({changes}). Use the catalogue that the data was written with, or ingest the "
+                f"{self.folder}: the counts are in other scales than those of the signal catalog "
+                f"({changes}). Use the catalog that the data was written with, or ingest the "
                 "logs into another data root."
             )
         return found
@@ -574,7 +577,7 @@ class Table:
         unneeded = frozenset(self.optional).difference(columns)
         if needed := [name for name in added if name not in unneeded]:
             raise RefusedError(
-                f"{self.folder}: the signal catalogue has columns that the table has not: "
+                f"{self.folder}: the signal catalog has columns that the table has not: "
                 f"{', '.join(needed)}. Add them with: fleet-slip migrate"
             )
 

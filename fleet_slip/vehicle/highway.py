@@ -15,6 +15,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.errors import RefusedError
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.batch import LaneDrive, simulate_samples
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
@@ -119,7 +120,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     both parts. A class for another car sets `PARAMETERS` or `ADHESION`.
     """
 
-    PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan")
+    PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     ADHESION: float = 1.0
     MAX_SPEED: float = 70.0
     MIN_SPEED: float = -70.0

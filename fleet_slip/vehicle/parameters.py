@@ -8,10 +8,10 @@ from typing import Annotated, NamedTuple, Self
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, ConfigT, load_config
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import find_config
+from fleet_slip.resources import Configs
 
 GRAVITY_MPS2 = 9.80665
 STIFFEST_TYRE = 30.0
@@ -188,9 +188,9 @@ class VehicleParameters(Config):
             raise ConfigError(f"{self.name} with {changes}: {reason}.") from None
 
 
-def load_vehicle(name_or_path: str) -> VehicleParameters:
-    """Read a car by the name of a shipped one or by path. Raises `ConfigError`."""
-    return load_config(find_config("vehicles", name_or_path), VehicleParameters)
+def load_vehicle(name_or_path: str, configs: Configs) -> VehicleParameters:
+    """Read a car by name or path. Raises `ConfigError`."""
+    return load_config(configs.find("vehicles", name_or_path), VehicleParameters)
 
 
 class Constants(NamedTuple):

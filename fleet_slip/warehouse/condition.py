@@ -20,8 +20,8 @@ from typing import Any
 import duckdb
 
 from fleet_slip.base import number_of
-from fleet_slip.catalogue.facts import SCENARIO, TRAINING_DRIVES
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.facts import SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,
@@ -111,33 +111,37 @@ def asking(
         timer.cancel()
 
 
-def parse_condition(text: str | Condition, columns: Collection[str] | None = None) -> Condition:
+def parse_condition(
+    signals: SignalCatalog, text: str | Condition, columns: Collection[str] | None = None
+) -> Condition:
     """Return a condition on columns, by default of drives. Raises `QuestionError`."""
     if isinstance(text, Condition):
         return text
-    return _parsed(text, frozenset(drive_columns() if columns is None else columns))
+    return _parsed(text, frozenset(drive_columns(signals) if columns is None else columns))
 
 
-def parse_cohort(text: str | Condition, columns: Collection[str] | None = None) -> Condition:
+def parse_cohort(
+    signals: SignalCatalog, text: str | Condition, columns: Collection[str] | None = None
+) -> Condition:
     """Return the condition of a cohort of the fleet: without test drives, unless it asks for them.
 
     It asks if it names the column `source`, or a scenario. Raises `QuestionError`.
     """
-    found = parse_condition(text, columns)
-    if "source" in found.columns or SCENARIO in found.sql:
-        return found
-    return Condition(found.text, f"({found.sql} AND {TRAINING_DRIVES})")
+    condition = parse_condition(signals, text, columns)
+    if "source" in condition.columns or SCENARIO in condition.sql:
+        return condition
+    return Condition(condition.text, f"({condition.sql} AND {TRAINING_DRIVES})")
 
 
-def drive_columns() -> tuple[str, ...]:
+def drive_columns(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the columns that the condition of a cohort may use: a drive's metadata and its day."""
-    return (*catalogue().drive, "day")
+    return (*signals.drive, "day")
 
 
-def row_columns() -> tuple[str, ...]:
+def row_columns(signals: SignalCatalog) -> tuple[str, ...]:
     """Return the columns that a condition on the rows of the view `log` may use."""
-    signals = (signal.column for signal in catalogue().signals.values())
-    return (*drive_columns(), "tick", "time_s", *signals)
+    columns = (signal.column for signal in signals.signals.values())
+    return (*drive_columns(signals), "tick", "time_s", *columns)
 
 
 @functools.lru_cache(maxsize=256)

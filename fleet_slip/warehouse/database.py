@@ -24,7 +24,8 @@ from fleet_slip.errors import (
 )
 from fleet_slip.limits import data_needed, memory_bytes
 from fleet_slip.storage.checksums import check_local_files, gone
-from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.folder import SPILL_PREFIX, Folder
+from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS, words
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -52,7 +53,7 @@ def open_database(
     process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
     otherwise such a query fails.
     """
-    aside = reading.spill / f".spill-{uuid.uuid4().hex}" if reading and spill else ""
+    aside = reading.spill / f"{SPILL_PREFIX}{uuid.uuid4().hex}" if reading and spill else ""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
@@ -222,7 +223,10 @@ def check_opened_files(database: duckdb.DuckDBPyConnection) -> None:
 # Not `duckdb_logs_parsed`, which takes seven times as long and reads no quotes in paths.
 _OPENED_FILES = """
 SELECT DISTINCT regexp_extract(message, '^.*?"path":"(.*)","op":"OPEN"}$', 1, 's') AS path
-FROM duckdb_logs() WHERE type = 'FileSystem' AND suffix(message, '"op":"OPEN"}')
+FROM duckdb_logs() WHERE type = 'FileSystem' AND suffix(message, '"op":"OPEN"}') AND (
+    current_setting('enable_external_access')
+    OR list_contains(current_setting('allowed_paths'), path)
+)
 """
 
 
@@ -251,24 +255,8 @@ LONGEST_QUERY = 100_000
 QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
 """Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
 
-CATALOGUE_PREFIX = "duckdb_"
-
 _SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
 """Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
-
-
-def _words(text: str) -> frozenset[str]:
-    return frozenset(text.split())
-
-
-TABLE_FUNCTIONS = _words(
-    """
-    generate_series histogram histogram_values json_each json_tree parquet_file_metadata
-    parquet_full_metadata parquet_metadata parquet_schema pragma_table_info range read_parquet
-    repeat repeat_row summary unnest
-    """
-)
-"""What may stand after FROM like a function, beside duckdb_tables() and its like."""
 
 
 def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
@@ -319,7 +307,7 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
     statement = "SELECT json_serialize_sql($text::VARCHAR)"
     [(serialised,)] = database.execute(statement, {"text": text}).fetchall()
     try:
-        tree = json.loads(serialised, object_hook=_checked)
+        tree = json.loads(serialised)
     except RecursionError:
         raise QuestionError("the query is nested too deeply. Divide it into parts.") from None
     if tree["error"]:
@@ -327,41 +315,48 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
             "only queries are allowed here (SELECT, WITH, DESCRIBE, SUMMARIZE, EXPLAIN; a PIVOT "
             "with IN)."
         )
+    after_from: set[int] = set()
+    for node in _nodes(tree):
+        kind = node.get("type")
+        if not isinstance(kind, str):
+            continue
+        if kind.endswith("_NODE") and kind not in QUERY_NODES:
+            raise QuestionError("the query would write: only reading is allowed here.")
+        if kind == "VALUE_PARAMETER":
+            raise QuestionError("the query has a parameter without a value.")
+        if kind == "TABLE_FUNCTION":
+            after_from.add(id(node["function"]))
+        if "function_name" in node:
+            _require_function(str(node["function_name"]).lower(), id(node) in after_from)
 
 
-def _checked(node: dict[str, Any]) -> dict[str, Any]:
-    """Return a node of the parsed statement. Raises `QuestionError` if it may do harm."""
-    kind = node.get("type")
-    if not isinstance(kind, str):
-        return node
-    if kind.endswith("_NODE") and kind not in QUERY_NODES:
-        raise QuestionError("the query would write: only reading is allowed here.")
-    if kind == "VALUE_PARAMETER":
-        raise QuestionError("the query has a parameter without a value.")
-    if kind == "TABLE_FUNCTION":
-        name = str(node["function"]["function_name"]).lower()
-        if name not in TABLE_FUNCTIONS and not name.startswith(CATALOGUE_PREFIX):
-            raise QuestionError(
-                f"the function {name!r} cannot be called after FROM here. Functions: "
-                f"{', '.join(sorted(TABLE_FUNCTIONS))}, and those that begin with duckdb_."
-            )
-    return node
+def _require_function(name: str, after_from: bool) -> None:
+    if after_from and name not in TABLE_FUNCTIONS:
+        raise QuestionError(
+            f"the function {printable(name)!r} cannot be called after FROM here. Functions: "
+            f"{', '.join(sorted(TABLE_FUNCTIONS))}."
+        )
+    if not after_from and name not in QUERY_FUNCTIONS:
+        raise QuestionError(
+            f"the function {printable(name)!r} cannot be called here: only functions that compute "
+            "a value of their arguments can."
+        )
 
 
 Tree = Mapping[str, Any]
 """An expression as DuckDB's parser serialises it."""
 
-_EXPRESSIONS = _words(
+_EXPRESSIONS = words(
     "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
 )
 """Kinds of expressions, as DuckDB calls them; others are subqueries, windows, lambdas, stars …"""
 
-_OPERATORS = _words(
+_OPERATORS = words(
     "COMPARE_IN COMPARE_NOT_IN OPERATOR_COALESCE OPERATOR_IS_NOT_NULL OPERATOR_IS_NULL OPERATOR_NOT"
 )
 
 
-FUNCTIONS = _words(
+FUNCTIONS = words(
     """
         abs ceil ceiling floor greatest least mod nullif round sign sqrt trunc
         contains ends_with left length lower ltrim prefix right rtrim split_part starts_with strpos
@@ -378,7 +373,7 @@ FUNCTIONS = _words(
 None makes a text longer than its arguments together, so that the cost of a condition is bounded by
 its length. `to_days` and its like are what INTERVAL becomes, `list_value` is a list in brackets."""
 
-TYPES = _words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
+TYPES = words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
 """What may be cast to. Not a time with a zone: the zone is the machine's."""
 
 
@@ -399,14 +394,16 @@ def columns_of(tree: Tree) -> frozenset[str]:
     )
 
 
-def _nodes(value: Any) -> Iterator[Tree]:
-    if isinstance(value, dict):
-        yield value
-        for part in value.values():
-            yield from _nodes(part)
-    elif isinstance(value, list):
-        for part in value:
-            yield from _nodes(part)
+def _nodes(tree: Any) -> Iterator[Tree]:
+    """Yield the objects of a parsed text, each before those in it."""
+    waiting = [tree]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            yield value
+            waiting.extend(reversed(value.values()))
+        elif isinstance(value, list):
+            waiting.extend(reversed(value))
 
 
 def _problem(node: Tree, columns: frozenset[str]) -> str | None:

@@ -7,8 +7,12 @@ question "was this one forgotten?" can be answered by who has the root and knows
                                     "allowed" where a car or drive may come back
 
 "begun" of a car or a drive has the digests of the drives' counts too, which tell a drive that comes
-again under another name. Releases up to 0.2 hashed names with scrypt, 40 ms each, and kept other
-hashes of samples: their names still count, their samples do not.
+again under another name: of its log (`digest_counts`) and of its Gram rows (`gram_digests`).
+Releases up to 0.2 hashed names with scrypt, 40 ms each, and kept other hashes of samples: their
+names still count, their samples do not.
+
+Names are hashed after `name_key`: `V1`, ` v1 ` and `V1` are one car. Entries of earlier releases
+have the hash of the name as it was typed.
 
 Who lands rows asks `barred` between looking at the table and committing to it. Who forgets writes
 "begun" and then fences the table (`Table.fence`). So a commit either began after the fence, and its
@@ -19,12 +23,12 @@ who forgets sees its rows.
 import functools
 import hashlib
 import secrets
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal, TypeAlias
 
-from fleet_slip.base import number_of
+from fleet_slip.base import name_key, normalize_name, number_of
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
@@ -46,12 +50,21 @@ class Forgettable:
         """The column that tells."""
         return {"vehicle": "vehicle_id", "drive": "drive_id", "before": "day"}[self.kind]
 
-    def digest(self, key: str) -> str:
-        """Return the keyed hash of the name."""
-        return _digest(f"{self.kind}:{self.value}", key)
+    def select(self, names: Iterable[str | None]) -> list[str]:
+        """Return those names that erasure compares as equal to the subject's."""
+        key = name_key(self.value)
+        return [name for name in names if name is not None and name_key(name) == key]
 
 
 _SCRYPT = "scrypt:"
+
+
+def _digests(kind: str, name: str, key: str) -> set[str]:
+    """Return the keyed hashes under which an entry of this release or an earlier one has a name."""
+    names = {name, normalize_name(name)}
+    if not key.startswith(_SCRYPT):  # slow, and used by releases that hashed names as typed
+        names.add(name_key(name))
+    return {_digest(f"{kind}:{form}", key) for form in names}
 
 
 @functools.lru_cache(300_000)
@@ -96,7 +109,7 @@ class Audit:
 
     @property
     def _folder(self) -> DocumentFolder:
-        return DocumentFolder(self.root / FOLDER)
+        return DocumentFolder(self.root, FOLDER)
 
     def entries(self) -> list[Mapping[str, Any]]:
         """Return all entries, oldest first."""
@@ -118,7 +131,8 @@ class Audit:
                 name
                 for name in (names if keys else ())
                 for key in keys
-                if last.get((kind, key, _digest(f"{kind}:{name}", key)), ALLOWED) not in free
+                for digest in _digests(kind, name, key)
+                if last.get((kind, key, digest), ALLOWED) not in free
             )
         return Barred(found["vehicle"], found["drive"])
 
@@ -136,7 +150,7 @@ class Audit:
         """Return the numbers of the entries that bar a car or a drive."""
         return frozenset(
             number
-            for number, entry in enumerate(self.entries(), 1)
+            for number, entry in zip(self._folder.numbers(), self.entries(), strict=False)
             if entry["event"] == "begun" and entry["kind"] != "before"
         )
 
@@ -190,16 +204,22 @@ class Audit:
         self._append(subject, {"event": ALLOWED})
 
     def _of(self, subject: Forgettable) -> list[Mapping[str, Any]]:
-        return [e for e in self.entries() if e["subject"] == subject.digest(e["key"])]
+        return [
+            entry
+            for entry in self.entries()
+            if entry["subject"] in _digests(subject.kind, subject.value, entry["key"])
+        ]
 
     def _append(self, subject: Forgettable, content: Mapping[str, Any]) -> None:
         # One key, or more if several processes made the first entries at once.
-        keys = [entry["key"] for entry in self._of(subject)]
-        keys += [e["key"] for e in self.entries() if not e["key"].startswith(_SCRYPT)]
+        keys = [e["key"] for e in self.entries() if not e["key"].startswith(_SCRYPT)]
         key = keys[0] if keys else secrets.token_hex(32)
         at = datetime.now(UTC).isoformat(timespec="seconds")
-        known = {"kind": subject.kind, "subject": subject.digest(key), "key": key, "at": at}
-        self._folder.append({**known, **content})
+        earlier = [(entry["subject"], entry["key"]) for entry in self._of(subject)]
+        digest = _digest(f"{subject.kind}:{name_key(subject.value)}", key)
+        for hashed, under in dict.fromkeys([*earlier, (digest, key)]):
+            known = {"kind": subject.kind, "subject": hashed, "key": under, "at": at}
+            self._folder.append({**known, **content})
 
 
 def _subject_of(entry: Mapping[str, Any]) -> tuple[str, str, str]:

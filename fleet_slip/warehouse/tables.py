@@ -1,30 +1,36 @@
 """The warehouse of one data root: which tables it holds and how they are encoded."""
 
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import duckdb
 import pyarrow as pa
 from pydantic import Field, RootModel, ValidationError
 
-from fleet_slip.catalogue.course import COURSE_LATE
-from fleet_slip.catalogue.facts import ALL_DRIVES
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.lines import FittedLine, look_for_lines, remember_line
-from fleet_slip.catalogue.signals import SAMPLE_TIME_S, SignalCatalogue, catalogue
+from fleet_slip.catalog.catalog import Catalog, load_catalog
+from fleet_slip.catalog.course import COURSE_LATE
+from fleet_slip.catalog.facts import ALL_DRIVES
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.lines import FittedLine
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
-from fleet_slip.resources import folder, read_sql
+from fleet_slip.resources import SHIPPED_CONFIGS, Configs, folder, read_sql
+from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
+from fleet_slip.warehouse.connections import ConnectionCache
 from fleet_slip.warehouse.database import database_errors, open_database
+from fleet_slip.warehouse.erased import find_erased, names_by_column, without_erased
 
 QUARANTINE_SCHEMA = pa.schema(
     [
@@ -42,11 +48,86 @@ that it belongs to and `vehicle_id` its car, null if that is what is wrong; `sig
 or metadata concerned, or `time`; `value` is what stood there, as text."""
 
 
+LINES = "lines"
+"""Folder of the first-stage models of a data root."""
+
+
+class StackedModels:
+    """The first-stage models of a data root: a folder of documents for each, by its digest."""
+
+    def __init__(self, root: Folder) -> None:
+        self.root = root
+        self._models: dict[str, FittedLine] = {}
+
+    def digests(self) -> list[str]:
+        """Return the digests of all models, sorted."""
+        return sorted((self.root / LINES).names())
+
+    def find(self, digest: str) -> FittedLine | None:
+        """Return a model by its digest; None if there is none. Raises `StorageError`."""
+        if digest not in self._models:
+            documents = DocumentFolder(self.root, f"{LINES}/{digest}")
+            if 1 not in documents.numbers():
+                return None
+            try:
+                content = documents.read(1).content["line"]
+                model = FittedLine.model_validate_json(json.dumps(content))
+            except (ValidationError, KeyError):
+                model = None
+            if model is None or model.digest != digest:
+                file = documents.file(1)
+                raise StorageError(f"{file}: no line of that checksum. Restore the folder.")
+            self._models[digest] = model
+        return self._models[digest]
+
+    def keep(self, model: FittedLine) -> None:
+        """Write a model durably, unless it exists."""
+        documents = DocumentFolder(self.root, f"{LINES}/{model.digest}")
+        documents.create(1, {"line": model.model_dump(mode="json")})
+
+    def clear(self) -> None:
+        """Forget the models that were read; they are read again when needed."""
+        self._models.clear()
+
+
 @dataclass(frozen=True)
 class Warehouse:
-    """The tables below a data root. Making one touches nothing below it."""
+    """The tables and the catalog of a data root. Creating one reads and writes nothing.
+
+    Attributes
+    ----------
+    root
+        Folder of the data root.
+    configs
+        Configuration files that the catalog is loaded from.
+    connections
+        The idle connection to the Gram rows.
+    """
 
     root: Folder
+    configs: Configs = SHIPPED_CONFIGS
+    connections: ConnectionCache = field(
+        default_factory=ConnectionCache, init=False, repr=False, compare=False
+    )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with the catalog: a worker elsewhere need not have the folder of configs."""
+        return _unpickle, (self.root, self.configs, self.catalog)
+
+    def close(self) -> None:
+        """Release the idle connection and the first-stage models that were read."""
+        self.connections.close()
+        self.stacked_models.clear()
+
+    @cached_property
+    def catalog(self) -> Catalog:
+        """Signals, features, feature sets and first-stage models. Raises `ConfigError`."""
+        return replace(load_catalog(self.configs), first_stage_models=self.stacked_models)
+
+    @cached_property
+    def stacked_models(self) -> StackedModels:
+        """The first-stage models of this data root."""
+        return StackedModels(self.root)
 
     def require(self) -> None:
         """Raise `StorageError` if there is no data root: a wrong path is not an empty warehouse."""
@@ -59,7 +140,7 @@ class Warehouse:
     @cached_property
     def logs(self) -> Table:
         """Counts at 100 Hz, partitioned by day; a file holds whole drives."""
-        signals = catalogue()
+        signals = self.catalog.signals
         return Table(
             folder=self.root / "logs",
             schema=stored_schema(signals),
@@ -77,9 +158,9 @@ class Warehouse:
         """Gram rows of drives, by feature set: n, sums and sums of products of counts."""
         return Table(
             folder=self.root / "grams",
-            schema=gram_schema(),
+            schema=gram_schema(self.catalog.signals),
             encoding=Encoding(
-                dictionary=("feature_set", "file", "part", "signals", *catalogue().drive),
+                dictionary=("feature_set", "file", "part", "signals", *self.catalog.signals.drive),
                 # A seventh smaller, and twice as fast to write and read, as zstd alone.
                 delta_packed=("sums.list.element", "products.list.element"),
                 compression="zstd",
@@ -105,51 +186,19 @@ class Warehouse:
             description="Rows of measured logs that were refused, with the reason",
         )
 
-    @property
-    def lines(self) -> Folder:
-        """The folder of fitted lines, a folder of documents for each, by its digest."""
-        return self.root / "lines"
-
-    def __post_init__(self) -> None:
-        self.look_for_lines()
-
-    def look_for_lines(self) -> None:
-        """Let feature sets find the lines of this data root; nothing is read before one does.
-
-        Done when one is made; a process that was sent one does it again.
-        """
-        look_for_lines(str(self.root), self.line)
-
     def feature_sets(self) -> tuple[str, ...]:
-        """Return the feature sets that Gram rows can be of, those with a line of this root, too."""
-        known = features()
-        digests = sorted(self.lines.names()) if known.learning else []
-        lines = [line for digest in digests if (line := self.line(digest))]
-        fitted = [
-            f"{name}_{line.digest}"
-            for name, estimate in known.learning.items()
-            for line in lines
-            if line.estimate == estimate and line.scale == known.estimates[estimate].scale
+        """Return the feature sets that Gram rows can be of, with those of first-stage models."""
+        catalog = self.catalog
+        digests = self.stacked_models.digests() if catalog.stacked_sets else []
+        models = [model for digest in digests if (model := self.stacked_models.find(digest))]
+        stacked = [
+            f"{name}_{model.digest}"
+            for name, estimate in catalog.stacked_sets.items()
+            for model in models
+            if model.estimate == estimate and model.scale == catalog.estimates[estimate].scale
         ]
-        return (PLAIN, *(name for name in known.sets if name not in known.learning), *fitted)
-
-    def line(self, digest: str) -> FittedLine | None:
-        """Return a line by its digest; None if there is none. Raises `StorageError`."""
-        kept = DocumentFolder(self.lines / digest)
-        if 1 not in kept.numbers():
-            return None
-        try:
-            line = FittedLine.model_validate_json(json.dumps(kept.read(1).content["line"]))
-        except (ValidationError, KeyError):
-            line = None
-        if line is None or line.digest != digest:
-            raise StorageError(f"{kept.file(1)}: no line of that checksum. Restore the folder.")
-        return line
-
-    def keep_line(self, line: FittedLine) -> None:
-        """Write a line down, durably, unless it is there."""
-        DocumentFolder(self.lines / line.digest).create(1, {"line": line.model_dump(mode="json")})
-        remember_line(line)
+        plain = (name for name in catalog.sets if name not in catalog.stacked_sets)
+        return (PLAIN, *plain, *stacked)
 
     @property
     def tables(self) -> tuple[Table, ...]:
@@ -157,7 +206,31 @@ class Warehouse:
         return (self.logs, self.grams, self.quarantine)
 
 
-def stored_schema(signals: SignalCatalogue) -> pa.Schema:
+def _unpickle(root: Folder, configs: Configs, catalog: Catalog) -> Warehouse:
+    warehouse = Warehouse(root, configs)
+    models = warehouse.stacked_models
+    warehouse.__dict__["catalog"] = replace(catalog, first_stage_models=models)
+    return warehouse
+
+
+ROOT_VARIABLE, CONFIG_VARIABLE = "FLEET_SLIP_ROOT", "FLEET_SLIP_CONFIG"
+"""Environment variables that stand for `root` and `config` of `open_warehouse`."""
+
+
+def open_warehouse(
+    root: Folder | Path | str | None = None, config: Path | str | None = None
+) -> Warehouse:
+    """Return the warehouse that arguments, else the environment, else the defaults name.
+
+    `fleet_slip.open` and the command line call this; no other function reads the environment.
+    Raises `StorageError` for an unusable root and `ConfigError` for an unusable folder of configs.
+    """
+    chosen = config or os.environ.get(CONFIG_VARIABLE)
+    configs = Configs(Path(chosen)) if chosen else SHIPPED_CONFIGS
+    return Warehouse(data_root(root or os.environ.get(ROOT_VARIABLE)), configs)
+
+
+def stored_schema(signals: SignalCatalog) -> pa.Schema:
     """Return the schema of the table `logs`, with each signal's scale in its field's metadata."""
     return pa.schema(
         [
@@ -169,7 +242,7 @@ def stored_schema(signals: SignalCatalogue) -> pa.Schema:
     )
 
 
-def gram_schema() -> pa.Schema:
+def gram_schema(signals: SignalCatalog) -> pa.Schema:
     """Return the Arrow schema of the table `grams`.
 
     `part` is null where a Gram row is of a whole drive, else which of its rows it is of. `clipped`
@@ -183,7 +256,7 @@ def gram_schema() -> pa.Schema:
             ("feature_set", pa.string()),
             ("file", pa.string()),
             ("day", pa.date32()),
-            *catalogue().drive_schema,
+            *signals.drive_schema,
             ("part", pa.string()),
             ("signals", pa.string()),
             ("n", pa.int64()),
@@ -273,7 +346,8 @@ def open_tables(
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection, to be locked yet, with some views on snapshots of their tables.
 
-    Logs and Gram rows are `of` the drives that satisfy this SQL condition.
+    Logs and Gram rows are `of` the drives that satisfy this SQL condition. No view has rows of
+    erased cars and drives, even if the tables have them again.
     """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
     tables = {snapshot.table.folder.name: snapshot for snapshot in snapshots}
@@ -281,11 +355,16 @@ def open_tables(
         active = [file.path for file in tables["logs"].files]
         database.execute("SET VARIABLE active_log_files = $active", {"active": active})
     read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
-    sources = {f"stored_{name}": _source(database, tables[name]) for name in read}
+    signals = warehouse.catalog.signals
+    sources = {f"stored_{name}": _source(database, tables[name], signals) for name in read}
     if of != ALL_DRIVES:
         for name in sources.keys() - {"stored_quarantine"}:
             sources[name] = f"(FROM {sources[name]} WHERE {of})"
-    columns = _generated_columns()
+    erased = find_erased(warehouse.root, warehouse.grams, snapshots)
+    for column, names in names_by_column(erased).items():
+        database.execute(f"SET VARIABLE erased_{column} = $names", {"names": names})
+    sources = {name: without_erased(rows, erased) for name, rows in sources.items()}
+    columns = _generated_columns(signals)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:
             if view in wanted:
@@ -308,7 +387,7 @@ def add_table(database: duckdb.DuckDBPyConnection, name: str, rows: pa.Table) ->
     database.unregister("incoming")
 
 
-def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
+def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, signals: SignalCatalog) -> str:
     """Return what stands after FROM for a stored table, empty ones included."""
     variable = f"{snapshot.table.folder.name.removesuffix('s')}_files"
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
@@ -317,17 +396,16 @@ def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot) -> str:
         if snapshot.table.folder.name == "logs":
             differ = not snapshot.has_same_columns
             database.execute("SET VARIABLE log_columns_differ = $differ", {"differ": differ})
-        known = [n for n in catalogue().stored_columns if n in snapshot.table.schema.names]
+        columns = [n for n in signals.stored_columns if n in snapshot.table.schema.names]
         if COURSE_LATE in absent_columns(snapshot.files, snapshot.table.optional):
             rows = f"(SELECT *, NULL::BIGINT AS {COURSE_LATE} FROM {rows})"
-        return with_absent(rows, absent_columns(snapshot.files, known))
+        return with_absent(signals, rows, absent_columns(snapshot.files, columns))
     empty = f"empty_{snapshot.table.folder.name}"
     add_table(database, empty, snapshot.table.schema.empty_table())
     return empty
 
 
-def _generated_columns() -> Mapping[str, Any]:
-    signals = catalogue()
+def _generated_columns(signals: SignalCatalog) -> Mapping[str, Any]:
     separator = ",\n    "
     return {
         "drive_columns": separator.join(signals.drive),
@@ -364,9 +442,9 @@ def column_descriptions() -> dict[str, dict[str, ColumnDescription]]:
     return _Descriptions.model_validate(load_toml(folder("warehouse") / "columns.toml")).root
 
 
-def describe_columns(database: duckdb.DuckDBPyConnection) -> pa.Table:
+def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog) -> pa.Table:
     """Return the columns of all views with unit and description."""
-    by_view, signals = column_descriptions(), catalogue()
+    by_view = column_descriptions()
     common = {n: ColumnDescription(description=c.description) for n, c in signals.drive.items()}
     for name, signal in signals.signals.items():
         for column, unit in ((name, f"{signal.scale} {signal.unit}"), (signal.column, signal.unit)):

@@ -201,9 +201,9 @@ def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
     assert fleet.models("slip").num_rows == 1
 
 
-def test_a_manifest_names_the_columns_of_todays_catalogue(fleet: Fleet) -> None:
+def test_a_manifest_names_the_columns_of_todays_catalog(fleet: Fleet) -> None:
     manifest: Manifest = fleet.model("bent").manifest
     log = {name for name, *_ in fleet.sql("DESCRIBE log").fetchall()}
-    assert {*manifest.columns} <= log
+    assert {*manifest.columns(fleet.warehouse.catalog.signals)} <= log
     folder: Folder = fleet.root
     assert folder.exists()

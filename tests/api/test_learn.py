@@ -10,6 +10,7 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.ingest.mapping import Mapping, assumptions_of, load_mapping
+from tests.support.catalog import CATALOG
 from tests.support.commands import Finished, run_on
 from tests.support.measured import DRIVE, OWN_MAPPING, SIGNALS, TIME, csv_text, own_columns
 
@@ -97,7 +98,7 @@ def test_a_corrected_mapping_takes_the_place_of_the_old_one(
     learned: tuple[Path, Finished, Finished], tmp_path: Path
 ) -> None:
     folder, _, _ = learned
-    mapping = load_mapping(str(folder / "own.toml"))
+    mapping = load_mapping(str(folder / "own.toml"), CATALOG)
     fleet = fleet_slip.open(shutil.copytree(folder / "root", tmp_path / "root"))
     ax = mapping.signals["ax"].model_copy(update={"negate": True})
     corrected = mapping.model_copy(update={"signals": {**mapping.signals, "ax": ax}})
@@ -143,7 +144,8 @@ def test_a_path_that_does_not_fit_is_an_error(tmp_path: Path) -> None:
 )
 def test_what_a_mapping_leaves_open_is_named(changed: dict[str, object], said: str) -> None:
     mapping = Mapping.model_validate(
-        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {**SIGNALS, **changed}}
+        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {**SIGNALS, **changed}},
+        context=CATALOG.signals,
     )
     assert any(text.startswith(said) for text in assumptions_of(mapping))
 
@@ -151,6 +153,7 @@ def test_what_a_mapping_leaves_open_is_named(changed: dict[str, object], said: s
 def test_what_it_says_is_not_assumed() -> None:
     sure = {"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.3}}
     mapping = Mapping.model_validate(
-        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {"ax": SIGNALS["ax"], **sure}}
+        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {"ax": SIGNALS["ax"], **sure}},
+        context=CATALOG.signals,
     )
     assert assumptions_of(mapping) == ()

@@ -16,14 +16,13 @@ import pytest
 import fleet_slip
 from fleet_slip.api import nightly
 from fleet_slip.api.nightly import Night
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import StorageError, UsageError
-from fleet_slip.models.acceptance import floor
 from fleet_slip.operations.night import Beginning, NightReport, Nights
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.condition import hash_drive, parse_condition, without_drives
 from tests.support.cars import counts, drive
+from tests.support.catalog import SIGNALS
 from tests.support.commands import Finished, run_on, start_on, until
 from tests.support.counted_rows import START_S, row_of, write_counted
 from tests.support.landing import Landing
@@ -61,9 +60,7 @@ def champions_by(folder: Path, old: str, new: str) -> Iterator[None]:
     """Publish by other rules, here and in commands."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("FLEET_SLIP_CONFIG", configs(folder, old, new))
-        floor.cache_clear()
         yield
-    floor.cache_clear()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -149,7 +146,7 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
     (place / "landing").mkdir()
     fleet = fleet_slip.open(place / "data")
     rng = np.random.default_rng(2)
-    names = catalogue().gram_signals
+    names = SIGNALS.gram_signals
     for night in range(2):
         rows = []
         for car in range(12):
@@ -354,7 +351,7 @@ def test_a_changed_record_is_refused(nights: Nights, tmp_path: Path) -> None:
 def test_drives_are_left_out_by_hashes_that_do_not_name_them() -> None:
     hashes = [hash_drive("fleet", drive) for drive in ("car's <1>", "b")]
     condition = without_drives("mass_kg > 1000 OR true", "fleet", hashes)
-    parse_condition(condition)
+    parse_condition(SIGNALS, condition)
     assert "car" not in condition
     with duckdb.connect() as database:
         left = database.execute(

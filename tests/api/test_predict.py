@@ -16,11 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.models.manifest import ModelTerm
 from fleet_slip.models.registry import ModelVersion
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest
 
 Column = list[float | None]
@@ -29,21 +28,20 @@ WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 
 def model(intercept: float, **coefficients: float) -> ModelVersion:
     """A model that nobody published, of signals and features."""
-    known = features()
     terms = tuple(
         ModelTerm(
             signal=name,
-            column=known.of(name).column,
-            unit=known.of(name).unit,
-            scale=known.of(name).scale,
-            sql=known.features[name].sql if name in known.features else "",
+            column=CATALOG.input(name).column,
+            unit=CATALOG.input(name).unit,
+            scale=CATALOG.input(name).scale,
+            sql=CATALOG.features[name].sql if name in CATALOG.features else "",
             coefficient=coefficient,
             coefficient_exact=Fraction(coefficient),
         )
         for name, coefficient in coefficients.items()
     )
     own = {"intercept": intercept, "intercept_exact": Fraction(intercept), "terms": terms}
-    return ModelVersion(1, manifest().model_copy(update=own), "")
+    return ModelVersion(1, manifest().model_copy(update=own), "", CATALOG)
 
 
 LINEAR = model(0.25, ay=-0.0085, yaw_rate=0.0123, steering_wheel=0.1)
@@ -136,17 +134,17 @@ def test_a_linear_model_is_one_dot_product(columns: dict[str, Column]) -> None:
 
 def count(x: float, signal: str) -> int:
     """The count of a value: to the nearest, halves to even."""
-    return round(x / float(catalogue()[signal].scale))
+    return round(x / float(SIGNALS[signal].scale))
 
 
 def logged(x: float, signal: str) -> float:
     """The value of a count."""
-    return count(x, signal) * float(catalogue()[signal].scale)
+    return count(x, signal) * float(SIGNALS[signal].scale)
 
 
 def valid(x: float | None, column: str) -> float | None:
     """A value; None where it is beyond its valid range."""
-    (one,) = (one for one in catalogue().signals.values() if one.column == column)
+    (one,) = (one for one in SIGNALS.signals.values() if one.column == column)
     if x is None or not one.min_count <= round(x / float(one.scale)) <= one.max_count:
         return None
     return x

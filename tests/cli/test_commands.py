@@ -13,11 +13,13 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.registry import Registry
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.commands import COMMAND, RunCommand, run_here, run_on
 
 
@@ -53,7 +55,7 @@ def test_the_bits_are_those_of_other_machines(smoke_root: Path) -> None:
             rows = rows.filter(pc.equal(rows["feature_set"], PLAIN))
         lines = sorted(rows.to_pylist(), key=lambda row: (row["drive_id"], row.get("tick", 0)))
         digests[table.folder.name] = sha256(str(lines).encode()).hexdigest()
-    manifest = Registry(LocalFolder(smoke_root / "models")).resolve("smoke").manifest
+    manifest = Registry(LocalFolder(smoke_root), CATALOG).resolve("smoke").manifest
     content = manifest.model_dump(mode="json", exclude={"package_version"})
     del content["cross_validation"]["label_noise_deg"]  # came later
     del content["selected_by"]["reason"]  # a sentence for people
@@ -260,9 +262,8 @@ def test_a_long_condition_is_not_printed_whole_unless_all_is(
 def test_a_changed_campaign_is_refused_and_changes_nothing(
     run_command: RunCommand, root_to_fail_in: Path, tmp_path: Path
 ) -> None:
-    from fleet_slip.resources import find_config  # noqa: PLC0415
 
-    text = find_config("campaigns", "smoke").read_text()
+    text = SHIPPED_CONFIGS.find("campaigns", "smoke").read_text()
     seed = next(line for line in text.splitlines() if line.startswith("seed"))
     (tmp_path / "mine.toml").write_text(text.replace(seed, "seed = 999"))
     asked = ("sql", "SELECT count(*) AS n FROM log", "--json")
@@ -331,7 +332,7 @@ def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_pat
     found = json.loads(done.stdout)
     assert (found["name"], found["drives"]) == ("mine", 2)
     assert 0.028 < found["fit_deg"] < found["held_out_deg"] < 0.06, "the label's noise is 0.029"
-    car = load_vehicle(str(file))
+    car = load_vehicle(str(file), SHIPPED_CONFIGS)
     assert car.body.mass_kg == pytest.approx(1480)
     assert car.body.yaw_inertia_kgm2 == pytest.approx(found["found"]["yaw_inertia_kgm2"])
 

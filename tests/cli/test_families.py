@@ -1,13 +1,13 @@
 """How a table names the columns of a large model."""
 
-from fleet_slip.catalogue.features import features
 from fleet_slip.models.request import load_model_list, require_inputs
 from fleet_slip.models.summary import MANY_SIGNALS, in_families
+from tests.support.catalog import CATALOG
 
 
 def test_a_large_model_is_named_by_families_and_what_belongs_to_none() -> None:
-    models = {model.name: model.signals for model in load_model_list("gated").model}
-    shown = in_families(models["excess"])
+    models = {model.name: model.signals for model in load_model_list(CATALOG, "gated").model}
+    shown = in_families(CATALOG, models["excess"])
     assert shown.startswith(f"{len(models['excess'])}: ax ay yaw_rate steering_wheel wheel_fl")
     assert " ax_mean(6) ay_mean(6) " in shown
     assert " excess(" in shown
@@ -16,25 +16,25 @@ def test_a_large_model_is_named_by_families_and_what_belongs_to_none() -> None:
 
 
 def test_a_part_of_a_family_is_named_column_by_column() -> None:
-    models = {model.name: model.signals for model in load_model_list("gated").model}
-    shown = in_families([name for name in models["no gate"] if name != "ax_mean_16"])
+    models = {model.name: model.signals for model in load_model_list(CATALOG, "gated").model}
+    shown = in_families(CATALOG, [name for name in models["no gate"] if name != "ax_mean_16"])
     assert "ax_mean_8 ax_mean_32 " in shown
     assert " ax_mean(" not in shown
 
 
 def test_a_small_model_is_named_in_full() -> None:
     names = [f"x{number}" for number in range(MANY_SIGNALS)]
-    assert in_families(names) == " ".join(names)
+    assert in_families(CATALOG, names) == " ".join(names)
 
 
 def test_families_of_a_question_stand_for_their_columns() -> None:
-    asked = require_inputs(["ay", " ax_mean", "excess"], "gated")
-    known = features()
+    asked = require_inputs(CATALOG, ["ay", " ax_mean", "excess"], "gated")
+    known = CATALOG
     assert asked == ("ay", *known.members("ax_mean"), *known.members("excess"))
 
 
 def test_the_small_gated_list_is_made_of_the_gated_set_without_its_long_ring() -> None:
-    (sixty,) = load_model_list("gated_small").model
+    (sixty,) = load_model_list(CATALOG, "gated_small").model
     assert len(sixty.signals) == 60
-    assert set(sixty.signals) <= set(features().feature_set("gated").inputs)
-    assert not set(sixty.signals) & set(features().members("road"))
+    assert set(sixty.signals) <= set(CATALOG.feature_set("gated").inputs)
+    assert not set(sixty.signals) & set(CATALOG.members("road"))

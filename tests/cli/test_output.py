@@ -229,6 +229,36 @@ ours                              0.0302
     ]
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["sql", "SELECT chr(27) || '[2J' AS name", "--csv"],
+        ["sql", "SELECT chr(27) || '[2J' AS name"],
+        ["select", "--cohort", "drive_id <> '\x1b[2J'"],
+    ],
+    ids=["csv", "table", "cohort"],
+)
+def test_a_terminal_is_sent_no_control_characters(
+    smoke_root: Path,
+    capsysbinary: pytest.CaptureFixture[bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    command: list[str],
+) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    app(["--root", str(smoke_root), *command], standalone_mode=False)
+    output = capsysbinary.readouterr().out
+    assert b"[2J" in output
+    assert b"\x1b[2J" not in output
+
+
+def test_a_pipe_is_sent_texts_as_they_are(
+    smoke_root: Path, capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    query = "SELECT chr(27) || '[2J' AS name"
+    app(["--root", str(smoke_root), "sql", query, "--csv"], standalone_mode=False)
+    assert b'"\x1b[2J"' in capsysbinary.readouterr().out
+
+
 def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:
     lines = shown(lambda: print_parts(["a model of the fleet " * 20]))
     assert " ".join(lines).split() == ("a model of the fleet " * 20).split()

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import PLAIN, features
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.job import update_grams
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, counts, drive
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, done_on
 from tests.support.logs import ask, land, log_rows
 from tests.support.once import made_once
@@ -44,9 +45,9 @@ def test_all_sets_are_made_and_up_to_date(run_command: RunCommand, own_set: Path
         reports = run_command("gram", "--features", "all", "--json", root=own_set).json
         assert (sum(report["files_read"] for report in reports) == 0) == done
     assert [report["feature_set"] for report in reports] == [
-        features().identity(name)
-        for name in (PLAIN, *features().sets)
-        if name not in features().learning
+        CATALOG.identity(name)
+        for name in (PLAIN, *CATALOG.sets)
+        if name not in CATALOG.stacked_sets
     ]
 
 
@@ -103,9 +104,9 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     assert done.exit_code == 0, done.stderr
     shown = run_command("show", "curved", "--json", root=own_set).json
     terms = {term["signal"]: term for term in shown["terms"]}
-    assert terms["curvature"]["sql"] == features().features["curvature"].sql
+    assert terms["curvature"]["sql"] == CATALOG.features["curvature"].sql
     assert (terms["curvature"]["unit"], terms["ay"]["sql"]) == ("rad/m", "")
-    assert shown["trained_on"]["feature_set"] == features().identity("motion")
+    assert shown["trained_on"]["feature_set"] == CATALOG.identity("motion")
     assert "CASE WHEN" in run_command("show", "curved", "--all", root=own_set).stdout
     score = run_command("score", "curved", "--json", root=own_set).json
     assert score["rows"] == shown["trained_on"]["rows"]
@@ -138,7 +139,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
     assert "curvature" in run_command("features").stdout
     assert "motion" in run_command("features", "--sets").stdout
     listed = run_command("features", "--json").json
-    assert listed["sets"]["motion"]["identity"] == features().identity("motion")
+    assert listed["sets"]["motion"]["identity"] == CATALOG.identity("motion")
 
 
 @pytest.mark.parametrize(

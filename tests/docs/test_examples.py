@@ -35,7 +35,7 @@ def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """Let commands run in a folder, as in a terminal in which the environment is active."""
     patch.chdir(folder)
     patch.setenv("PATH", str(Path(sys.executable).parent), prepend=":")
-    for variable in ("FLEET_SLIP_ROOT", "FLEET_SLIP_SIGNALS", "FLEET_SLIP_VERIFY_KEY"):
+    for variable in ("FLEET_SLIP_ROOT", "FLEET_SLIP_CONFIG", "FLEET_SLIP_VERIFY_KEY"):
         patch.delenv(variable, raising=False)
 
 

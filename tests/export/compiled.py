@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import OnBoard, c_gram_header, c_gram_source, lower
 from fleet_slip.export.compile import Sample
@@ -26,6 +26,7 @@ from fleet_slip.export.templating import c_prefix, field_names
 from fleet_slip.models.manifest import LearnedFrom, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import MODELS, model_of
+from tests.support.catalog import CATALOG
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
 SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -182,7 +183,9 @@ def gram_driver(prefix: str, *, course: bool = True) -> str:
     return text.replace("PASS", passed).replace("UPPER", prefix.upper()).replace("PREFIX", prefix)
 
 
-def learned(columns: Sequence[str] = COLUMNS, feature_set: str = "course") -> Manifest:
+def learned(
+    columns: Sequence[str] = COLUMNS, feature_set: str = "course", catalog: Catalog = CATALOG
+) -> Manifest:
     """A model that changes of the course taught."""
     terms = tuple(
         ModelTerm(
@@ -190,14 +193,14 @@ def learned(columns: Sequence[str] = COLUMNS, feature_set: str = "course") -> Ma
             column=name,
             unit="1",
             scale=Decimal("0.001"),
-            definition=features().definition(name),
+            definition=catalog.definition(name),
             coefficient=0.5,
             coefficient_exact=Fraction(1, 2),
         )
         for name in columns
     )
     one = model_of(MODELS["signals"], name="any")
-    trained = one.trained_on.model_copy(update={"feature_set": features().identity(feature_set)})
+    trained = one.trained_on.model_copy(update={"feature_set": catalog.identity(feature_set)})
     said = LearnedFrom(
         label="course",
         change_s=4.0,
@@ -217,7 +220,7 @@ class Counter:
 
     @property
     def signals(self) -> tuple[str, ...]:
-        return tuple(one.name for one in lower(self.sets)[0].signals)
+        return tuple(one.name for one in lower(CATALOG, self.sets)[0].signals)
 
     def messages(self, table: pa.Table, late: int = 0, start_s: int = START_S) -> bytes:
         """What a car sends of a drive whose log is that table."""
@@ -235,8 +238,8 @@ class Counter:
 
 def write_counter(folder: Path, sets: tuple[OnBoard, ...]) -> None:
     """Write the C that counts some feature sets."""
-    (folder / "any_gram.h").write_text(c_gram_header("any", sets))
-    (folder / "any_gram.c").write_text(c_gram_source("any", sets))
+    (folder / "any_gram.h").write_text(c_gram_header(CATALOG, "any", sets))
+    (folder / "any_gram.c").write_text(c_gram_source(CATALOG, "any", sets))
 
 
 def build(folder: Path, sets: tuple[OnBoard, ...], *options: str) -> Counter:

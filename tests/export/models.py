@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Equation,
@@ -17,14 +17,13 @@ from fleet_slip.catalogue.definitions import (
     Product,
     Slope,
 )
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest
 
 
@@ -33,7 +32,7 @@ def export_texts(version: ModelVersion, warehouse: Warehouse | None, to: str) ->
     return {name: text.decode() for name, text in export_files(version, warehouse, to).items()}
 
 
-COURSE = features().features["course_difference"]
+COURSE = CATALOG.features["course_difference"]
 SPEED = Definition(of="wheel_fl", over="mean", ticks=4, bits=16)
 EVER = Definition(of="yaw_rate", over="running_mean", ratio=Fraction(16))
 
@@ -132,8 +131,8 @@ def model_of(
 
 
 def _term(name: str, coefficient: Fraction) -> ModelTerm:
-    signal = catalogue().signals.get(name)
-    feature = features().features.get(name)
+    signal = SIGNALS.signals.get(name)
+    feature = CATALOG.features.get(name)
     return ModelTerm(
         signal=name,
         column=signal.column if signal else name,
@@ -201,4 +200,4 @@ def hostile_version() -> ModelVersion:
         for i, one in enumerate(facts)
     ]
     manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
-    return ModelVersion(1, manifest, "0123" * 16)
+    return ModelVersion(1, manifest, "0123" * 16, CATALOG)

@@ -25,6 +25,7 @@ from tests.export.compiled import (
     run_compiled,
 )
 from tests.export.models import CARS, MODELS, SMALL, export_texts, hostile_drive, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
@@ -33,15 +34,15 @@ pytestmark = needs_cc
 def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path) -> None:
     """And nothing overflows or reads beyond its memory, where the compiler has sanitizers."""
     manifest = model_of(MODELS[name], Fraction(-1, 700), name)
-    program = compile_program(manifest)
-    version = ModelVersion(1, manifest, "0" * 64)
+    program = compile_program(CATALOG, manifest)
+    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
     options = SANITIZED if can_sanitize() else ("-O2",)
     driver = build_driver(tmp_path, version, program, *options)
     angles: set[int | None] = set()
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 400, seed)
         found = drive(driver, program, car, samples)
-        assert found == angles_by_kernel(manifest, program, car, samples)
+        assert found == angles_by_kernel(SIGNALS, manifest, program, car, samples)
         angles |= {*found}
     assert len(angles) > 10
     assert None in angles
@@ -50,14 +51,17 @@ def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path)
 def test_the_next_drive_remembers_what_was_learned(tmp_path: Path) -> None:
     """All of 256 parts, some, none: as the estimator in Python does, in counts of a column."""
     manifest = model_of({"slope": Fraction(1, 3), "ever": Fraction(1, 7)}, name="any")
-    program, version = compile_program(manifest), ModelVersion(1, manifest, "0" * 64)
+    program, version = (
+        compile_program(CATALOG, manifest),
+        ModelVersion(1, manifest, "0" * 64, CATALOG),
+    )
     samples = hostile_drive(program, 300, 5)
     after: dict[int, list[int | None]] = {}
     for kept in (0, 77, 256, 1000):
         again = f"if (tick == 200U) {{ PREFIX_next(&state, {kept}U); }}"
         driver = build_driver(tmp_path, version, program, before=again)
         after[kept] = drive(driver, program, CARS[0], samples)[200:]
-        estimator = Estimator(manifest)
+        estimator = Estimator(CATALOG, manifest)
         columns = [one.column for one in program.signals]
         scales = [float(one.scale) for one in program.signals]
         stepped = []
@@ -94,7 +98,7 @@ def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
     if not can_sanitize():
         pytest.skip("the compiler's sanitizers are not here")
     manifest = model_of(MODELS["every_kind"], Fraction(5), "any")
-    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "c")
     for name, text in {**files, "main.c": FUZZ}.items():
         (tmp_path / name).write_text(text)
     sources = ["sideslip_any.c", "sideslip_any_fuzz.c", "main.c"]
@@ -179,7 +183,7 @@ def test_inputs_beyond_their_ranges_are_counted(smoke_root: Path, tmp_path: Path
 
 def test_names_of_scales_differ_where_c_looks() -> None:
     manifest = model_of({"wheel_fl": SMALL, "wheel_fr": SMALL}, name="m" * 15)
-    text = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    text = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "c")
     (header,) = [content for name, content in text.items() if name.endswith(".h")]
     names = re.findall(r"#define (\w+) ", header)
     assert len({name[:31] for name in names}) == len(names) > 6
@@ -203,7 +207,7 @@ def result_of(program: Path) -> tuple[int, str]:
 
 def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
     manifest = model_of(MODELS["every_kind"], Fraction(5), "every_kind")
-    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "c")
     text = files["sideslip_every_kind.h"] + files["sideslip_every_kind.c"]
     for word in ("float", "double", "malloc", "stdlib", "math.h", "1e-"):
         assert word not in text
@@ -211,7 +215,7 @@ def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
 
 
 def test_quotients_take_64_bits_only_where_they_need_them() -> None:
-    text = export_texts(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64), None, "c")[
+    text = export_texts(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64, CATALOG), None, "c")[
         "sideslip_sideslip.c"
     ]
     assert "nearest_32" in text
@@ -242,7 +246,7 @@ int main(void)
 @pytest.fixture
 def text(tmp_path: Path) -> str:
     """Export C, and write a program that declares and checks what the A2L file asks for."""
-    files = export_texts(ModelVersion(1, MODEL, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, MODEL, "0" * 64, CATALOG), None, "c")
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     found = files["sideslip_any.a2l"]

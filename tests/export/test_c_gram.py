@@ -1,9 +1,9 @@
 """Gram rows, and changes of the course, counted by exported C are those of the kernel."""
 
+import json
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
-from decimal import Decimal
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from subprocess import run
@@ -15,8 +15,7 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import FeatureSet, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.files import export_files
@@ -25,6 +24,7 @@ from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.straight_on import PLANE
 from fleet_slip.regression.gram import Gram
+from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -42,18 +42,19 @@ from tests.export.compiled import (
 )
 from tests.export.models import MODELS, model_of
 from tests.grams.rows.test_course_sums import hostile_drive
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counted_rows import parse_messages, rows_of_messages, write_counted
 from tests.support.logs import land
 
 pytestmark = needs_cc
 
-SIGNALS = catalogue().gram_signals
+COUNTED = SIGNALS.gram_signals
 MISSING = -(2**15)
 
 
 def build_counter(folder: Path, *options: str) -> Path:
     """A program that reads drives and writes messages."""
-    version = ModelVersion(1, model_of(MODELS["signals"], name="any"), "0" * 64)
+    version = ModelVersion(1, model_of(MODELS["signals"], name="any"), "0" * 64, CATALOG)
     for name, content in export_files(version, None, "c", with_gram=True).items():
         (folder / name).write_bytes(content)
     (folder / "driver.c").write_text(gram_driver("sideslip_any", course=False))
@@ -69,7 +70,7 @@ def count_drives(counter: Path, drives: Sequence[tuple[str, int, Any]]) -> bytes
     """The messages of drives: a car, when it began, and counts, shape (rows, signals)."""
     given = b""
     for car, start_s, counts in drives:
-        rows = np.zeros(len(counts), [("logged", "<i4"), ("counts", "<i2", len(SIGNALS))])
+        rows = np.zeros(len(counts), [("logged", "<i4"), ("counts", "<i2", len(COUNTED))])
         rows["logged"], rows["counts"] = 1, counts
         given += struct.pack("<16sQqQ", car.encode(), start_s, 0, len(rows)) + rows.tobytes()
     return run_compiled([counter], given=given)
@@ -79,7 +80,7 @@ def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
     """The Grams of the messages of one drive, by signals."""
     found = {}
     for message in parse_messages(content):
-        names = tuple(name for i, name in enumerate(SIGNALS) if message.mask >> i & 1)
+        names = tuple(name for i, name in enumerate(COUNTED) if message.mask >> i & 1)
         numbers = np.frombuffer(message.numbers, "<i8").tolist()
         k = len(names)
         found[names] = Gram(names, message.rows, tuple(numbers[:k]), tuple(numbers[k:]))
@@ -88,8 +89,8 @@ def parts_of(content: bytes) -> dict[tuple[str, ...], Gram]:
 
 def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path) -> None:
     random = np.random.default_rng(5)
-    counts = random.choice([-32767, 32767, 30000, -30000, 0, 1, -1], (5000, len(SIGNALS)))
-    limits = [(catalogue()[name].min_count, catalogue()[name].max_count) for name in SIGNALS]
+    counts = random.choice([-32767, 32767, 30000, -30000, 0, 1, -1], (5000, len(COUNTED)))
+    limits = [(SIGNALS[name].min_count, SIGNALS[name].max_count) for name in COUNTED]
     low, high = (np.array(one) for one in zip(*limits, strict=True))
     counts = np.clip(counts, low, high)
     counts[:1000, 0] = MISSING
@@ -99,8 +100,8 @@ def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path)
     found = parts_of(content)
     assert sum(one.n for one in found.values()) == 5000
     for names, gram in found.items():
-        at = [SIGNALS.index(name) for name in names]
-        others = [i for i in range(len(SIGNALS)) if i not in at]
+        at = [COUNTED.index(name) for name in names]
+        others = [i for i in range(len(COUNTED)) if i not in at]
         mine = np.all(counts[:, at] != MISSING, axis=1)
         mine &= np.all(counts[:, others] == MISSING, axis=1)
         assert gram == Gram.from_counts(names, counts[mine][:, at])
@@ -108,7 +109,7 @@ def test_each_set_of_signals_has_a_message_and_extremes_are_exact(counter: Path)
 
 
 def test_rows_of_more_sets_of_signals_are_counted_as_lost(counter: Path) -> None:
-    counts = np.zeros((60, len(SIGNALS)), np.int16)
+    counts = np.zeros((60, len(COUNTED)), np.int16)
     for row in range(60):
         counts[row, row % 6] = MISSING
     messages = parse_messages(count_drives(counter, [("VIN1", 7, counts)]))
@@ -118,10 +119,13 @@ def test_rows_of_more_sets_of_signals_are_counted_as_lost(counter: Path) -> None
 
 
 def test_the_layout_is_what_the_page_says(counter: Path) -> None:
-    counts = np.ones((3, len(SIGNALS)), np.int16)
+    counts = np.ones((3, len(COUNTED)), np.int16)
     content = count_drives(counter, [("VIN-17", 1_700_000_000, counts)])
     assert content[:8] == b"FSGR\x01\x00" + len(content).to_bytes(2, "little")
-    assert int.from_bytes(content[8:16], "little") == next(iter(counted_sets().values())).definition
+    assert (
+        int.from_bytes(content[8:16], "little")
+        == next(iter(counted_sets(CATALOG).values())).definition
+    )
     assert content[16:32] == b"VIN-17".ljust(16, b"\0")
     assert content[32:36] == b"\0\0\x01\0"
     assert struct.unpack_from("<QIII", content, 36) == (1_700_000_000, 2**11 - 1, 3, 0)
@@ -130,7 +134,7 @@ def test_the_layout_is_what_the_page_says(counter: Path) -> None:
 
 
 def test_gram_rows_go_with_c_alone() -> None:
-    version = ModelVersion(1, model_of(MODELS["signals"], Fraction(0), "any"), "0" * 64)
+    version = ModelVersion(1, model_of(MODELS["signals"], Fraction(0), "any"), "0" * 64, CATALOG)
     with pytest.raises(UsageError, match="--to c --with-gram"):
         export_files(version, None, "json", with_gram=True)
     names = [*export_files(version, None, "c", with_gram=True)]
@@ -142,7 +146,7 @@ def test_external_names_of_long_models_differ_in_31_characters(tmp_path: Path) -
     names = [f"waterford_of_summer_with_windows_{end}" for end in ("a", "b")]
     stems = []
     for name in [*names, "short"]:
-        version = ModelVersion(1, model_of(MODELS["signals"], name=name), "0" * 64)
+        version = ModelVersion(1, model_of(MODELS["signals"], name=name), "0" * 64, CATALOG)
         files = export_files(version, None, "c", with_gram=True)
         for file, content in files.items():
             (tmp_path / file).write_bytes(content)
@@ -164,12 +168,12 @@ def test_external_names_of_long_models_differ_in_31_characters(tmp_path: Path) -
 
 @pytest.fixture(scope="module")
 def of_course(tmp_path_factory: pytest.TempPathFactory) -> Counter:
-    return build(tmp_path_factory.mktemp("course"), sets_on_board(learned()), "-O2")
+    return build(tmp_path_factory.mktemp("course"), sets_on_board(CATALOG, learned()), "-O2")
 
 
 def valid(table: pa.Table) -> pa.Table:
     """A drive whose counts are in the ranges of their signals, as a log's are."""
-    for name, one in catalogue().signals.items():
+    for name, one in SIGNALS.signals.items():
         counts = table[name].cast(pa.int32())
         counts = pc.max_element_wise(counts, one.min_count, skip_nulls=False)
         counts = pc.min_element_wise(counts, one.max_count, skip_nulls=False).cast(pa.int16())
@@ -189,9 +193,11 @@ def grams_of(rows: list[dict[str, Any]], columns: Sequence[str]) -> dict[Any, Gr
     return found
 
 
-def kernel_rows(folder: Folder, table: pa.Table, name: str, late: int) -> list[dict[str, Any]]:
+def kernel_rows(
+    folder: Folder, table: pa.Table, name: str, late: int, configs: Configs = SHIPPED_CONFIGS
+) -> list[dict[str, Any]]:
     """What `gram --features` says of the log."""
-    warehouse = Warehouse(folder)
+    warehouse = Warehouse(folder, configs)
     if not warehouse.logs.snapshot().files:
         land(warehouse, "one", table)
     files = warehouse.logs.snapshot().files
@@ -202,11 +208,15 @@ def kernel_rows(folder: Folder, table: pa.Table, name: str, late: int) -> list[d
     return found
 
 
-def received_rows(root: Path, content: bytes) -> list[dict[str, Any]]:
+def received_rows(
+    root: Path, content: bytes, configs: Configs = SHIPPED_CONFIGS
+) -> list[dict[str, Any]]:
     """The Gram rows that the messages of a drive become."""
     root.mkdir()
-    fleet = fleet_slip.open(root / "data")
-    fleet.ingest_counted(write_counted(root / "rows", rows_of_messages(content)))
+    fleet = fleet_slip.open(root / "data", configs.folder)
+    fleet.ingest_counted(
+        write_counted(root / "rows", rows_of_messages(content, fleet.warehouse.catalog))
+    )
     found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()
     return found
 
@@ -234,28 +244,33 @@ def test_received_rows_are_those_of_the_log(
         assert not changes or sum(gram.n for gram in changes) > 20
 
 
-@pytest.fixture
-def three(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+THREE = """
+[sets.few]
+description = "few"
+signals = ["ax", "ay", "yaw_rate"]
+windows = {windows}
+
+[sets.three]
+description = "three"
+of = "few"
+features = ["curvature"]
+change_s = [3.5, 4, 5]
+"""
+
+
+def test_several_times_are_parts_of_the_drive(tmp_path: Path) -> None:
     """A set of changes over several times, with a gate."""
-    windows = ("ay_mean_16", *PLANE, features().members("cornering")[0])
-    few = FeatureSet(description="few", signals=("ax", "ay", "yaw_rate"), windows=windows)
-    times = (Decimal("3.5"), Decimal(4), Decimal(5))
-    three = FeatureSet(description="three", of="few", features=("curvature",), change_s=times)
-    monkeypatch.setitem(features().sets, "few", few)
-    monkeypatch.setitem(features().sets, "three", three)
-    counted_sets.cache_clear()
-    yield "three"
-    counted_sets.cache_clear()
-
-
-def test_several_times_are_parts_of_the_drive(tmp_path: Path, three: str) -> None:
-    sets = sets_on_board(learned(("ay_mean_16",), three))[:2]
+    windows = ["ay_mean_16", *PLANE, CATALOG.members("cornering")[0]]
+    own = Configs(tmp_path)
+    (tmp_path / "features.toml").write_text(THREE.format(windows=json.dumps(windows)))
+    catalog = load_catalog(own)
+    sets = sets_on_board(catalog, learned(("ay_mean_16",), "three", catalog))[:2]
     counted = build(tmp_path, sets)
     table = valid(hostile_drive("a", 5000, 3))
-    came = received_rows(tmp_path / "cars", counted.messages(table, 9))
-    mine = [row for row in came if row["feature_set"] == features().identity(three)]
+    came = received_rows(tmp_path / "cars", counted.messages(table, 9), own)
+    mine = [row for row in came if row["feature_set"] == catalog.identity("three")]
     assert {row["part"] for row in mine} == {"3.5 s", "4 s", "5 s"}
-    expected = kernel_rows(LocalFolder(tmp_path / "logs"), table, three, 9)
+    expected = kernel_rows(LocalFolder(tmp_path / "logs"), table, "three", 9, own)
     assert grams_of(mine, sets[1].columns) == grams_of(expected, sets[1].columns)
 
 
@@ -275,26 +290,26 @@ def test_nothing_overflows(tmp_path: Path, of_course: Counter) -> None:
 
 
 def test_an_export_counts_what_teaches_the_model_again() -> None:
-    version = ModelVersion(1, learned(), "0" * 64)
+    version = ModelVersion(1, learned(), "0" * 64, CATALOG)
     files = export_files(version, None, "c", with_gram=True)
     header = files["sideslip_any_gram.h"].decode()
     assert "int32_t course_count;" in header and "_gram_pass(" in header
-    sizes = [one.columns for one in sets_on_board(version.manifest)[1:]]
-    assert set(sizes[-1]) == {*COLUMNS, *PLANE, catalogue().label}, "the columns themselves"
+    sizes = [one.columns for one in sets_on_board(CATALOG, version.manifest)[1:]]
+    assert set(sizes[-1]) == {*COLUMNS, *PLANE, SIGNALS.label}, "the columns themselves"
     assert sizes[0] == (
         *(
             "ay",
             "yaw_rate",
             "curvature",
-            *sorted(COLUMNS, key=features().feature_set("course").columns.index),
+            *sorted(COLUMNS, key=CATALOG.feature_set("course").columns.index),
         ),
-        *("turned", "straight", "straight_course", catalogue().label),
+        *("turned", "straight", "straight_course", SIGNALS.label),
     )
 
 
 def test_what_a_car_is_not_told_it_cannot_count() -> None:
     with pytest.raises(RefusedError, match="has ay_mean_16_mass: cars count up to 32 columns"):
-        sets_on_board(learned(("ay_mean_16_mass",), "course_fleet"))
-    many = features().feature_set("course").windows[:30]
+        sets_on_board(CATALOG, learned(("ay_mean_16_mass",), "course_fleet"))
+    many = CATALOG.feature_set("course").windows[:30]
     with pytest.raises(RefusedError, match="up to 32 columns"):
-        sets_on_board(learned(many))
+        sets_on_board(CATALOG, learned(many))

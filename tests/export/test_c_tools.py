@@ -13,6 +13,7 @@ from fleet_slip.export.files import export_files
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import STRICT, learned, run_compiled, write_counter
 from tests.export.models import MODELS, export_texts, model_of
+from tests.support.catalog import CATALOG
 from tests.support.cortex_m import measure_cortex_m, run_self_test
 
 DEVIATIONS = {"misra-c2012-15.5", "misra-c2012-2.5", "misra-c2012-8.7"}
@@ -23,7 +24,7 @@ the functions are called from elsewhere, which recent versions look for. docs/ex
 @pytest.fixture(params=MODELS)
 def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     manifest = model_of(MODELS[request.param], Fraction(-1, 700), "any")
-    version = ModelVersion(1, manifest, "0" * 64)
+    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
     for name, text in export_files(version, None, "c", with_gram=True).items():
         (tmp_path / name).write_bytes(text)
     return tmp_path
@@ -31,7 +32,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.mark.tools("clang", "cppcheck")
 def test_what_counts_changes_of_the_course_keeps_the_same_rules(tmp_path: Path) -> None:
-    write_counter(tmp_path, sets_on_board(learned()))
+    write_counter(tmp_path, sets_on_board(CATALOG, learned()))
     run(tmp_path, "clang", *STRICT, "-c", "any_gram.c")
     require_misra(tmp_path, "any_gram.c")
 
@@ -67,7 +68,7 @@ def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
     """Four columns with windows take less than 4 kB of code and 2 kB of memory."""
     names = ("mean_3", "mean_5", "sum_4", "change_mean")
     manifest = model_of(dict.fromkeys(names, Fraction(1, 10**4)), Fraction(-1, 700), "any")
-    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "c")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "c")
     found = measure_cortex_m(tmp_path, "sideslip_any", files)
     assert run_self_test(tmp_path) == 0
     assert found["with_divisions_of_64_bits_bytes"] < 4096
@@ -78,8 +79,8 @@ def test_the_self_test_passes_on_a_cortex_m(tmp_path: Path) -> None:
 @pytest.mark.tools("arm-none-eabi-gcc", "qemu-system-arm")
 @pytest.mark.parametrize("name", MODELS)
 def test_estimates_for_a_cortex_m_are_above_what_is_measured(tmp_path: Path, name: str) -> None:
-    version = ModelVersion(1, model_of(MODELS[name], Fraction(-1, 700), name), "0" * 64)
-    estimated = cost_on_board(version.manifest)
+    version = ModelVersion(1, model_of(MODELS[name], Fraction(-1, 700), name), "0" * 64, CATALOG)
+    estimated = cost_on_board(CATALOG, version.manifest)
     found = measure_cortex_m(tmp_path, f"sideslip_{name}", export_texts(version, None, "c"))
     assert found["state_bytes"] == estimated.memory_bytes
     assert 0.5 < found["most_instructions"] / estimated.estimated_instructions <= 1

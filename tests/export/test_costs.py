@@ -13,22 +13,24 @@ from fleet_slip.errors import RefusedError
 from fleet_slip.export.costs import cost_on_board, costs_content, describe_costs
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import LARGEST_SUM, OUTPUT_COUNTS, fixed_point
+from fleet_slip.models.registry import ModelVersion
 from tests.export.models import DEFINITIONS, model_of
+from tests.support.catalog import CATALOG
 
 ONE = Fraction(1, 1000)
 
 
 def test_a_signal_costs_one_term() -> None:
     """Two words of a coefficient: two products and two sums, and two shifts that round."""
-    found = cost_on_board(model_of({"ay": ONE}))
+    found = cost_on_board(CATALOG, model_of({"ay": ONE}))
     assert (found.columns, found.coefficient_bytes, found.memory_bytes) == (1, 8, 1)
     assert (found.multiplications, found.additions, found.divisions) == (2, 2 + 2, 0)
 
 
 def test_windows_of_one_source_share_its_ring_buffer() -> None:
     """ay over 3 and 5 ticks: 5 words of 2 bytes, its place, two sums and two counters of 4."""
-    one = cost_on_board(model_of({"mean_5": ONE}))
-    two = cost_on_board(model_of({"mean_5": ONE, "mean_3": ONE}))
+    one = cost_on_board(CATALOG, model_of({"mean_5": ONE}))
+    two = cost_on_board(CATALOG, model_of({"mean_5": ONE, "mean_3": ONE}))
     assert one.memory_bytes == 5 * 2 + 2 + 4 + 8  # the place of a word of 4 bytes is one of its own
     assert two.memory_bytes == one.memory_bytes + 8
     # Of a window more: the oldest is found and leaves, the newest comes, a quotient, a term.
@@ -39,9 +41,9 @@ def test_windows_of_one_source_share_its_ring_buffer() -> None:
 
 def test_a_feature_is_computed_once() -> None:
     """Two looks at `change`: its arithmetic counts once, and needs a division of 64 bits."""
-    alone = cost_on_board(model_of({"change_mean": ONE}))
-    both = cost_on_board(model_of({"change_mean": ONE, "heavy_above": ONE}))
-    heavy = cost_on_board(model_of({"heavy": ONE}))
+    alone = cost_on_board(CATALOG, model_of({"change_mean": ONE}))
+    both = cost_on_board(CATALOG, model_of({"change_mean": ONE, "heavy_above": ONE}))
+    heavy = cost_on_board(CATALOG, model_of({"heavy": ONE}))
     gate = (1, 1)  # product and quotient of what rises
     rounded = (2, 1)
     gated = 1 + rounded[0] + gate[0]
@@ -52,7 +54,7 @@ def test_a_feature_is_computed_once() -> None:
 
 def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> None:
     version = fleet_slip.open(smoke_root).model("smoke")
-    counted = costs_content(version.manifest)
+    counted = costs_content(version)
     assert counted["columns"] == len(version.manifest.terms)
     assert counted["memory_bytes"] > 1000 < counted["estimated_instructions"]
     files = export_files(version, None, "c")
@@ -62,20 +64,20 @@ def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> No
     assert [*manifest["files"]] == [name for name in files if "manifest" not in name]
     document = json.loads(export_files(version, None, "json")["smoke-1.json"])
     assert document["costs"] == counted
-    assert str(cost_on_board(version.manifest)) == describe_costs(version.manifest)
+    assert str(cost_on_board(CATALOG, version.manifest)) == describe_costs(version)
 
 
 def test_each_kind_of_column_adds_to_the_costs() -> None:
-    least = cost_on_board(model_of({"ay": ONE}))
+    least = cost_on_board(CATALOG, model_of({"ay": ONE}))
     for name in DEFINITIONS:
-        found = cost_on_board(model_of({"ay": ONE, name: ONE}))
+        found = cost_on_board(CATALOG, model_of({"ay": ONE, name: ONE}))
         assert found.operations > least.operations, name
         assert found.estimated_instructions > least.estimated_instructions, name
         assert found.estimated_code_bytes > least.estimated_code_bytes, name
 
 
 def test_what_cannot_be_exported_is_said() -> None:
-    wild = model_of({"ay": Fraction(10**40)})
+    wild = ModelVersion(1, model_of({"ay": Fraction(10**40)}), "0" * 64, CATALOG)
     assert describe_costs(wild).startswith("cannot be exported: the coefficients are too large")
     assert "too large to bound" in costs_content(wild)["error"]
 

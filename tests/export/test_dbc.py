@@ -11,9 +11,12 @@ from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import DEFINITIONS, export_texts, hostile_drive, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
-VERSION = ModelVersion(7, model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6))), "12ab34" * 10)
-PROGRAM = compile_program(VERSION.manifest)
+VERSION = ModelVersion(
+    7, model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6))), "12ab34" * 10, CATALOG
+)
+PROGRAM = compile_program(CATALOG, VERSION.manifest)
 
 
 @pytest.fixture(scope="module")
@@ -45,12 +48,12 @@ def test_a_drive_over_the_bus_gives_the_same_angles(bus: Database) -> None:
     received = [over_the_bus(bus, PROGRAM, sample) for sample in samples]
     car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
     manifest = VERSION.manifest
-    found = angles_by_kernel(manifest, PROGRAM, car, received)
-    assert found == angles_by_kernel(manifest, PROGRAM, car, samples)
+    found = angles_by_kernel(SIGNALS, manifest, PROGRAM, car, received)
+    assert found == angles_by_kernel(SIGNALS, manifest, PROGRAM, car, samples)
     assert len({*found}) > 10
 
 
-def test_signals_have_the_scales_units_and_ranges_of_the_catalogue(bus: Database) -> None:
+def test_signals_have_the_scales_units_and_ranges_of_the_catalog(bus: Database) -> None:
     by_name = {signal.name: signal for message in bus.messages for signal in message.signals}
     for one in PROGRAM.signals:
         signal = by_name[one.name]
@@ -67,7 +70,9 @@ def test_messages_come_every_tick(bus: Database) -> None:
 def test_the_angle_s_range_is_what_the_model_can_reach(bus: Database) -> None:
     angle = bus.get_message_by_name("sideslip_estimate").get_signal_by_name("sideslip")
     car = Car({"mass_kg": 1500.0, "vehicle_model": "suv"}, {})
-    found = angles_by_kernel(VERSION.manifest, PROGRAM, car, hostile_drive(PROGRAM, 100, 5))
+    found = angles_by_kernel(
+        SIGNALS, VERSION.manifest, PROGRAM, car, hostile_drive(PROGRAM, 100, 5)
+    )
     largest = max(abs(one) for one in found if one is not None) * float(PROGRAM.angle.scale)
     assert angle.maximum is not None
     assert largest <= angle.maximum < 100 * largest

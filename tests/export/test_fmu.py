@@ -24,6 +24,7 @@ from fleet_slip.export.program import Car, Program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.models import CARS, MODELS, hostile_drive, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
@@ -33,7 +34,7 @@ MANIFEST = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
 
 @pytest.fixture(scope="module")
 def archive() -> bytes:
-    return export_files(ModelVersion(1, MANIFEST, "0123" * 16), None, "fmu")[
+    return export_files(ModelVersion(1, MANIFEST, "0123" * 16, CATALOG), None, "fmu")[
         "sideslip_any_fmi2.fmu"
     ]
 
@@ -112,10 +113,10 @@ def drive(instance: Fmu, program: Program, car: Car, samples: Sequence[Sample]) 
 
 
 def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu) -> None:
-    program = compile_program(MANIFEST)
+    program = compile_program(CATALOG, MANIFEST)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
-        expected = angles_by_kernel(MANIFEST, program, car, samples)
+        expected = angles_by_kernel(SIGNALS, MANIFEST, program, car, samples)
         assert drive(instance, program, car, samples) == expected
 
 
@@ -125,7 +126,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
     assert [instance.step(s) for s in (0.015, 0.0, -0.01, float("nan"), 1e300)] == [error] * 5
     assert not instance.instantiate(b"{another}")
     state = c_void_p()
-    program = compile_program(MANIFEST)
+    program = compile_program(CATALOG, MANIFEST)
     samples = hostile_drive(program, 60, 1)
     before = drive(instance, program, CARS[1], samples)
     assert instance.call("GetFMUstate", byref(state)) == 0
@@ -143,11 +144,11 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
 
 
 def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes) -> None:
-    version = ModelVersion(1, MANIFEST, "0123" * 16)
+    version = ModelVersion(1, MANIFEST, "0123" * 16, CATALOG)
     with zipfile.ZipFile(BytesIO(archive)) as file:
         table = file.read("resources/checks.csv").decode()
         text = file.read("modelDescription.xml").decode()
-    assert fmu.fmu(version, compile_program(MANIFEST), table) == archive
+    assert fmu.fmu(version, compile_program(CATALOG, MANIFEST), table) == archive
     assert "any@1, SHA-256 01230123" in text
     assert '<Unit name="m/s^2"><BaseUnit m="1" s="-2"/></Unit>' in text
     assert table.startswith("drive_id,tick,")
@@ -155,7 +156,7 @@ def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes) -> None:
 
 def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fmu, "COMPILER", "no-such-compiler")
-    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
+    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
     with pytest.raises(ConfigError, match="the C compiler no-such-compiler"):
         export_files(version, None, "fmu")
 
@@ -164,7 +165,7 @@ def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", ["every_kind", "learning"])
 def test_fmpy_finds_no_problem(name: str, tmp_path: Path) -> None:
     manifest = model_of(MODELS[name], Fraction(-1, 700), "any")
-    content = export_files(ModelVersion(1, manifest, "0" * 64), None, "fmu")
+    content = export_files(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "fmu")
     file = tmp_path / "any.fmu"
     file.write_bytes(content["sideslip_any_fmi2.fmu"])
     assert "No problems found" in run_fmpy("validate", str(file))
@@ -182,7 +183,7 @@ def run_fmpy(*words: str) -> str:
 def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     version = fleet.model("smoke")
-    program = compile_program(version.manifest)
+    program = compile_program(CATALOG, version.manifest)
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick").pl()
     fleet.export(version, "fmu", tmp_path)
     columns = [one.column for one in program.signals]

@@ -26,6 +26,7 @@ from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite
 from tests.export.models import LONGEST, MODELS, TEXTS, hostile_version, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 EMPTY = model_of(MODELS["every_kind"], name="empty")
 
@@ -99,7 +100,7 @@ def test_onnx_takes_no_car_at_all() -> None:
 
 
 def empty_log() -> pl.DataFrame:
-    columns: Mapping[str, type[pl.DataType]] = dict.fromkeys(EMPTY.columns, pl.Float64)
+    columns: Mapping[str, type[pl.DataType]] = dict.fromkeys(EMPTY.columns(SIGNALS), pl.Float64)
     facts = {"mass_kg": pl.Float64, "vehicle_model": pl.String}
     numbers = dict.fromkeys(("yaw_rate_offset", "speed_ratio", "understeer"), pl.Float64)
     return pl.DataFrame(
@@ -108,13 +109,15 @@ def empty_log() -> pl.DataFrame:
 
 
 def test_sql_of_a_log_without_rows_has_none() -> None:
-    statement = export_files(ModelVersion(1, EMPTY, "0" * 64), None, "sql")["sideslip_empty.sql"]
+    statement = export_files(ModelVersion(1, EMPTY, "0" * 64, CATALOG), None, "sql")[
+        "sideslip_empty.sql"
+    ]
     assert by_duckdb(statement.decode(), empty_log()) == {}
     assert by_sqlite(statement.decode(), empty_log()) == {}
 
 
 def test_what_mlflow_loads_takes_no_row_and_names_what_a_frame_lacks() -> None:
-    loaded = LoggedVersion(EMPTY)
+    loaded = LoggedVersion(SIGNALS, EMPTY)
     frame: pd.DataFrame = empty_log().to_pandas()
     assert loaded.predict(frame).shape == (0, 1)
     with pytest.raises(InputError, match="the frame lacks ay_mps2"):

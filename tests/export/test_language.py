@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Equation,
@@ -28,8 +28,8 @@ from fleet_slip.catalogue.definitions import (
     Product,
     Slope,
 )
-from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.time_columns import Feature
+from fleet_slip.catalog.facts import NumberName
+from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.export.compile import (
     Sample,
@@ -46,6 +46,7 @@ from tests.export import plain
 from tests.export.compiled import build_driver, drive, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite, open_session, run_drives
 from tests.export.models import cars, export_texts
+from tests.support.catalog import CATALOG
 from tests.support.manifests import manifest
 
 SIGNALS = ("ay", "yaw_rate", "wheel_fl")
@@ -183,7 +184,7 @@ def models(draw: st.DrawFn) -> Manifest:
 def compiled(one: Manifest) -> Program:
     """The program; what divides by a constant that is not positive is no example."""
     try:
-        return compile_program(one)
+        return compile_program(CATALOG, one)
     except Exception as error:
         assume("divides by a number" not in str(error) and "uses no signal" not in str(error))
         assume("two ways" not in str(error))
@@ -287,17 +288,17 @@ def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
     values = data.draw(drives(program))
     samples = counts_of(program, values)
     expected = judged(program, car, samples)
-    assert angles_by_kernel(one, program, car, samples) == expected
+    assert angles_by_kernel(CATALOG.signals, one, program, car, samples) == expected
     if not program.numbers:
         assert by_warehouse(one, program, car, samples) == expected
-    estimator = Estimator(one, known(program, car))
+    estimator = Estimator(CATALOG, one, known(program, car))
     rows = [dict(zip(estimator.columns, row, strict=True)) for row in values]
     stepped = [estimator.step(row) for row in rows]
     assert close(in_counts(program, stepped), expected)
     told = {name: [value] * len(rows) for name, value in known(program, car).items()}
     missing = {n.name: [np.nan] * len(rows) for n in program.numbers}
     frame = {c: [row[c] for row in rows] for c in estimator.columns} | missing | told
-    predicted = ModelVersion(1, one, "0" * 64).predict(frame).tolist()
+    predicted = ModelVersion(1, one, "0" * 64, CATALOG).predict(frame).tolist()
     assert [None if np.isnan(x) else x for x in predicted] == stepped
 
 
@@ -316,7 +317,7 @@ def test_kernel_warehouse_and_estimator_are_what_the_interpreter_says(
 def test_exports_are_what_the_interpreter_says(
     one: Manifest, car: Car, data: st.DataObject, tmp_path: Path
 ) -> None:
-    program, version = compiled(one), ModelVersion(1, one, "0" * 64)
+    program, version = compiled(one), ModelVersion(1, one, "0" * 64, CATALOG)
     values = data.draw(st.lists(drives(program), min_size=3, max_size=3))
     samples = [counts_of(program, each) for each in values]
     expected = [judged(program, car, each) for each in samples]
@@ -375,8 +376,8 @@ def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) 
         coefficient=float(value), coefficient_exact=value,
     )  # fmt: skip
     made = manifest(name="any").model_copy(update={"terms": (term,)})
-    program = compile_program(made)
+    program = compile_program(CATALOG, made)
     samples: list[Sample] = [(n,) * len(program.signals) for n in (None, -3, 0, 7, 30000)]
-    assert angles_by_kernel(made, program, Car({}, {}), samples) == judged(
+    assert angles_by_kernel(CATALOG.signals, made, program, Car({}, {}), samples) == judged(
         program, Car({}, {}), samples
     )

@@ -8,7 +8,7 @@ import onnx
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.definitions import Definition
+from fleet_slip.catalog.definitions import Definition
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.compile import compile_program, drive_counts
 from fleet_slip.export.files import export_files
@@ -17,14 +17,15 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.engines import in_si, open_session, run_drives
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
 @pytest.mark.parametrize("name", MODELS)
 def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) -> None:
     manifest = model_of(MODELS[name], Fraction(-1, 700), name)
-    program, predictor = compile_program(manifest), Predictor.of(manifest)
-    version = ModelVersion(1, manifest, "0" * 64)
+    program, predictor = compile_program(CATALOG, manifest), Predictor.of(SIGNALS, manifest)
+    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
     samples = [hostile_drive(program, 250, seed) for seed in range(len(CARS))]
     expected = np.array(
         [
@@ -46,9 +47,9 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
     always = Definition(of="always", sql="CASE WHEN ay >= 0 THEN -(1000) END")
     monkeypatch.setitem(DEFINITIONS, "always", always)
     manifest = model_of({"always": Fraction(1, 7), "mean_3": Fraction(1, 9)})
-    program, predictor = compile_program(manifest), Predictor.of(manifest)
+    program, predictor = compile_program(CATALOG, manifest), Predictor.of(SIGNALS, manifest)
     samples = hostile_drive(program, 50, 1)
-    session = open_session(ModelVersion(1, manifest, "0" * 64), "float64")
+    session = open_session(ModelVersion(1, manifest, "0" * 64, CATALOG), "float64")
     found = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]
     expected = predictor(drive_counts(program, predictor, CARS[0], samples))
     assert np.isfinite(expected).any()
@@ -73,7 +74,7 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
     said = {one.key: one.value for one in model.metadata_props}
     assert (said["model"], said["sha256"]) == ("smoke@1", version.sha256)
     assert said["drives_sha256"] == version.manifest.trained_on.drives_sha256
-    program = compile_program(version.manifest)
+    program = compile_program(CATALOG, version.manifest)
     assert said["error"] == f"{error_bound(version, program, 'float32'):.3g} rad"
     assert files == export_files(version, fleet.warehouse, "onnx")
 
@@ -81,6 +82,6 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx")
-    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64)
+    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
     with pytest.raises(ConfigError, match=r"onnx. Run: pip install 'fleet-slip\[onnx\]'"):
         export_files(version, None, "onnx")

@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalogue.definitions import Combination, Definition
+from fleet_slip.catalog.definitions import Combination, Definition
 from fleet_slip.cli.app import app
 from fleet_slip.columns.operations import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError
@@ -21,6 +21,7 @@ from fleet_slip.export.stepping import Estimator
 from fleet_slip.storage.documents import checksum
 from tests.export import plain
 from tests.export.models import DEFINITIONS, LEARNING, MODELS, export_texts, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 
 def test_what_divides_by_a_constant_below_zero_has_no_program(
@@ -28,15 +29,15 @@ def test_what_divides_by_a_constant_below_zero_has_no_program(
 ) -> None:
     monkeypatch.setitem(DEFINITIONS, "by_minus_3", Definition(of="x", sql="ay // (-(3))"))
     with pytest.raises(QuestionError, match="not positive"):
-        compile_program(model_of({"by_minus_3": Fraction(1, 7)}))
+        compile_program(CATALOG, model_of({"by_minus_3": Fraction(1, 7)}))
 
 
 def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
     """Else the checks that travel with a program would check nothing of it."""
     for name in (*DEFINITIONS, *LEARNING):
         manifest = model_of({name: Fraction(1, 3)})
-        program = compile_program(manifest)
-        checks = make_checks(manifest, program)
+        program = compile_program(CATALOG, manifest)
+        checks = make_checks(SIGNALS, manifest, program)
         angles = {angle for check in checks for angle in check.angles}
         assert (None in angles) == (name not in ("slope", "one_below")), name  # always there
         assert len(angles) > (2 if name == "tyres" else 5), name
@@ -49,7 +50,7 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
 def test_steps_that_several_columns_are_made_of_stand_once() -> None:
     third = Fraction(1, 3)
     content = program_content(
-        compile_program(model_of({"mean_5": third, "below": third, "ay": third}))
+        compile_program(CATALOG, model_of({"mean_5": third, "below": third, "ay": third}))
     )
     steps = [tuple(one) for one in content["steps"]]
     assert len(steps) == len({*steps})
@@ -62,7 +63,7 @@ def test_steps_that_several_columns_are_made_of_stand_once() -> None:
 
 def test_a_running_mean_takes_no_more_than_its_most_values() -> None:
     """5 of ay's counts, then more: with a most of 2, they are the mean of the first two."""
-    content = program_content(compile_program(model_of({"ever": Fraction(1, 1000)})))
+    content = program_content(compile_program(CATALOG, model_of({"ever": Fraction(1, 1000)})))
     for step in content["steps"]:
         if step[0] in {"sum", "values"}:
             step[3] = 2
@@ -83,10 +84,10 @@ def test_what_needs_more_than_63_bits_has_no_program(
         manifest = model_of({"large": Fraction(1, 7)})
         if times > 2**43:
             with pytest.raises(QuestionError, match="63 bits"):
-                compile_program(manifest)
+                compile_program(CATALOG, manifest)
             continue
-        program = compile_program(manifest)
-        for check in make_checks(manifest, program):
+        program = compile_program(CATALOG, manifest)
+        for check in make_checks(SIGNALS, manifest, program):
             samples = list(check.samples)
             assert plain.angles(program_content(program), [], [], samples) == list(check.angles)
 
@@ -105,12 +106,12 @@ def test_a_feature_defined_in_two_ways_is_refused() -> None:
     other = Definition(of="change", sql="ay", of_bits=18, over="mean", ticks=2)
     term = manifest.terms[1].model_copy(update={"definition": other})
     with pytest.raises(QuestionError, match="two ways"):
-        compile_program(manifest.model_copy(update={"terms": (manifest.terms[0], term)}))
+        compile_program(CATALOG, manifest.model_copy(update={"terms": (manifest.terms[0], term)}))
 
 
 def test_the_angle_is_rounded_halves_up() -> None:
     """0.00005 rad for each of ay's counts, 0.001 m/s^2: 5 counts of the angle; halves of 1/2."""
-    program = compile_program(model_of({"ay": Fraction(1, 200)}))
+    program = compile_program(CATALOG, model_of({"ay": Fraction(1, 200)}))
     assert program.angle.bits > 40
     assert np.isclose(program.angle.terms[0][1] / 2**program.angle.bits, 0.5)
     found = plain.angles(program_content(program), [], [], [[-3], [-1], [0], [1], [3]])
@@ -124,7 +125,7 @@ def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
     name: str, sha256: str
 ) -> None:
     """Of programs of version 0.2.0: whoever compares two exports of a version finds no change."""
-    steps = [list(step) for step in compile_program(model_of(MODELS[name])).steps]
+    steps = [list(step) for step in compile_program(CATALOG, model_of(MODELS[name])).steps]
     assert sha256_of(canonical_json(steps)).startswith(sha256)
 
 
@@ -188,7 +189,7 @@ def test_the_command_writes_the_files_and_names_them(
 @pytest.mark.parametrize("ticks", [1, 3, 4, 5, 10**12])
 def test_ticks_that_are_skipped_are_missing(ticks: int) -> None:
     """A mean over 5 ticks: 1 m/s^2 before the hole, 3 m/s^2 after it."""
-    estimator = Estimator(model_of({"mean_5": Fraction(1)}))
+    estimator = Estimator(CATALOG, model_of({"mean_5": Fraction(1)}))
     for _ in range(5):
         estimator.step({"ay_mps2": 1.0})
     estimator.skip(ticks)
@@ -201,8 +202,8 @@ def test_ticks_that_are_skipped_are_missing(ticks: int) -> None:
 def test_what_is_missing_or_unknown_is_said() -> None:
     manifest = model_of({"ay": Fraction(1), "heavy": Fraction(1)})
     with pytest.raises(InputError, match=r"does not use adhesion of a car\. It uses: mass_kg"):
-        Estimator(manifest, {"adhesion": 1.0})
-    estimator = Estimator(manifest, {"mass_kg": 1500})
+        Estimator(CATALOG, manifest, {"adhesion": 1.0})
+    estimator = Estimator(CATALOG, manifest, {"mass_kg": 1500})
     with pytest.raises(InputError, match="needs ay_mps2 in every sample"):
         estimator.step({"ay": 3})
     with pytest.raises(InputError, match="is not a number"):
@@ -210,4 +211,4 @@ def test_what_is_missing_or_unknown_is_said() -> None:
     assert estimator.step({"ay_mps2": None}) is None
     assert estimator.step({"ay_mps2": float("inf")}) is None
     assert estimator.step({"ay_mps2": 1.0}) is not None
-    assert Estimator(manifest).step({"ay_mps2": 1.0}) is None
+    assert Estimator(CATALOG, manifest).step({"ay_mps2": 1.0}) is None

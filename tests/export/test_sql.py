@@ -17,13 +17,14 @@ from tests.export.models import (
     hostile_version,
     model_of,
 )
+from tests.support.catalog import CATALOG
 
 MANIFESTS = [model_of(of, name=name) for name, of in MODELS.items()] + [hostile_version().manifest]
 
 
 def test_the_statement_says_what_it_is_of() -> None:
     manifest = model_of(dict.fromkeys(DEFINITIONS, Fraction(1, 10**6)))
-    files = export_texts(ModelVersion(3, manifest, "ab" * 32), None, "sql")
+    files = export_texts(ModelVersion(3, manifest, "ab" * 32, CATALOG), None, "sql")
     for text in (files["sideslip_sideslip.sql"], files["sideslip_sideslip_macro.sql"]):
         assert text.startswith("-- sideslip@3: sideslip_rad")
         assert "ab" * 32 in text
@@ -33,7 +34,7 @@ def test_the_statement_says_what_it_is_of() -> None:
 def test_two_engines_give_the_angles_of_the_checks(tmp_path: Path, manifest: Manifest) -> None:
     """Every kind of column: `car` of the check `extremes` knows all facts and numbers."""
     name = manifest.name
-    files = export_texts(ModelVersion(1, manifest, "0" * 64), None, "sql")
+    files = export_texts(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "sql")
     checks = tmp_path / "checks.csv"
     checks.write_text(files[f"sideslip_{name}_checks.csv"])
     rows = pl.read_csv(checks, infer_schema_length=None)

@@ -4,6 +4,7 @@ What takes the place of npTDMS here is the reader with a hole that nobody knows 
 """
 
 import os
+import platform
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -33,11 +34,26 @@ def signal_parent(): os.kill(os.getppid(), 0)
 def signal_tester(): os.kill({pid}, 0)
 def read_environment(): os.environ["{variable}"]
 def read_tester(): open("/proc/{pid}/environ").read()
+def limit_tester(): resource.prlimit({pid}, resource.RLIMIT_CORE)
+def schedule_tester(): os.sched_setscheduler({pid}, os.SCHED_BATCH, os.sched_param(0))
+def schedule_itself(): os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+def slow_tester(): os.setpriority(os.PRIO_PROCESS, {pid}, 0)
+def move_tester(): os.sched_setaffinity({pid}, os.sched_getaffinity(0))
+def delay_tester(): call({ioprio_set}, 1, {pid}, 0)
+def handle_tester(): os.pidfd_open({pid})
+def make_memory(): os.memfd_create("x")
+def own_signals(): fcntl.fcntl(1, fcntl.F_SETOWN, {pid})
+def choose_signal(): fcntl.fcntl(1, 10, 9)
+def attach_memory(): call({shmctl}, 0, 0, 0)
 """
 
 
 FAKE = """
-import ctypes, json, os, socket, stat, struct, subprocess, sys, tempfile, time
+import ctypes, fcntl, json, os, resource, socket, stat, struct, subprocess, sys, tempfile, time
+def call(*numbers):
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.syscall(*numbers) < 0 and ctypes.get_errno() == 1:
+        raise PermissionError
 class log:
     class log_manager:
         set_level = staticmethod(print)
@@ -79,7 +95,9 @@ def test_a_reader_can_do_no_harm(
     secret = tmp_path / "secret"
     secret.write_text("secret")
     told = {"secret": str(secret), "folder": str(tmp_path), "port": 1, "pid": os.getpid()}
-    harm = HARM.format(**told, variable="SOME_TOKEN")
+    is_arm = platform.machine() == "aarch64"
+    numbers = {"ioprio_set": 30 if is_arm else 251, "shmctl": 195 if is_arm else 31}
+    harm = HARM.format(**told, **numbers, variable="SOME_TOKEN")
     names = [line.split("(")[0].removeprefix("def ") for line in harm.split("\n") if line]
     done = f"""
 def fail(): raise PermissionError
@@ -118,6 +136,24 @@ def test_what_a_reader_does_is_its_files_fault(
     monkeypatch.setattr(budget, "FREE_MEMORY", 2**26)
     monkeypatch.setattr(budget, "FREE_BYTES", 2**22)
     assert why in failure(fake_reader(harm), own_clock())
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        "[tempfile.TemporaryFile() for _ in range(8)]",
+        "[open(os.path.join(tempfile.gettempdir(), str(n)), 'wb') for n in range(8)]",
+    ],
+    ids=["deleted", "present"],
+)
+@pytest.mark.timeout(60)
+def test_temporary_files_are_bounded_together(
+    fake_reader: Any, monkeypatch: pytest.MonkeyPatch, files: str
+) -> None:
+    monkeypatch.setattr(budget, "FREE_BYTES", 2**22)
+    monkeypatch.setattr(budget, "FREE_S", 30)
+    harm = f"files = {files}\nfor file in files: file.write(bytes(2**20)), file.flush()\n"
+    assert "in a temporary file" in failure(fake_reader(f"{harm}time.sleep(100)"), own_clock())
 
 
 def test_what_a_reader_says_is_looked_at(fake_reader: Any) -> None:

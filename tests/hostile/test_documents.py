@@ -11,11 +11,12 @@ import pytest
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 from fleet_slip.models.registry import Registry
-from fleet_slip.resources import find_config
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.documents import DocumentFolder, checksum
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand
 from tests.support.logs import path_of
 from tests.support.manifests import manifest, publish
@@ -26,7 +27,7 @@ NAME = manifest().name
 @pytest.fixture
 def registry(tmp_path: Path) -> Registry:
     """A registry with one version."""
-    registry = Registry(LocalFolder(tmp_path / "models"))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     publish(registry, manifest())
     return registry
 
@@ -41,8 +42,8 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         document["content"][key] = part | value if isinstance(part, dict) else value
     if term:
         document["content"]["terms"][0] |= term
-    document["sha256"] = checksum(document["content"])
-    file.write_text(json.dumps(document))
+    file.unlink()
+    DocumentFolder(registry.root, f"models/{NAME}/{kind}").create(1, document["content"])
 
 
 @pytest.mark.parametrize(
@@ -135,7 +136,7 @@ def test_a_document_that_is_none_is_refused(registry: Registry, text: str) -> No
 
 
 def test_only_numbers_are_documents(registry: Registry) -> None:
-    folder = DocumentFolder(registry.folder / NAME / "versions")
+    folder = DocumentFolder(registry.root, f"models/{NAME}/versions")
     for stem in ("01", "0", "-1", "1e3", "٣", "9" * 200, "x"):
         (path_of(folder.folder) / f"{stem}.json").write_text("{}")
     assert folder.numbers() == [1]
@@ -189,7 +190,7 @@ def test_what_is_not_toml_is_refused_on_one_line(tmp_path: Path, content: bytes)
 @pytest.mark.parametrize("name", ["a\0.toml", "x" * 300, "x" * 5000 + ".toml", "..", "", "\ud800"])
 def test_a_name_that_no_file_can_have_is_unknown(name: str) -> None:
     with pytest.raises(ConfigError):
-        find_config("tracks", name)
+        SHIPPED_CONFIGS.find("tracks", name)
 
 
 @pytest.mark.parametrize("closed", ["true", "false"])
@@ -201,11 +202,11 @@ def test_a_track_of_any_length_takes_little_memory(
     file = tmp_path / "x.toml"
     file.write_text(TRACK.format(closed=closed, segments=segment))
     with pytest.raises(ConfigError, match="length_m"):
-        load_track(str(file))
+        load_track(str(file), SHIPPED_CONFIGS)
     half = "{length_m = 9e5, curvature_1pm = [0.0, 0.0]}"
     file.write_text(TRACK.format(closed=closed, segments=f"{half}, {half}"))
     with pytest.raises(ConfigError, match="long"):
-        load_track(str(file))
+        load_track(str(file), SHIPPED_CONFIGS)
 
 
 @pytest.mark.parametrize("curvature", ["1.1", "-1e308", "inf", "nan"])
@@ -214,14 +215,14 @@ def test_a_track_bends_no_more_than_a_car_can(tmp_path: Path, curvature: str) ->
     file = tmp_path / "x.toml"
     file.write_text(TRACK.format(closed="true", segments=segment))
     with pytest.raises(ConfigError, match="curvature_1pm"):
-        load_track(str(file))
+        load_track(str(file), SHIPPED_CONFIGS)
 
 
 def test_of_many_faults_the_first_are_told(tmp_path: Path) -> None:
     file = tmp_path / "x.toml"
     file.write_text("\n".join(f"{'k' * 500}{i} = 1" for i in range(500)))
     with pytest.raises(ConfigError, match=r"and 49\d more") as raised:
-        load_track(str(file))
+        load_track(str(file), SHIPPED_CONFIGS)
     assert len(str(raised.value)) < 5000
 
 

@@ -20,10 +20,12 @@ from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.models.acceptance import Floor
 from fleet_slip.models.registry import Registry
-from fleet_slip.resources import CONFIG_VARIABLE, config_file, find_config
+from fleet_slip.resources import Configs
+from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, within
 from tests.support.logs import ask, land, log_rows, path_of, random_counts
 from tests.support.manifests import manifest, publish
@@ -115,7 +117,7 @@ def test_nobody_gets_more_rights_than_the_umask_gives(tmp_path: Path, umask: int
         warehouse = Warehouse(LocalFolder(tmp_path / "data"))
         land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
         update_grams(warehouse, no_progress)
-        publish(Registry(warehouse.root / "models"), manifest())
+        publish(Registry(warehouse.root, CATALOG), manifest())
     finally:
         os.umask(old)
     files = [*path_of(warehouse.root).rglob("*")]
@@ -170,32 +172,27 @@ def test_a_file_is_read_up_to_a_size(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("target", ["nowhere", "publish.toml", "/dev/null", "."])
 def test_a_config_that_cannot_be_read_is_not_replaced_by_the_shipped_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
+    tmp_path: Path, target: str
 ) -> None:
-    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
     (tmp_path / "publish.toml").symlink_to(target)
     with pytest.raises(ConfigError, match=r"publish\.toml"):
-        load_config(config_file("publish.toml"), Floor)
+        load_config(Configs(tmp_path).file("publish.toml"), Floor)
 
 
-def test_a_named_config_that_leads_nowhere_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
+def test_a_named_config_that_leads_nowhere_is_told(tmp_path: Path) -> None:
     (tmp_path / "campaigns").mkdir()
     (tmp_path / "campaigns" / "smoke.toml").symlink_to("nowhere")
     with pytest.raises(ConfigError, match="a link to a file that does not exist"):
-        read_named_file(find_config("campaigns", "smoke"))
+        read_named_file(Configs(tmp_path).find("campaigns", "smoke"))
 
 
 @pytest.mark.parametrize("kind", ["models", "mappings"])
 def test_a_folder_of_configs_that_leads_nowhere_does_not_count_as_empty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+    tmp_path: Path, kind: str
 ) -> None:
-    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
     (tmp_path / kind).symlink_to("nowhere")
     with pytest.raises(ConfigError, match=f"{kind}: not a folder that can be read"):
-        find_config("campaigns", "smoke")
+        Configs(tmp_path)
 
 
 def test_a_pipe_given_to_a_command_is_refused_at_once(
@@ -205,6 +202,21 @@ def test_a_pipe_given_to_a_command_is_refused_at_once(
     done = run_command("ingest", str(tmp_path / "pipe"))
     assert done.exit_code == InputError.exit_code
     assert "pipe" in done.stderr
+
+
+@pytest.mark.timeout(60)
+def test_a_sparse_file_is_refused_before_it_is_read(warehouse: Warehouse, tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text("t,ax\n")
+    os.truncate(file, 10**11)
+    with pytest.raises(InputError, match="100,000,000,000 bytes, but only"):
+        ingest_file(warehouse, file, a_mapping())
+
+
+def test_a_clock_before_1970_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.time", lambda: -86400.0)
+    with pytest.raises(StorageError, match="before 1970"):
+        data_root(tmp_path)
 
 
 def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(
@@ -281,7 +293,7 @@ def test_a_document_is_read_from_a_file_only(
     tmp_path: Path, place: Place, file: str, run_command: RunCommand
 ) -> None:
     """Even a link to the very document: tomorrow it may lead to another."""
-    publish(Registry(LocalFolder(tmp_path / "data/models")), manifest())
+    publish(Registry(LocalFolder(tmp_path / "data"), CATALOG), manifest())
     document = tmp_path / "data/models/sideslip" / file
     content = document.read_text()
     other = place(document)

@@ -20,9 +20,16 @@ from hypothesis import strategies as st
 from fleet_slip.base import no_progress
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.job import update_grams
+from fleet_slip.storage.checksums import check_local_files
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.database import database_errors, interruptible, one_query
+from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS
+from fleet_slip.warehouse.database import (
+    check_opened_files,
+    database_errors,
+    interruptible,
+    one_query,
+)
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
@@ -108,6 +115,54 @@ def test_what_writes_is_refused_and_has_not_run(root: Path) -> None:
     assert contents(root) == before
 
 
+UNLISTED = {
+    "SELECT write_log('x', log_type := 'FileSystem')": "write_log",
+    "SELECT system.main.WRITE_LOG('x')": "write_log",
+    "SELECT 1 LIMIT write_log('x')": "write_log",
+    "SELECT list_transform([1], lambda x: sleep_ms(x))": "sleep_ms",
+    "SELECT sum(1) OVER (ORDER BY nextval('x'))": "nextval",
+    "EXPLAIN ANALYZE SELECT pg_sleep(1)": "pg_sleep",
+    "SELECT current_setting('home_directory')": "current_setting",
+    "SELECT getvariable('log_files')": "getvariable",
+    "FROM duckdb_logs()": "duckdb_logs",
+    "FROM truncate_duckdb_logs()": "truncate_duckdb_logs",
+    "FROM read_text('/etc/passwd')": "read_text",
+}
+
+
+@pytest.mark.parametrize("query", UNLISTED)
+def test_a_function_that_is_not_listed_is_refused_by_name(query: str) -> None:
+    with (
+        duckdb.connect() as database,
+        pytest.raises(QuestionError, match=f"function '{UNLISTED[query]}' cannot be called"),
+    ):
+        one_query(database, query)
+
+
+def test_listed_functions_are_those_of_duckdb_that_only_compute() -> None:
+    with duckdb.connect() as database:
+        query = "SELECT function_name, stability FROM duckdb_functions()"
+        functions = database.execute(query).fetchall()
+    names = {name.lower() for name, _ in functions}
+    assert names >= TABLE_FUNCTIONS
+    assert QUERY_FUNCTIONS - names == {"ifnull", "nvl"}  # which its parser replaces
+    acting = {name for name, stability in functions if stability == "VOLATILE"}
+    assert acting & QUERY_FUNCTIONS == {"error", "random"}
+
+
+def test_a_forged_log_of_opened_files_opens_no_pipe(root: Path, tmp_path: Path) -> None:
+    names = [tmp_path / f"{kind}-x{'0' * 16}-{'0' * 32}.parquet" for kind in ("pipe", "file")]
+    os.mkfifo(names[0])
+    names[1].write_text("not the content that the name states")
+    with connect(root, query="log") as database:
+        for name in names:
+            message = f'{{"fs":"LocalFileSystem","path":"{name}","op":"OPEN"}}'
+            database.execute("SELECT write_log($m, log_type := 'FileSystem')", {"m": message})
+        check_opened_files(database)
+    with pytest.raises(StorageError, match="not a regular file"):
+        check_local_files([str(names[0])])
+
+
 READS = (
     "FROM drives",
     "EXPLAIN SELECT 1",
@@ -125,6 +180,11 @@ READS = (
     "SELECT 'COPY x TO y; DROP TABLE z'",
     "FROM duckdb_columns() WHERE NOT internal",
     "SELECT unnest(sums) FROM grams;",
+    "SELECT [n + 1 for n in [1, 2] if n > 1], {'a': 1}.a, MAP {'a': 1}['a'], 'abc'[1:2]",
+    "SELECT DATE '2024-05-31' + INTERVAL 3 DAY, EXTRACT(day FROM now()), 2 ** 3, 3!, 'a' ~ 'b'",
+    "SELECT 'a' SIMILAR TO 'b', position('a' IN 'b'), trim(both 'x' FROM 'y'), ifnull(NULL, 1)",
+    "SELECT quantile_cont(n, 0.5), mode() WITHIN GROUP (ORDER BY n) FROM range(3) t(n)",
+    "SELECT rank() OVER (ORDER BY n), sum(n) FILTER (n > 1) OVER () FROM range(3) t(n)",
 )
 
 

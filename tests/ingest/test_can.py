@@ -27,6 +27,7 @@ from fleet_slip.ingest.formats.can import (
 )
 from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.mapping import load_mapping
+from tests.support.catalog import CATALOG
 from tests.support.logs import without_names
 from tests.support.measured import MeasuredLog, read_measured, ticks
 from tests.support.reported import call
@@ -95,7 +96,7 @@ def read(
 ) -> MeasuredLog:
     (file.parent / name).write_text(database)
     (file.parent / "bus.toml").write_text(text)
-    return read_measured(file, load_mapping(str(file.parent / "bus.toml")))
+    return read_measured(file, load_mapping(str(file.parent / "bus.toml"), CATALOG))
 
 
 def failure(file: Path, *arguments: str) -> str:

@@ -18,6 +18,7 @@ from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS
 from fleet_slip.ingest.vocabulary import unit_called
+from tests.support.catalog import CATALOG
 from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
@@ -49,7 +50,7 @@ def suggest(folder: Path, file: Path, *options: str) -> dict[str, Any]:
     call(folder / "root", "mapping", "suggest", str(file), "--output", str(written), *options)
     text = filled_in(written.read_text())
     written.write_text(text)
-    log = read_measured(file, load_mapping(str(written)))
+    log = read_measured(file, load_mapping(str(written), CATALOG))
     assert log.counts.quarantined == {}
     return tomllib.loads(text)
 
@@ -76,7 +77,7 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     assert '# Choose the unit: "m/s" or "km/h" or "mph".\nvehicle_speed = {' in text
     (tmp_path / "draft.toml").write_text(filled_in(text[text.index("name = ") :], units=False))
     with pytest.raises(ConfigError, match="no unit in the file: write the right one"):
-        load_mapping(str(tmp_path / "draft.toml"))
+        load_mapping(str(tmp_path / "draft.toml"), CATALOG)
 
 
 _AXLE = "Vehicle.Chassis.Axle.Row"
@@ -228,7 +229,7 @@ def test_a_strangers_log_becomes_the_drives_that_it_has(tmp_path: Path, name: st
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / name)).partition("\n# A draft")[2]
     mapping = tmp_path / "draft.toml"
     mapping.write_text(f"# {filled_in(text)}", encoding="utf-8")
-    found, counts = read(tmp_path / name, load_mapping(str(mapping)))
+    found, counts = read(tmp_path / name, load_mapping(str(mapping), CATALOG))
     assert counts.quarantined == {}
     assert len(found) == drives
     for number, drive in enumerate(found):
@@ -272,7 +273,7 @@ def test_date_and_time_stand_in_columns_of_their_own(tmp_path: Path, column: str
     text = draft.partition("\n# A draft")[2]
     assert "# day = " not in text
     (tmp_path / "m.toml").write_text(f"# {filled_in(text)}", encoding="utf-8")
-    mapping = load_mapping(str(tmp_path / "m.toml"))
+    mapping = load_mapping(str(tmp_path / "m.toml"), CATALOG)
     (drive,), counts = read(tmp_path / "log.csv", mapping)
     assert drive.metadata["started_at"] == start
     assert (counts.rows_kept, counts.ticks, counts.quarantined) == (ROWS, ROWS, {})
@@ -284,7 +285,7 @@ def test_a_rate_that_is_assumed_is_said_at_each_ingest(tmp_path: Path) -> None:
         2
     ]
     (tmp_path / "m.toml").write_text(f"# {filled_in(text)}", encoding="utf-8")
-    assert load_mapping(str(tmp_path / "m.toml")).time.assumed
+    assert load_mapping(str(tmp_path / "m.toml"), CATALOG).time.assumed
     words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "m.toml"))
     with pytest.raises(AlarmError, match="100 Hz is assumed"):
         call(tmp_path / "root", *words)

@@ -1,20 +1,18 @@
 """Signals that some cars log besides: stored where they are, and known to features alone."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
-from fleet_slip.errors import RefusedError
+from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.grams.compute import by_sql
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
-from fleet_slip.resources import CONFIG_VARIABLE, folder
+from fleet_slip.resources import folder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.logs import ask
 from tests.support.measured import a_mapping, csv_text, ingest_file, physical, read_columns, ticks
 
@@ -77,13 +75,6 @@ def write(file: Path, seed: int = 0) -> Path:
     return file
 
 
-@pytest.fixture
-def clear_caches() -> Iterator[None]:
-    yield
-    catalogue.cache_clear()
-    features.cache_clear()
-
-
 def test_extras_are_stored_in_their_units(tmp_path: Path) -> None:
     log = read_columns(tmp_path, columns_of(), a_mapping(signals={**PLAIN, **EXTRA}))
     assert physical(log, "brake_pressure", 1000)[:3] == pytest.approx([0, 1e5, 2e5])
@@ -121,7 +112,7 @@ def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
 ) -> None:
     ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
     (plain,) = warehouse.logs.snapshot().files
-    assert not set(catalogue().extras) & set(plain.null_counts)
+    assert not set(SIGNALS.extras) & set(plain.null_counts)
     assert ask(warehouse.root, "SELECT count(*), count(steer), count(gear) FROM log_counts") == [
         (ROWS, 0, 0)
     ]
@@ -139,16 +130,11 @@ def test_a_file_has_the_columns_of_extras_only_where_a_drive_has_them(
     assert not list(verify(warehouse, full=True).damage)
 
 
-def test_features_may_use_extras(
-    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clear_caches: None
-) -> None:
-    known = {name: features().identity(name) for name in ("signals", *features().sets)}
-    own = tmp_path / "configs"
-    own.mkdir()
-    (own / "features.toml").write_text(OWN_FEATURES, encoding="utf-8")
-    monkeypatch.setenv(CONFIG_VARIABLE, str(own))
-    features.cache_clear()
-    assert {name: features().identity(name) for name in known} == known
+def test_features_may_use_extras(warehouse: Warehouse, tmp_path: Path) -> None:
+    shipped = {name: CATALOG.identity(name) for name in ("signals", *CATALOG.sets)}
+    configs = configs_with(tmp_path / "configs", features=OWN_FEATURES)
+    warehouse = Warehouse(warehouse.root, configs)
+    assert {name: warehouse.catalog.identity(name) for name in shipped} == shipped
     ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
     ingest_file(
         warehouse,
@@ -176,20 +162,20 @@ def test_features_may_use_extras(
 
 
 def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_the_rest(
-    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clear_caches: None
+    warehouse: Warehouse, tmp_path: Path
 ) -> None:
     shipped = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
     before, _, rest = shipped.partition("[signals.steer]\n")
-    old = tmp_path / "signals.toml"  # without the extras but those that shipped feature sets are of
-    old.write_text(before + rest[rest.index("[signals.course]") :], encoding="utf-8")
-    monkeypatch.setenv(CATALOGUE_VARIABLE, str(old))
-    catalogue.cache_clear()
-    ingest_file(warehouse, write(tmp_path / "a.csv"), a_mapping(signals=PLAIN))
-    update_grams(warehouse)
-    grams = ask(warehouse.root, "SELECT * FROM grams")
-    monkeypatch.delenv(CATALOGUE_VARIABLE)
-    catalogue.cache_clear()
+    # Without the extras but those that shipped feature sets are of.
+    signals = before + rest[rest.index("[signals.course]") :]
+    old = Warehouse(warehouse.root, configs_with(tmp_path / "configs", signals=signals))
+    of_old = a_mapping(signals=PLAIN, catalog=old.catalog)
+    ingest_file(old, write(tmp_path / "a.csv"), of_old)
+    update_grams(old)
+    grams = ask(old, "SELECT * FROM grams")
     now = Warehouse(warehouse.root)
+    with pytest.raises(ConfigError, match="loaded with other signals"):
+        ingest_file(now, write(tmp_path / "b.csv", 1), of_old)
     assert ask(now.root, "SELECT * FROM grams") == grams
     assert update_grams(now).files_read == 0
     ingest_file(now, write(tmp_path / "b.csv", 1), a_mapping(signals=PLAIN))

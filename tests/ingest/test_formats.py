@@ -25,6 +25,7 @@ from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import profile_file
+from tests.support.catalog import SIGNALS
 from tests.support.fuzz import logs
 from tests.support.fuzz.logs import FORMATS, sound_file
 from tests.support.measured import (
@@ -268,7 +269,7 @@ def test_matlab(tmp_path: Path, write: Callable[[Path, dict[str, Any]], None]) -
     log = read_measured(file, own)
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     assert log.drives["sideslip"].drop_null().to_pylist() == BETA_COUNTS[::2]
-    draft = write_draft(draft_mapping(file, profile_file(file)), "draft")
+    draft = write_draft(draft_mapping(SIGNALS, file, profile_file(file)), "draft")
     assert 'ax = { column = "Data.Vehicle.ax", ' in draft
     absent = mat_mapping(signals=signals("Data.Vehicle.ay", "gps.beta"))
     assert "Did the mapping mean 'Data.Vehicle.ax'" in failure(file, absent)

@@ -9,17 +9,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
-from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
 from fleet_slip.ingest.resampling import build_resampler
 from fleet_slip.ingest.suspicion import RADIUS_M
-from fleet_slip.resources import config_file, config_names
+from fleet_slip.resources import SHIPPED_CONFIGS
+from tests.support.catalog import CATALOG, configs_with
 from tests.support.measured import (
     a_mapping,
     good_columns,
@@ -45,16 +46,16 @@ STEER = 'steer_fl = { column = "steer_fl_deg", unit = "deg" }'
 WHEEL = 'wheel_fl = { column = "v", unit = "km/h", radius_m = 0.3 }'
 
 
-def load(folder: Path, text: str) -> Any:
+def load(folder: Path, text: str, catalog: Catalog = CATALOG) -> Any:
     file = folder / "m.toml"
     file.write_text(text, encoding="utf-8")
-    return load_mapping(str(file))
+    return load_mapping(str(file), catalog)
 
 
 def test_shipped_mappings_load() -> None:
-    names = config_names("mappings")
+    names = SHIPPED_CONFIGS.names("mappings")
     assert "race_car_250lm" in names
-    assert [load_mapping(name).name for name in names] == names
+    assert [load_mapping(name, CATALOG).name for name in names] == names
 
 
 def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
@@ -66,6 +67,11 @@ def test_a_mapping_without_a_radius_says_nothing_of_one(tmp_path: Path) -> None:
 def test_columns_are_listed_once(tmp_path: Path) -> None:
     text = GOOD.replace('"m" }', '{ column = "a" }, column = "run" }')
     assert load(tmp_path, text).time_bases() == {"t": ["t", "run", "a", "steer_fl_deg"]}
+
+
+def test_names_of_drives_are_normalized(tmp_path: Path) -> None:
+    text = GOOD.replace('"v"', '" Zoe\\u0308\\t"')
+    assert load(tmp_path, text).drive.vehicle_id == "Zo\u00eb"
 
 
 def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
@@ -96,6 +102,9 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('unit = "s"', 'unit = "s", longest_gap_s = nan', "time.longest_gap_s"),
         ("day = 2024-05-31, ", "", "drive.day is missing"),
         ("2024-05-31", '"tomorrow"', "drive.day"),
+        ('"v"', '"  "', "drive.vehicle_id: is empty"),
+        ('"v"', f'"{"v" * 201}"', "drive.vehicle_id: has more than 200 characters"),
+        ('"v"', '"v\\u001b"', "drive.vehicle_id: has characters that cannot be printed"),
         (
             'vehicle_id = "v"',
             "mass_kg = -1",
@@ -142,24 +151,17 @@ def test_mistakes_are_named_by_file_key_and_reason(
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="race_car_250lm"):
-        load_mapping("no_such_mapping")
+        load_mapping("no_such_mapping", CATALOG)
 
 
-def test_tyres_need_a_column_of_the_catalogue(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shipped = config_file("signals.toml").read_text(encoding="utf-8")
+def test_tyres_need_a_column_of_the_catalog(tmp_path: Path) -> None:
+    shipped = SHIPPED_CONFIGS.file("signals.toml").read_text(encoding="utf-8")
     start = shipped.index("[drive.tyres]")
     own = shipped[:start] + shipped[shipped.index("[drive.adhesion]") :]
-    (tmp_path / "signals.toml").write_text(own, encoding="utf-8")
-    monkeypatch.setenv("FLEET_SLIP_SIGNALS", str(tmp_path / "signals.toml"))
-    catalogue.cache_clear()
-    try:
-        with pytest.raises(ConfigError, match=r"drive\.tyres: the catalogue has no such drive"):
-            load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'))
-        assert load(tmp_path, GOOD)
-    finally:
-        catalogue.cache_clear()
+    catalog = load_catalog(configs_with(tmp_path / "configs", signals=own))
+    with pytest.raises(ConfigError, match=r"drive\.tyres: the catalog has no such drive"):
+        load(tmp_path, GOOD.replace('"m" }', '"m", tyres = "winter" }'), catalog)
+    assert load(tmp_path, GOOD, catalog)
 
 
 @pytest.mark.parametrize("fact", ["tyres", "receiver"])
@@ -353,6 +355,7 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
         ([{"column": "speed"}], "needs 'at_least', 'at_most' or 'one_of'"),
         ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "and not both"),
         ([{"column": "speed", "at_least": float("nan")}], "finite number"),
+        ([{"column": "speed", "at_least": 1}] * 65, "at most 64 items"),
     ],
 )
 def test_what_a_condition_cannot_be(where: Any, message: str) -> None:
@@ -397,3 +400,46 @@ def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
     short = {"longest_gap_s": 0.2, "split_gap_s": 2}
     whole = read_columns(tmp_path, rows, a_mapping(where=IGNITION, time=short))
     assert whole.counts.drives == 1
+
+
+PATTERN = st.text("*ab_.", max_size=9).flatmap(
+    lambda text: st.integers(0, len(text)).map(lambda place: f"{text[:place]}{{}}{text[place:]}")
+)
+
+
+@given(PATTERN, st.text("ab_.", max_size=14))
+@example("*a{}a*", "aaaaa")
+@example("{}*_", "a__")
+def test_a_pattern_matches_a_name_as_a_regular_expression_does(pattern: str, name: str) -> None:
+    meanings = {"{}": "(.+?)", "*": ".*"}
+    tokens = re.split(r"(\{\}|\*)", pattern)
+    expression = "".join(meanings.get(token, re.escape(token)) for token in tokens)
+    match = re.fullmatch(expression, name)
+    assert match_name(pattern, name) == (match and match[1])
+
+
+@pytest.mark.parametrize(
+    ("pattern", "path", "value"),
+    [
+        ("{}/*", "/logs/golf7/monday.csv", "golf7"),
+        ("{}/*", "/monday.csv", None),
+        ("golf*/{}.csv", "/logs/golf7/monday.csv", "monday"),
+        ("golf*/{}.csv", "/logs/polo/monday.csv", None),
+        ("*_{}.csv", "/logs/a_b_c.csv", "c"),
+        ("{}_*", "/logs/a_b_c.csv", "a"),
+        ("logs/{}", "/old_logs/monday.csv", None),
+        ("{}", "/logs/monday.csv", "monday.csv"),
+    ],
+)
+def test_a_pattern_matches_the_end_of_a_path(pattern: str, path: str, value: str | None) -> None:
+    if value is None:
+        with pytest.raises(InputError, match="does not end as in"):
+            FromPath(path=pattern).find(Path(path))
+    else:
+        assert FromPath(path=pattern).find(Path(path)) == value
+
+
+@pytest.mark.timeout(60)
+def test_a_pattern_of_many_stars_ends() -> None:
+    with pytest.raises(InputError, match="does not end as in"):
+        FromPath(path="*_" * 60 + "{}.csv").find(Path("/" + "_" * 205 + ".txt"))

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, stream
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (
     a_mapping,
@@ -32,7 +32,7 @@ from tests.support.measured import (
 
 def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
     log = read_columns(tmp_path, good_columns())
-    table = log.drives.cast(schema_without(catalogue().extras))
+    table = log.drives.cast(schema_without(SIGNALS.extras))
     first = table.slice(0, 1).to_pylist()[0]
     known = {
         "day": date(2024, 5, 31),
@@ -162,7 +162,7 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
     ]
     assert log.quarantine["drive_id"].null_count == 3
     drives = (
-        log.drives.cast(schema_without(catalogue().extras))
+        log.drives.cast(schema_without(SIGNALS.extras))
         .group_by(["drive_id", "day", "vehicle_id", "mass_kg"])
         .aggregate([("tick", "count"), ("ax", "min")])
     )
@@ -174,6 +174,16 @@ def test_drives_from_columns_may_alternate(tmp_path: Path) -> None:
         (date(2024, 6, 1), "b", 1740.5, 6, 13000),
     ]
     assert log.drives["drive_id"].to_pylist() == sorted(log.drives["drive_id"].to_pylist())
+
+
+def test_names_are_normalized_and_checked(tmp_path: Path) -> None:
+    columns = good_columns(16)
+    names = [" Zoe\u0308 ", "Zo\u00eb", "V\x1b[2J", "V" * 201]
+    columns["car"] = [name for name in names for _ in range(4)]
+    log = read_columns(tmp_path, columns, a_mapping(drive={"vehicle_id": {"column": "car"}}))
+    assert set(log.drives["vehicle_id"].to_pylist()) == {"Zo\u00eb"}
+    assert len(set(log.drives["drive_id"].to_pylist())) == 1
+    assert reasons(log) == [(row, "out_of_range", "vehicle_id") for row in range(9, 17)]
 
 
 def test_the_column_of_drives_may_hold_numbers(tmp_path: Path) -> None:
@@ -364,7 +374,7 @@ def test_the_worked_example_of_the_docs(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "ingest.md").read_text(encoding="utf-8")
     log_text, mapping_text = (block.partition("\n")[2] for block in text.split("```")[1:4:2])
     (tmp_path / "m.toml").write_text(mapping_text)
-    log = read_text(tmp_path, log_text, load_mapping(str(tmp_path / "m.toml")))
+    log = read_text(tmp_path, log_text, load_mapping(str(tmp_path / "m.toml"), CATALOG))
     assert reasons(log) == [(4, "out_of_range", "ay")]
     assert set(log.drives["vehicle_id"].to_pylist()) == {"A7"}
     g = 9.80665

@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.sql import column_query
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
@@ -18,6 +16,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.measured import csv_text, ingest_file
 from tests.support.reported import call
 
@@ -61,13 +60,13 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
     file = tmp_path / "lap.csv"
     file.write_text(csv_text(columns))
     warehouse = Warehouse(LocalFolder(tmp_path / "data"))
-    report = ingest_file(warehouse, file, load_mapping("race_car_250lm"))
+    report = ingest_file(warehouse, file, load_mapping("race_car_250lm", CATALOG))
     assert (report.counts.rows_kept, report.counts.ticks, report.counts.drives) == (
         20_000,
         20_000,
         1,
     )
-    again = ingest_file(warehouse, file, load_mapping("race_car_250lm"))
+    again = ingest_file(warehouse, file, load_mapping("race_car_250lm", CATALOG))
     assert [(one.new, one.drives_forgotten) for one in (report, again)] == [(True, 0), (False, 0)]
     update_grams(warehouse)
     with connect(warehouse.root, query="drives, log") as database:
@@ -80,13 +79,13 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
         ("steer_fl", "steer_fl_deg", np.pi / 180),
         ("vx", "vx_kmh", 1 / 3.6),
     ):
-        signal = catalogue()[name]
+        signal = SIGNALS[name]
         half_a_count = 0.5001 * float(signal.scale)
         given = np.array(columns[column]) * unit
         np.testing.assert_allclose(rows[signal.column], given, rtol=0, atol=half_a_count)
     (table,) = load_cohort(warehouse).tables
     fitted = fit(table.total(), list(COEFFICIENTS), "sideslip")
-    scales = {name: s.exact_scale for name, s in catalogue().signals.items()}
+    scales = {name: s.exact_scale for name, s in SIGNALS.signals.items()}
     for estimate, true in zip(
         infer_classically(fitted, scales).estimates, [OFFSET, *COEFFICIENTS.values()], strict=True
     ):
@@ -142,14 +141,16 @@ def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_t
 
 def first_to_last_minute_deg(root: Path) -> float:
     """Fit to the first minute by numpy on the columns as SQL defines them, and test on the rest."""
-    known = features()
     with connect(LocalFolder(root), query="log_counts") as database:
         columns = [
-            np.array(database.sql(column_query(known, name)).fetchnumpy()[name], dtype=np.float64)
+            np.array(
+                database.sql(column_query(CATALOG, name)).fetchnumpy()[name],
+                dtype=np.float64,
+            )
             for name in REMEMBERED
         ]
         log = database.sql("SELECT * FROM log_counts ORDER BY tick").fetchnumpy()
-    beta = np.asarray(log["sideslip"], dtype=np.float64) * float(catalogue()["sideslip"].scale)
+    beta = np.asarray(log["sideslip"], dtype=np.float64) * float(SIGNALS["sideslip"].scale)
     last = np.asarray(log["tick"], dtype=np.int64) >= 6000
     matrix = np.column_stack([np.ones(len(beta)), *(c / np.abs(c).max() for c in columns)])
     weights = np.linalg.lstsq(matrix[~last], beta[~last], rcond=None)[0]

@@ -18,12 +18,12 @@ import pytest
 from asammdf import MDF, Signal
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import SignalColumn, conversion_factor
 from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.profile import profile_file
 from fleet_slip.ingest.suspicion import RADIUS_M
+from tests.support.catalog import SIGNALS
 from tests.support.textbook_car import a_car
 
 NAMES = Path(__file__).parents[1] / "data" / "stranger_names.csv"
@@ -58,7 +58,7 @@ def score(columns: list[Named], folder: Path) -> Counter[str]:
     file = folder / f"{columns[0].log}.{'mf4' if columns[0].layout == 'mdf' else 'csv'}"
     _write(file, columns)
     try:
-        text = write_draft(draft_mapping(file, profile_file(file)), "draft")
+        text = write_draft(draft_mapping(SIGNALS, file, profile_file(file)), "draft")
     except InputError:
         return Counter(missing=sum(bool(column.signal) for column in columns))
     return _judge(columns, text)
@@ -94,7 +94,7 @@ def _is_right(column: Named, keys: dict[str, Any]) -> bool:
     if column.sign and keys.get("sign", {}).get("column") != column.sign:
         return False
     told = {key: value for key, value in keys.items() if key != "longest_gap_s"}
-    si_unit = catalogue()[column.signal].unit
+    si_unit = SIGNALS[column.signal].unit
     try:
         gain, _ = SignalColumn.model_validate(told).linear(si_unit)
     except ValueError:
@@ -114,7 +114,7 @@ def _header(column: Named) -> str:
 
 def _per_si(column: Named) -> float:
     """Return what one SI unit is in the file."""
-    si_unit = catalogue()[column.signal].unit
+    si_unit = SIGNALS[column.signal].unit
     if column.signal.startswith("wheel_") and column.measured_in in {"m/s", "km/h"}:
         return RADIUS_M / conversion_factor(column.measured_in, "m/s")
     return 1 / conversion_factor(column.measured_in, si_unit)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.mapping import Mapping, load_mapping
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.measured import DRIVE, failure, own_clock, physical, read_measured, reasons
 from tests.support.reported import call
 
@@ -174,11 +174,11 @@ def test_the_mapping_of_the_page_is_one(tmp_path: Path) -> None:
         f'name = "page"\n{toml}[drive]\nvehicle_id = "A"\nvehicle_model = "m"\n'
     )
     write(tmp_path / "a.vbo", head=HEAD.replace("knots", "kmh").replace(" Yaw\n", " YawRate\n"))
-    log = read_measured(tmp_path / "a.vbo", load_mapping(str(tmp_path / "page.toml")))
+    log = read_measured(tmp_path / "a.vbo", load_mapping(str(tmp_path / "page.toml"), CATALOG))
     assert log.counts.rows_kept == ROWS
     # Values that stay are those of one fix, which stands in its first row.
     assert physical(log, "satellite_speed", 0.005)[0] == pytest.approx(40 / 3.6, abs=0.003)
-    course = physical(log, "course", float(catalogue()["course"].scale))[0]
+    course = physical(log, "course", float(SIGNALS["course"].scale))[0]
     assert math.sin(course - math.radians(90 - 93.5)) == pytest.approx(0, abs=2e-4)
 
 

@@ -8,11 +8,11 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.models.manifest import Manifest
 from tests.export.compiled import START_S, build, needs_cc
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counted_rows import rows_of_messages, write_counted
 
 CAMPAIGN = """
@@ -115,16 +115,16 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
 ) -> None:
     """What they count on board, and nothing else; a drive is told in some kilobytes."""
     taught = without_label(fleet)
-    counter = build(tmp_path, sets_on_board(taught), "-O0")
+    counter = build(tmp_path, sets_on_board(CATALOG, taught), "-O0")
     logged = fleet.sql(
         "SELECT drive_id, any_value(course_late) FROM grams "
         "WHERE course_late IS NOT NULL GROUP BY drive_id ORDER BY drive_id"
     ).fetchall()
-    columns = ", ".join(name for name in counter.signals if name != catalogue().label)
+    columns = ", ".join(name for name in counter.signals if name != SIGNALS.label)
     sent = []
     for number, (drive, late) in enumerate(logged):
         rows = fleet.sql(
-            f"SELECT tick, vehicle_id, {columns}, NULL::SMALLINT AS {catalogue().label} "
+            f"SELECT tick, vehicle_id, {columns}, NULL::SMALLINT AS {SIGNALS.label} "
             f"FROM log_counts WHERE drive_id = '{drive}' ORDER BY tick"
         )
         sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))

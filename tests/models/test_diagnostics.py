@@ -10,16 +10,17 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip import open as open_fleet
-from fleet_slip.catalogue.features import input_scales
+from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.models import label_quality as uncertainty
 from fleet_slip.models.diagnose import diagnose
 from fleet_slip.models.label_quality import label_noise_deg
 from fleet_slip.models.publish import manifest_of
 from fleet_slip.regression.drives import ClusterUnit
+from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.counts import INPUTS, LABEL, by_rows, cohort_of, dense_fit, driven, rows_of
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
@@ -30,7 +31,7 @@ def test_figures_are_those_of_the_rows() -> None:
     found = diagnose(cohort_of(drives), INPUTS)
     rows = rows_of(drives).astype(float)
     b, rss = dense_fit(rows)
-    scales = input_scales()
+    scales = CATALOG.input_scales
     units = [float(scales[LABEL] / scales[name]) for name in INPUTS]
     slopes = [estimate.value for estimate in found.naive.estimates[1:]]
     np.testing.assert_allclose(slopes, b[1:] * units, rtol=1e-9)
@@ -52,7 +53,7 @@ def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> No
     drives = driven(9, COEFFICIENTS, drives=22, rows=30)
     cohort = cohort_of(drives)
     owners = cohort.drives["vehicle_id"].to_pylist()
-    units = [float(input_scales()[LABEL] / input_scales()[name]) for name in INPUTS]
+    units = [float(CATALOG.input_scales[LABEL] / CATALOG.input_scales[name]) for name in INPUTS]
     for cluster, groups in (("vehicle", owners), ("drive", [one.drive for one in drives])):
         parts = [
             rows_of([d for d, of in zip(drives, groups, strict=True) if of == group])
@@ -97,8 +98,11 @@ def test_a_selection_and_its_manifest_tell_it(smoke_root: Path) -> None:
 
 
 def test_nobody_knows_the_noise_of_a_campaign_that_is_not_there(
-    smoke_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    smoke_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(uncertainty, "find_config", lambda *_: tmp_path / "none.toml")
+    def find(_: Configs, kind: str, name: str) -> Path:
+        raise ConfigError(f"{kind}: nothing is called {name!r}.")
+
+    monkeypatch.setattr(Configs, "find", find)
     warehouse = Warehouse(LocalFolder(smoke_root))
     assert label_noise_deg(warehouse, load_cohort(warehouse)) is None

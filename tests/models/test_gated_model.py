@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import Registry
@@ -14,6 +12,7 @@ from fleet_slip.regression import least_squares as exact
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.once import made_once
 from tests.support.reported import answer
 
@@ -37,7 +36,7 @@ signals = [{plain}, "ax_mean", "yaw_rate_mean", {gates}]
 def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("lists") / "gates.toml"
     plain = ", ".join(f'"{name}"' for name in PLAIN.split(", "))
-    low = [name for name in features().members("excess") if name.endswith(("_1", "_2"))]
+    low = [name for name in CATALOG.members("excess") if name.endswith(("_1", "_2"))]
     gates = ", ".join(f'"{name}"' for name in low)  # the drives are too gentle for the upper knots
     file.write_text(LIST.format(plain=plain, gates=gates))
     return file
@@ -60,24 +59,22 @@ def test_select_says_what_the_gate_buys(root: Path, models: Path) -> None:
 
 
 def test_gates_stand_in_the_manifest_as_they_are_defined(root: Path) -> None:
-    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    manifest = Registry(LocalFolder(root), CATALOG).resolve("roads").manifest
     gates = [term.definition.gate for term in manifest.terms if term.definition]
     opened = [gate for gate in gates if gate]
     assert {gate.by.of for gate in opened} == {"steering_excess"}
     assert manifest.selected_by.model == "gated"
-    assert len(opened) == 2 * len(features().gates["excess"].columns)
+    assert len(opened) == 2 * len(CATALOG.file.gates["excess"].columns)
 
 
 def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     """Every row of every drive, computed again from the logs, against sums of Gram rows."""
     warehouse = Warehouse(LocalFolder(root))
-    manifest = Registry(LocalFolder(root / "models")).resolve("roads").manifest
+    manifest = Registry(LocalFolder(root), CATALOG).resolve("roads").manifest
     cohort = load_cohort(warehouse, "true", "gated")
     total = cohort.serving(manifest.signals).table.total()
     fitted = exact.fit(total, manifest.signals, manifest.label.signal)
-    figures = error_sums(fitted.model, total).figures(
-        catalogue()[manifest.label.signal].exact_scale
-    )
+    figures = error_sums(fitted.model, total).figures(SIGNALS[manifest.label.signal].exact_scale)
     scored = answer(root, "score", "roads", "--cohort", "true")
     assert scored["rows"] == figures.rows
     assert scored["rmse_deg"] == pytest.approx(figures.rmse_deg, rel=1e-9)

@@ -1,9 +1,7 @@
 """Two stages: a line that is fitted first, and one whose columns have its estimate."""
 
 import json
-import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +9,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.definitions import Combination
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.lines import (
-    FittedLine,
-    _lines,
-    _sources,
-    known_line,
-    look_for_lines,
-    whole_line,
-)
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.definitions import Combination
+from fleet_slip.catalog.lines import FittedLine, whole_line
 from fleet_slip.columns.drive_columns import compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, StorageError
@@ -30,8 +19,8 @@ from fleet_slip.export.files import program_content
 from fleet_slip.grams.compute import read_drives
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.resources import CONFIG_VARIABLE
 from tests.export import plain
+from tests.support.catalog import CATALOG, SIGNALS
 
 INNER = ("ay_mean_16", "curvature_mean_8", "steering_mean_16")
 SET = """\
@@ -62,37 +51,28 @@ signals = ["ay", "curvature_mean_8", "line", "error_slope"]
 }
 
 
-def forget_features() -> None:
-    for cached in (features, input_scales):
-        cached.cache_clear()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def own_set(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+@pytest.fixture(scope="module")
+def own_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Configs of one's own with the set `tiny`, and lists of models of it."""
     own = tmp_path_factory.mktemp("own")
     (own / "models").mkdir()
     (own / "features.toml").write_text(SET)
     for name, text in LISTS.items():
         (own / "models" / f"{name}.toml").write_text(text)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv(CONFIG_VARIABLE, str(own))
-        forget_features()
-        yield
-    forget_features()
+    return own
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, own_set: Path) -> Path:
     """A root with the model `tiny`. Copy it."""
     root = shutil.copytree(smoke_root, tmp_path_factory.mktemp("tiny") / "data")
-    published(fleet_slip.open(root))
+    published(fleet_slip.open(root, own_set))
     return root
 
 
 @pytest.fixture
-def fleet(tmp_path: Path, made: Path) -> Fleet:
-    return fleet_slip.open(shutil.copytree(made, tmp_path / "data"))
+def fleet(tmp_path: Path, made: Path, own_set: Path) -> Fleet:
+    return fleet_slip.open(shutil.copytree(made, tmp_path / "data"), own_set)
 
 
 def published(fleet: Fleet) -> ModelVersion:
@@ -100,17 +80,17 @@ def published(fleet: Fleet) -> ModelVersion:
 
 
 def the_line(fleet: Fleet) -> FittedLine:
-    (digest,) = fleet.warehouse.lines.names()
-    line = fleet.warehouse.line(digest)
+    (digest,) = fleet.warehouse.stacked_models.digests()
+    line = fleet.warehouse.stacked_models.find(digest)
     assert line is not None
     return line
 
 
 def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet: Fleet) -> None:
     """By numpy's least squares on the rows themselves."""
-    line, label = the_line(fleet), catalogue().label
+    line, label = the_line(fleet), SIGNALS.label
     names = (*INNER, label)
-    plan = ColumnPlan.of(names, {}, {n: features().time_columns[n].definition for n in INNER})
+    plan = ColumnPlan.of(names, {}, {n: CATALOG.time_columns[n].definition for n in INNER})
     rows = {
         str(drive.facts["drive_id"]): compute_columns(plan, drive)
         for file in fleet.warehouse.logs.snapshot().files
@@ -144,8 +124,8 @@ def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
     assert isinstance(estimate, Combination)
     assert (estimate.terms, estimate.line) == (line.fitted.terms, line.digest)
     assert manifest.line == line.digest
-    program = compile_program(manifest)
-    for check in make_checks(manifest, program):
+    program = compile_program(fleet.warehouse.catalog, manifest)
+    for check in make_checks(SIGNALS, manifest, program):
         content, samples = program_content(program), list(check.samples)
         angles = plain.angles(content, list(check.facts), list(check.numbers), samples)
         assert angles == list(check.angles)
@@ -158,7 +138,7 @@ def test_published_again_nothing_is_computed_again(fleet: Fleet) -> None:
     assert published(fleet) == first
     assert fleet.publish("tiny").version == first
     assert fleet.warehouse.grams.snapshot().version == version
-    assert len(fleet.warehouse.lines.names()) == 1
+    assert len(fleet.warehouse.stacked_models.digests()) == 1
 
 
 def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> None:
@@ -167,18 +147,16 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
     fleet.forget(drive=drive)
     after = published(fleet).manifest.trained_on.feature_set
     assert line.digest not in after
-    others = set(fleet.warehouse.lines.names()) - {line.digest}
+    others = set(fleet.warehouse.stacked_models.digests()) - {line.digest}
     (digest,) = others
-    fitted = fleet.warehouse.line(digest)
+    fitted = fleet.warehouse.stacked_models.find(digest)
     assert fitted is not None
     assert fitted.drives == line.drives - 1
 
 
-def test_whoever_opens_the_root_later_knows_the_line(fleet: Fleet) -> None:
+def test_whoever_opens_the_root_later_finds_the_line(fleet: Fleet, own_set: Path) -> None:
     for number in range(2):
-        _lines.clear()  # as in another process
-        _sources.clear()
-        later = fleet_slip.open(str(fleet.root))
+        later = fleet_slip.open(str(fleet.root), own_set)
         if number == 0:
             later.cohort().diagnose("tiny")
         else:
@@ -196,31 +174,27 @@ def test_a_drive_too_long_for_its_slope_is_refused(
 
 
 def test_counts_of_another_grain_need_another_line(
-    fleet: Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, tmp_path: Path, own_set: Path
 ) -> None:
     """A line of micro-radians is none of ten of them."""
     line = the_line(fleet)
     estimate = '\n[estimates.line]\nscale = 0.00001\ncolumn = "line_rad"\ndescription = "coarser"\n'
-    own = shutil.copytree(os.environ[CONFIG_VARIABLE], tmp_path / "own")
+    own = shutil.copytree(own_set, tmp_path / "own")
     (own / "features.toml").write_text(SET + estimate)
-    monkeypatch.setenv(CONFIG_VARIABLE, str(own))
-    forget_features()
+    fleet = fleet_slip.open(fleet.root, own)
     with pytest.raises(QuestionError, match=r"counts of 0\.000001 rad"):
         update_grams(fleet.warehouse, feature_set=f"tiny_{line.digest}")
     assert f"tiny_{line.digest}" not in fleet.warehouse.feature_sets()
     fleet.cohort().select(models="outer")
-    assert len(fleet.warehouse.lines.names()) == 2
-    monkeypatch.undo()
-    forget_features()
+    assert len(fleet.warehouse.stacked_models.digests()) == 2
 
 
-def test_a_line_that_was_changed_is_refused(fleet: Fleet) -> None:
+def test_a_line_that_was_changed_is_refused(fleet: Fleet, own_set: Path) -> None:
     line = the_line(fleet)
-    file = Path(str(fleet.warehouse.lines)) / line.digest / "1.json"
+    file = Path(str(fleet.warehouse.stacked_models.folder)) / line.digest / "1.json"
     file.write_text(file.read_text().replace('"drives": ', '"drives": 1', 1))
-    _lines.clear()
     with pytest.raises(StorageError, match="SHA-256"):
-        published(fleet)
+        published(fleet_slip.open(fleet.root, own_set))
 
 
 def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
@@ -233,22 +207,16 @@ def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
 
 
 def test_a_line_whose_estimate_would_not_be_exact_is_refused() -> None:
-    column = features().time_columns["ay_mean_16"].definition
+    column = CATALOG.time_columns["ay_mean_16"].definition
     with pytest.raises(QuestionError, match="exact"):
-        whole_line(input_scales()["ay"], [input_scales()["ay"] * 2**40], [column])
+        whole_line(CATALOG.input_scales["ay"], [CATALOG.input_scales["ay"] * 2**40], [column])
 
 
-def test_a_root_that_is_gone_does_not_fail_the_questions_of_another(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+def test_a_root_is_not_asked_for_the_lines_of_another(
+    fleet: Fleet, smoke_root: Path, own_set: Path
 ) -> None:
-    monkeypatch.setattr("fleet_slip.catalogue.lines._sources", dict(_sources))
-
-    def gone(digest: str) -> FittedLine | None:
-        raise StorageError(f"no credentials to look for {digest}")
-
-    look_for_lines("s3://elsewhere/data", gone)
-    with pytest.raises(StorageError, match="no credentials"):
-        known_line("0123456789ab")
-    look_for_lines(str(fleet.warehouse.root), fleet.warehouse.line)
-    with pytest.raises(QuestionError, match="the line 0123456789ab is not"):
-        known_line("0123456789ab")
+    line = the_line(fleet)
+    other = fleet_slip.open(smoke_root, own_set)
+    with pytest.raises(QuestionError, match=f"the line {line.digest} is not in this data root"):
+        other.warehouse.catalog.first_stage_model(f"tiny_{line.digest}")
+    assert fleet.warehouse.catalog.first_stage_model(f"tiny_{line.digest}") == line

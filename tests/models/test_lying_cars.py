@@ -1,7 +1,7 @@
 """Cars that send rows with a wrong label: none of them, nor a few, decide what is true."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,11 @@ INPUTS = "ay,yaw_rate,steering_wheel,wheel_fl,wheel_fr"
 @pytest.fixture(scope="module")
 def grams() -> list[Gram]:
     """The Gram of a drive of half a minute of each car."""
-    drives = (drive(np.random.default_rng(car), gentleness=2.0) for car in range(CARS))
+    return drive_grams(range(CARS))
+
+
+def drive_grams(seeds: Iterable[int]) -> list[Gram]:
+    drives = (drive(np.random.default_rng(seed), gentleness=2.0) for seed in seeds)
     return [gram_of(counts(one)) for one in drives]
 
 
@@ -35,7 +39,8 @@ def root(tmp_path_factory: pytest.TempPathFactory, grams: Sequence[Gram]) -> Pat
     fleet = fleet_slip.open(folder / "data")
     receive(fleet, folder / "honest", honest(grams, START_S))
     fleet.publish("beta", select(fleet))
-    receive(fleet, folder / "next", honest(grams, START_S + DAY_S))
+    next_day = drive_grams(range(CARS, 2 * CARS))
+    receive(fleet, folder / "next", honest(next_day, START_S + DAY_S))
     return folder / "data"
 
 
@@ -79,8 +84,8 @@ def forged(grams: Sequence[Gram], how: str) -> Rows:
     if how == "offset":
         return [row_of(lie(grams[0], offset=200, times=day), "LIAR", start_s)]
     if how == "many small":
-        some = [lie(gram, gain=3) for gram in grams]
-        return [row_of(one, "LIAR", start_s + 31 * i) for i, one in enumerate(some * 4)]
+        lies = [lie(gram, gain=3, offset=offset) for offset in range(4) for gram in grams]
+        return [row_of(gram, "LIAR", start_s + 31 * i) for i, gram in enumerate(lies)]
     several = [lie(gram, offset=200, times=day) for gram in grams[:5]]
     return [row_of(one, f"LIAR{i}", start_s) for i, one in enumerate(several)]
 

@@ -9,8 +9,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured
 from fleet_slip.evaluation.measured_evaluation import identified_prior
@@ -22,9 +21,11 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand, done_on, run_on
 from tests.support.counts import gram_of
 from tests.support.logs import land, log_rows
@@ -70,16 +71,16 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
     monkeypatch.setattr("fleet_slip.models.select.PRIOR_SHARE", Fraction(1, 2**20))
     fleet = fleet_slip.open(own)
     found = fleet.cohort().select(model=INPUTS, prior=few)
-    prior = simulate_prior(few, "signals")
+    prior = simulate_prior(CATALOG, few, "signals")
     weight = found.cohort.weight
-    signals = (*INPUTS.split(","), catalogue().label)
+    signals = (*INPUTS.split(","), SIGNALS.label)
     (simulated,) = prior.tables
     real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total().restrict(signals)
     both = with_mark(real, 1).times(weight.denominator)
     both += with_mark(simulated.total().restrict(signals), 0).times(weight.numerator)
     assert 0 < weight < 1
     assert found.as_dict()["prior"] == {"campaign": few, "weight": str(weight)}
-    by_hand = fit(both, [*INPUTS.split(","), "mark"], catalogue().label).model
+    by_hand = fit(both, [*INPUTS.split(","), "mark"], SIGNALS.label).model
     counts = found.winner.model.counts
     assert [*counts.weights.values()] == [by_hand.weights[name] for name in counts.weights]
     assert counts.offset == pytest.approx(by_hand.offset + by_hand.weights["mark"], rel=1e-12)
@@ -92,7 +93,7 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     manifest = fleet.model("with").manifest
     assert manifest.prior is not None
     assert (manifest.prior.campaign, manifest.prior.drives) == ("few", 2)
-    assert manifest.prior.campaign_sha256 == load_campaign(few).digest
+    assert manifest.prior.campaign_sha256 == load_campaign(few, SHIPPED_CONFIGS).digest
     assert manifest.trained_on.drives == 6, "those of the cohort"
     assert "few: 2 simulated drives" in done_on(own, "show", "with").stdout
     assert "The prior stays" in made.stdout
@@ -126,9 +127,9 @@ def test_what_a_prior_does_not_join_is_refused(own: Path, few: str, words: tuple
 
 def test_a_wrong_prior_is_not_used(own: Path, few: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its label is reversed: whatever is taken of it makes held-out drives worse."""
-    prior = simulate_prior(few, "signals")
+    prior = simulate_prior(CATALOG, few, "signals")
     (table,) = prior.tables
-    label = table.signals.index(catalogue().label)
+    label = table.signals.index(SIGNALS.label)
     sums, products = table.sums.copy(), table.products.copy()
     sums[:, label] *= -1
     rows = label * (label + 1) // 2 + np.arange(label)
@@ -157,7 +158,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
         fitted = Fitted(stiffness_rear=1.0 + len(seen) / 100)
         return Identified(measured.car(fitted), fitted.noise, 0.0)
 
-    def simulate(campaign: object, feature_set: str, executor: object) -> object:
+    def simulate(_: Catalog, campaign: object, feature_set: str, executor: object) -> object:
         vehicle = identified_prior(campaign)  # type: ignore[arg-type]
         assert vehicle is not None
         simulated.append(vehicle.suspension.rear_stiffness_factor)
@@ -166,10 +167,10 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     found = Identified(car.car(Fitted()), Fitted().noise, 0.0)
     file = tmp_path / "own.toml"
     file.write_text(found.as_campaign())
-    campaign = load_campaign(str(file))
+    campaign = load_campaign(str(file), SHIPPED_CONFIGS)
     assert identified_prior(campaign) == found.car
     few_drives = campaign.model_copy(update={"number_of_days": 1, "drives_per_day": 2})
-    prior = simulate_prior(few_drives, "signals")
+    prior = simulate_prior(CATALOG, few_drives, "signals")
     monkeypatch.setattr("fleet_slip.models.prior.simulate_prior", lambda *_: prior)
     done_on(own, "publish", "identified", "--model", INPUTS, "--prior", file, "--force")
     monkeypatch.setattr(module, "identify", identify)
@@ -220,10 +221,10 @@ def test_weights_halve_with_age() -> None:
 
 def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
     """An evaluation makes it again by the recipe, which names no list."""
-    usual = SelectionPlan.of(SelectionRequest(half_life=90))
-    assert usual.model_list == load_model_list("estimator")
-    logged = SelectionPlan.of(SelectionRequest(features="signals", robust=True))
-    assert logged.model_list == load_model_list("table1")
+    usual = SelectionPlan.of(CATALOG, SelectionRequest(half_life=90))
+    assert usual.model_list == load_model_list(CATALOG, "estimator")
+    logged = SelectionPlan.of(CATALOG, SelectionRequest(features="signals", robust=True))
+    assert logged.model_list == load_model_list(CATALOG, "table1")
 
 
 TWO = "ay,yaw_rate"
@@ -312,6 +313,8 @@ def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> Non
         [np.repeat(one, part if i == 5 else 16, axis=0) for i, one in enumerate(rows)]
     )
     slopes = fit(gram_of(repeated), ["x1", "x2"], "y").model.coefficients
-    units = [input_scales()["sideslip"] / input_scales()[name] for name in ("ay", "yaw_rate")]
+    units = [
+        CATALOG.input_scales["sideslip"] / CATALOG.input_scales[name] for name in ("ay", "yaw_rate")
+    ]
     expected = tuple(slope * unit for slope, unit in zip(slopes, units, strict=True))
     assert found.winner.model.model.coefficients == expected

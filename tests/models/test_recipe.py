@@ -16,6 +16,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest
@@ -41,7 +42,7 @@ def test_publishing_again_without_options_is_the_same_model(root: Path, name: st
 
 
 def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root), CATALOG)
     kept = recipe_for(registry, "ranked", SelectionRequest())
     assert (kept.request.rank, kept.request.folds, kept.request.intercept) == (
         "forward",
@@ -61,7 +62,7 @@ def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
 
 
 def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     chosen = SelectedBy(
         model_list="nested:catalogue backward cv", model="5", reason="best", config_sha256="0"
     )

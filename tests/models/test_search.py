@@ -8,8 +8,6 @@ import pytest
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import folding
 from fleet_slip.grams.cohort import drive_folds
@@ -26,6 +24,7 @@ from fleet_slip.models.select import select
 from fleet_slip.regression.choice import CROSS_VALIDATION, Rule, select_nested
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.folds import cross_validate, least_squares
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, Driven, cohort_of, dense_fit, driven, rows_of
 
 STRONG_FIRST = (0.0, 0.4, 0.9, 0.0)
@@ -73,7 +72,7 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
     folds = cohort.folds("drive", 5).serving(INPUTS, LABEL)
     for model in found.models:
         procedure = least_squares(model.signals, LABEL)
-        alone = cross_validate("alone", folds, procedure, input_scales())
+        alone = cross_validate("alone", folds, procedure, CATALOG.input_scales)
         assert model.sums == alone.sums
 
 
@@ -96,7 +95,7 @@ def test_the_honest_figures_are_of_the_choice_itself_and_need_three_folds() -> N
         choices.add(chosen)
     assert len(choices) > 1
     assert honest is not None
-    counts = honest.pooled.rmse / float(catalogue()[LABEL].scale)
+    counts = honest.pooled.rmse / float(SIGNALS[LABEL].scale)
     assert counts == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=1e-9)
     assert select_inputs(cohort_of(drives), INPUTS, two, rule, USUAL).choice.honest is None
 
@@ -232,7 +231,7 @@ def test_figures_are_those_of_leaving_each_out_on_the_rows(by: str) -> None:
     (found,) = selection.models
     assert found.fold_names == tuple(sorted(set(key)))
     assert selection.as_dict()["folds"]["count"] == len(set(key))
-    scale = float(catalogue()[LABEL].scale)
+    scale = float(SIGNALS[LABEL].scale)
     rmse = float(np.sqrt(np.mean((predicted - rows[:, -1]) ** 2)))
     assert found.pooled.rmse == pytest.approx(rmse * scale, rel=1e-9)
     assert found.correlation == pytest.approx(np.corrcoef(predicted, rows[:, -1])[0, 1], rel=1e-9)

@@ -22,6 +22,7 @@ from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.verify import Verification, verify_models
 from fleet_slip.storage.documents import Document, DocumentFolder
 from fleet_slip.storage.local import LocalFolder
+from tests.support.catalog import CATALOG
 from tests.support.commands import PATIENCE_S
 from tests.support.manifests import manifest, publish
 
@@ -43,7 +44,7 @@ def call_at_once(function: Callable[..., object], arguments: Iterable[tuple[Any,
 
 
 def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     for number in (1, 2, 3):
         assert publish(registry, manifest(Fraction(number))).version == number
     assert registry.versions("sideslip") == [1, 2, 3]
@@ -54,16 +55,16 @@ def test_versions_are_consecutive_and_the_latest_published_is_champion(tmp_path:
 
 def test_a_manifest_keeps_every_digit(tmp_path: Path) -> None:
     exact = Fraction(123456789012345678901, 98765432109876543210987)
-    publish(Registry(LocalFolder(tmp_path)), manifest(exact))
-    loaded = Registry(LocalFolder(tmp_path)).load("sideslip", 1).manifest
+    publish(Registry(LocalFolder(tmp_path), CATALOG), manifest(exact))
+    loaded = Registry(LocalFolder(tmp_path), CATALOG).load("sideslip", 1).manifest
     assert loaded == manifest(exact)
     assert loaded.terms[0].coefficient_exact == exact
     assert loaded.terms[0].coefficient == float(exact)
 
 
 def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
-    DocumentFolder(LocalFolder(tmp_path / "sideslip" / "versions")).append(
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
+    DocumentFolder(LocalFolder(tmp_path), "models/sideslip/versions").append(
         manifest().model_dump(mode="json")
     )
     assert registry.champion("sideslip") is None
@@ -73,8 +74,8 @@ def test_publishing_what_an_interrupted_run_left_uses_it(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("change", ["coefficient", "sha256", "truncated"])
 def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
-    publish(Registry(LocalFolder(tmp_path)), manifest())
-    file = tmp_path / "sideslip" / "versions" / "1.json"
+    publish(Registry(LocalFolder(tmp_path), CATALOG), manifest())
+    file = tmp_path / "models" / "sideslip" / "versions" / "1.json"
     envelope = json.loads(file.read_text())
     if change == "coefficient":
         envelope["content"]["terms"][0]["coefficient"] = 0.5
@@ -82,18 +83,18 @@ def test_a_changed_version_is_refused(tmp_path: Path, change: str) -> None:
         envelope["sha256"] = "0" * 64
     file.write_text(json.dumps(envelope)[: 40 if change == "truncated" else None])
     with pytest.raises(StorageError, match=r"1\.json"):
-        Registry(LocalFolder(tmp_path)).load("sideslip", 1)
+        Registry(LocalFolder(tmp_path), CATALOG).load("sideslip", 1)
 
 
 def test_a_signature_of_an_earlier_release_is_ignored(tmp_path: Path) -> None:
-    publish(Registry(LocalFolder(tmp_path)), manifest())
-    (tmp_path / "sideslip" / "versions" / "1.sig").write_bytes(b"AAAA")
-    assert Registry(LocalFolder(tmp_path)).versions("sideslip") == [1]
-    assert publish(Registry(LocalFolder(tmp_path)), manifest(Fraction(2))).version == 2
+    publish(Registry(LocalFolder(tmp_path), CATALOG), manifest())
+    (tmp_path / "models" / "sideslip" / "versions" / "1.sig").write_bytes(b"AAAA")
+    assert Registry(LocalFolder(tmp_path), CATALOG).versions("sideslip") == [1]
+    assert publish(Registry(LocalFolder(tmp_path), CATALOG), manifest(Fraction(2))).version == 2
 
 
 def test_aliases_move_and_go_back(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     for number in (1, 2, 3):
         publish(registry, manifest(Fraction(number)))
     registry.promote("sideslip", 1, CHAMPION)
@@ -112,7 +113,7 @@ def test_aliases_move_and_go_back(tmp_path: Path) -> None:
 
 
 def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     with pytest.raises(QuestionError, match=r"no model is called 'x'.*publish one with"):
         registry.resolve("x")
     publish(registry, manifest())
@@ -126,12 +127,12 @@ def test_unknown_names_versions_and_aliases_say_what_there_is(tmp_path: Path) ->
 
 def _publish_ten(path: Path, writer: int) -> None:
     for number in range(10):
-        publish(Registry(LocalFolder(path)), manifest(Fraction(writer * 100 + number, 7)))
+        publish(Registry(LocalFolder(path), CATALOG), manifest(Fraction(writer * 100 + number, 7)))
 
 
 def test_writers_at_once_never_share_a_number_or_lose_a_version(tmp_path: Path) -> None:
     call_at_once(_publish_ten, [(tmp_path, writer) for writer in range(4)])
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     numbers = registry.versions("sideslip")
     assert numbers == list(range(1, 41))
     published = {registry.load("sideslip", n).manifest.terms[0].coefficient_exact for n in numbers}
@@ -144,13 +145,13 @@ def _publish_the_same(path: Path, logs_version: int, barrier: Any) -> None:
     for model in range(20):
         barrier.wait()
         same = manifest(name=f"m{model}").model_copy(update={"trained_on": trained_on})
-        publish(Registry(LocalFolder(path)), same)
+        publish(Registry(LocalFolder(path), CATALOG), same)
 
 
 def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None:
     barrier = PROCESSES.Barrier(3, timeout=PATIENCE_S)
     call_at_once(_publish_the_same, [(tmp_path, version, barrier) for version in range(3)])
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     for model in range(20):
         assert registry.versions(f"m{model}") == [1]
         moves = registry.history(f"m{model}").moves()
@@ -158,7 +159,7 @@ def test_writers_at_once_publish_the_same_estimator_once(tmp_path: Path) -> None
 
 
 def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     history = registry.history("sideslip")
     challenger = registry.add(manifest(Fraction(2)), b"")
     seen: list[int | None] = []
@@ -178,7 +179,7 @@ def test_what_was_decided_on_another_champion_is_decided_again(tmp_path: Path) -
 def test_two_who_go_back_at_once_go_back_two_versions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     for number in (1, 2, 3):
         publish(registry, manifest(Fraction(number)))
 
@@ -198,7 +199,7 @@ def test_two_who_go_back_at_once_go_back_two_versions(
 def test_a_version_and_the_champion_are_found_without_reading_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    registry = Registry(LocalFolder(tmp_path))
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
     for number in range(1, 21):
         publish(registry, manifest(Fraction(number)))
     read: list[int] = []

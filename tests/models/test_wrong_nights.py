@@ -15,13 +15,13 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram
 from tests.support.cars import Signals, counts, drive, gram_of
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows
 from tests.support.once import made_once
@@ -92,7 +92,7 @@ def land_day(fleet: Fleet, number: int, rng: np.random.Generator, change: Change
         signals = drive(rng, gentleness=2)
         if change:
             change(signals)
-        largest = {name: 32767 * float(catalogue()[name].scale) for name in signals}
+        largest = {name: 32767 * float(SIGNALS[name].scale) for name in signals}
         clipped = {
             name: np.clip(one, -largest[name], largest[name]) for name, one in signals.items()
         }
@@ -129,9 +129,9 @@ def truth() -> Gram:
 
 
 def error_deg(manifest: Manifest, truth: Gram) -> float:
-    model = manifest.counts_model()
+    model = manifest.counts_model(CATALOG)
     sums = error_sums(model, truth.restrict((*model.signals, model.label)))
-    return sums.figures(catalogue()[model.label].exact_scale).rmse_deg
+    return sums.figures(SIGNALS[model.label].exact_scale).rmse_deg
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import time
 from datetime import date
 from fractions import Fraction
 from functools import cache
@@ -15,19 +16,26 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations.find_drives import Located, drives_by_file, locate, quarantined_of
+from fleet_slip.operations.find_drives import (
+    Located,
+    drives_by_file,
+    locate,
+    quarantined_of,
+    vacuum,
+)
 from fleet_slip.operations.forget import Retention, forget, retain
 from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.verify import verify
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
@@ -60,7 +68,7 @@ def _filled(cars: tuple[str, ...]) -> TemporaryDirectory[str]:
 def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:
     cohort = load_cohort(warehouse)
     (table,) = cohort.tables
-    model = fit(table.total(), catalogue().inputs, catalogue().label).model
+    model = fit(table.total(), SIGNALS.inputs, SIGNALS.label).model
     return {
         "intercept": model.intercept,
         **dict(zip(model.signals, model.coefficients, strict=True)),
@@ -119,7 +127,7 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
     assert mentions(tmp_path, "gamma")
 
 
-def test_what_a_killed_job_left_goes_at_once_and_what_of_others_stays_for_an_hour(
+def test_what_a_killed_job_left_goes_at_once_and_files_of_other_cars_stay_for_compact(
     tmp_path: Path,
 ) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
@@ -132,18 +140,22 @@ def test_what_a_killed_job_left_goes_at_once_and_what_of_others_stays_for_an_hou
     other = warehouse.logs.write_file("other", drive("alfa", 7), date(2024, 5, 1))
     assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
     assert not mentions(tmp_path, "beta"), left
+    os.utime(tmp_path / "logs" / other.path, (0, 0))  # where clocks differ, a job may be writing it
+    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
     assert (tmp_path / "logs" / other.path).exists()
-    os.utime(tmp_path / "logs" / other.path, (0, 0))
-    forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert vacuum(warehouse).files
     assert not (tmp_path / "logs" / other.path).exists()
 
 
+@pytest.mark.parametrize("old", [True, False])
 @pytest.mark.parametrize("table", ["logs", "grams"])
-def test_where_a_delta_log_was_lost_nothing_is_deleted(tmp_path: Path, table: str) -> None:
+def test_where_a_delta_log_was_lost_nothing_is_deleted(
+    tmp_path: Path, table: str, old: bool
+) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
     shutil.rmtree(tmp_path / table / "_delta_log")
     files = sorted(tmp_path.rglob("*.parquet"))
-    for file in files:
+    for file in files if old else ():
         os.utime(file, (0, 0))
     with pytest.raises(StorageError, match="files without a Delta log"):
         forget(warehouse, Forgettable("vehicle", "beta"), now=True)
@@ -280,3 +292,103 @@ def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
     assert run_command("sql", query, "--json").json == [{"n": 0}]
     assert run_command("verify", "--full").exit_code == 0
     assert run_command("forget").exit_code == 2
+
+
+CLOCKS_S = [-60, -2 * 86_400, 600]
+"""How far the clock of an erasure is ahead of the clock that dated the files."""
+
+
+@pytest.mark.parametrize("shift_s", CLOCKS_S)
+def test_erasure_does_not_depend_on_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shift_s: int
+) -> None:
+    warehouse = fill(tmp_path, *CARS)
+    compact(warehouse)  # older versions have the car in other files
+    warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))
+    set_clock(monkeypatch, shift_s)
+    report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert not report.pending
+    assert not mentions(tmp_path, "beta")
+    assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM grams ORDER BY 1") == [
+        ("alfa",),
+        ("gamma",),
+    ]
+    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).changed
+    monkeypatch.undo()
+    assert not verify(warehouse, full=True).damage
+
+
+def test_files_that_a_clock_ahead_has_replaced_go_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ahead_s = 2 * 86_400
+    warehouse = fill(tmp_path, *CARS)
+    with monkeypatch.context() as patch:
+        set_clock(patch, ahead_s)  # then the commits, too, are dated otherwise
+        compact(warehouse)
+        forget(warehouse, Forgettable("vehicle", "beta"))
+    for file in tmp_path.rglob("*.parquet"):
+        moment = time.time() + ahead_s
+        os.utime(file, (moment, moment))
+    report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert not report.pending
+    assert report.old_files_deleted
+    assert not mentions(tmp_path, "beta")
+
+
+def set_clock(monkeypatch: pytest.MonkeyPatch, shift_s: int) -> None:
+    """Put the clock of this process ahead; the Delta library keeps its own."""
+    now, now_ns = time.time, time.time_ns
+    monkeypatch.setattr(time, "time", lambda: now() + shift_s)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() + shift_s * 10**9)
+
+
+@pytest.mark.parametrize("folder", ["logs/day=2024-05-01/.tmp-half", ".spill-0/duckdb_temp"])
+@pytest.mark.parametrize("age_s", [-3600, 1800])
+def test_temporary_files_of_killed_jobs_go_at_any_age_and_those_of_a_run_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, age_s: int
+) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    half = tmp_path / folder
+    half.parent.mkdir(exist_ok=True)
+    half.write_bytes(b"beta, half a file")
+    os.utime(half, (time.time() - age_s,) * 2)
+    with monkeypatch.context() as patch:
+        patch.setattr("fleet_slip.operations.forget.runs_under_way", lambda _: ["night"])
+        report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    assert report.pending == (folder, "the run night")
+    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
+    assert not mentions(tmp_path, "beta")
+
+
+def test_what_cannot_be_read_or_deleted_is_no_success(
+    tmp_path: Path, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path / "data", "alfa", "beta")
+    action = warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))
+    left = tmp_path / "data" / "logs" / action.path
+    left.write_bytes(b"beta, and damaged")
+    words = ("forget", "--vehicle", "beta", "--now")
+    done = run_command(*words)
+    assert done.exit_code == 12
+    assert f"logs/{action.path} (unreadable)" in done.stderr
+    assert "fleet-slip verify" in done.stderr
+    left.unlink()
+    action = warehouse.logs.write_file("left", drive("beta", 8), date(2024, 5, 1))
+    with monkeypatch.context() as patch:
+        patch.setattr(LocalFolder, "remove", lambda *_: False)
+        assert run_command(*words, "--json").json["pending"] == [f"logs/{action.path}"]
+    assert run_command(*words).exit_code == 0
+
+
+def test_an_erasure_that_left_rows_in_a_table_is_not_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warehouse = fill(tmp_path, "alfa", "beta")
+    beta = Forgettable("vehicle", "beta")
+    with monkeypatch.context() as patch:
+        patch.setattr("fleet_slip.operations.forget.reconcile", lambda _: [])
+        assert forget(warehouse, beta, now=True).pending == ("grams",)
+    assert Audit(warehouse.root).state(beta) == "begun"
+    assert not forget(warehouse, beta, now=True).pending
+    assert Audit(warehouse.root).state(beta) == "done"

@@ -23,8 +23,9 @@ from fleet_slip.operations.forget import forget
 from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage import encoding
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.forgotten import FOLDER, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, recording
 
@@ -181,6 +182,40 @@ def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
 
 def cars(rows: pa.Table) -> set[str]:
     return set(rows["vehicle_id"].cast(pa.string()).to_pylist())
+
+
+@pytest.mark.parametrize("name", [" Stra\u00dfe 1", "STRASSE 1", "stra\u00dfe 1\u00a0"])
+def test_names_are_compared_after_normalization_and_case_folding(
+    warehouse: Warehouse, tmp_path: Path, name: str
+) -> None:
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    columns = recording() | {"car": ["Stra\u00dfe 1"] * ROWS}
+    ingest_file(warehouse, write(tmp_path, columns), mapping)
+    other = recording(2) | {"car": [name] * ROWS}
+    assert forget(warehouse, Forgettable("vehicle", name)).drives == 1
+    assert is_empty(warehouse)
+    file = write(tmp_path, other, "tuesday.csv")
+    assert ingest_file(warehouse, file, mapping).drives_forgotten == 1
+    Audit(warehouse.root).allow(Forgettable("vehicle", "strasse 1"))
+    again = write(tmp_path, recording(3) | {"car": [name] * ROWS}, "wednesday.csv")
+    assert ingest_file(warehouse, again, mapping).counts.drives == 1
+
+
+def test_entries_of_names_as_they_were_typed_bar_that_name_until_it_is_allowed(
+    tmp_path: Path,
+) -> None:
+    audit, key = Audit(LocalFolder(tmp_path / "data")), "00" * 32
+    typed = hashlib.blake2b(b"vehicle:CAR", key=bytes(32), digest_size=32).hexdigest()
+    for event in ("begun", "done"):
+        entry: dict[str, Any] = {"kind": "vehicle", "subject": typed, "key": key, "event": event}
+        DocumentFolder(audit.root / FOLDER).append(entry)
+    assert audit.barred({"CAR", " CAR", "car"}, ()).vehicles == {"CAR", " CAR"}
+    assert audit.state(Forgettable("vehicle", "CAR")) == "done"
+    audit.begin(Forgettable("vehicle", "car"), 1, [])
+    audit.end(Forgettable("vehicle", "car"))
+    assert audit.barred({"CAR", "car"}, ()).vehicles == {"CAR", "car"}
+    audit.allow(Forgettable("vehicle", "CAR"))
+    assert not audit.barred({"CAR", "car"}, ())
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])

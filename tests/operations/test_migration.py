@@ -1,7 +1,8 @@
 """Signals come and go, roots of earlier releases are read, and other scales are refused."""
 
+import os
 import tarfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.signals import CATALOGUE_VARIABLE, catalogue
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import migrate
 from fleet_slip.resources import folder
-from fleet_slip.views import connect
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS, configs_with
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import gram_of, row_of, write_counted
 from tests.support.logs import ask, land, log_rows
@@ -42,36 +43,30 @@ WIDER_AX = SHIPPED.replace(AX, "scale = 0.002\nmin = -60\nmax = 60", 1)
 BEFORE, _, REST = SHIPPED.partition("[signals.lateral_offset]")
 WITHOUT_OFFSET = BEFORE + "# What is known" + REST.partition("# What is known")[2]
 
-Use = Callable[[str], None]
+Use = Callable[[str], Warehouse]
 
 
 @pytest.fixture
-def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Use]:
-    """Return a function that makes a text the catalogue, here and in commands."""
+def use(tmp_path: Path, warehouse: Warehouse) -> Use:
+    """Return a function that opens the warehouse with a text as its signals."""
 
-    def chosen(text: str) -> None:
-        file = tmp_path / "signals.toml"
-        file.write_text(text)
-        monkeypatch.setenv(CATALOGUE_VARIABLE, str(file))
-        catalogue.cache_clear()
+    def opened(text: str) -> Warehouse:
+        return Warehouse(warehouse.root, configs_with(tmp_path / "configs", signals=text))
 
-    yield chosen
-    monkeypatch.undo()
-    catalogue.cache_clear()
+    return opened
 
 
 def small_counts(seed: int, rows: int = 40) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
-    return {n: rng.integers(-9000, 9000, rows).astype(np.int16) for n in catalogue().signals}
+    return {n: rng.integers(-9000, 9000, rows).astype(np.int16) for n in SIGNALS.signals}
 
 
 def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> None:
     land(warehouse, "old", log_rows("old", small_counts(1)))
     update_grams(warehouse)
     before = ask(warehouse.root, "SELECT sums, products FROM grams")
-    use(NEW_SIGNAL)
-    now = Warehouse(warehouse.root)
-    assert ask(now.root, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
+    now = use(NEW_SIGNAL)
+    assert ask(now, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
     with pytest.raises(RefusedError, match=r"has not: tyre_pressure.*fleet-slip migrate"):
         land(now, "new", log_rows("new", small_counts(2)))
     report = migrate(now)
@@ -79,11 +74,11 @@ def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> No
     assert not migrate(now).changed
     land(now, "new", log_rows("new", small_counts(2)))
     assert update_grams(now).files_read == 1
-    signals = dict(ask(now.root, "SELECT drive_id, signals FROM grams"))
+    signals = dict(ask(now, "SELECT drive_id, signals FROM grams"))
     assert "tyre_pressure" in str(signals["new"])
     assert "tyre_pressure" not in str(signals["old"])
-    assert ask(now.root, "SELECT sums, products FROM grams WHERE drive_id = 'old'") == before
-    assert ask(now.root, "SELECT count(*), count(tyre_pressure) FROM log_counts") == [(80, 40)]
+    assert ask(now, "SELECT sums, products FROM grams WHERE drive_id = 'old'") == before
+    assert ask(now, "SELECT count(*), count(tyre_pressure) FROM log_counts") == [(80, 40)]
     check_grams(now, 10)
 
 
@@ -91,13 +86,11 @@ def test_grams_of_old_files_alone_are_the_same_with_a_new_signal(
     warehouse: Warehouse, use: Use
 ) -> None:
     land(warehouse, "old", log_rows("old", small_counts(1)))
-    use(NEW_SIGNAL)
-    now = Warehouse(warehouse.root)
+    now = use(NEW_SIGNAL)
     update_grams(now)
     first_rows = "SELECT signals, sums[1] FROM grams WHERE feature_set = 'signals'"
-    (signals, first), *_ = ask(now.root, first_rows)
+    (signals, first), *_ = ask(now, first_rows)
     assert "tyre_pressure" not in str(signals)
-    catalogue.cache_clear()
     assert first == small_counts(1)["ax"].sum()
     check_grams(now, 1)
 
@@ -106,41 +99,39 @@ def test_a_retired_signal_stays_in_old_files_and_is_not_asked_for(
     warehouse: Warehouse, use: Use
 ) -> None:
     land(warehouse, "old", log_rows("old", small_counts(1)))
-    use(WITHOUT_OFFSET)
-    now = Warehouse(warehouse.root)
+    now = use(WITHOUT_OFFSET)
     land(now, "new", log_rows("new", small_counts(2)))
     assert not migrate(now).changed
-    assert ask(now.root, "SELECT count(*), count(station_m) FROM log") == [(80, 80)]
-    assert "lateral_offset_m" not in [row[0] for row in ask(now.root, "DESCRIBE log")]
+    assert ask(now, "SELECT count(*), count(station_m) FROM log") == [(80, 80)]
+    assert "lateral_offset_m" not in [row[0] for row in ask(now, "DESCRIBE log")]
 
 
 def test_counts_of_another_scale_are_refused(warehouse: Warehouse, use: Use) -> None:
     land(warehouse, "a", log_rows("a", small_counts(1)), log_rows("b", small_counts(2)))
     update_grams(warehouse)
-    use(WIDER_AX)
-    now = Warehouse(warehouse.root)
+    now = use(WIDER_AX)
     for touch in (
         now.logs.snapshot,
-        lambda: connect(now.root),
+        lambda: open_views(now, None),
         lambda: update_grams(now),
         lambda: migrate(now),
     ):
         with pytest.raises(RefusedError, match=r"ax 0.001 -> 0.002.*another data root"):
             touch()
-    use(SHIPPED)
-    assert ask(warehouse.root, "SELECT count(*) FROM log") == [(80,)]
+    assert ask(warehouse, "SELECT count(*) FROM log") == [(80,)]
 
 
 def test_the_nightly_job_goes_on_after_a_signal_was_added(
-    run_command: RunCommand, use: Use
+    tmp_path: Path, run_command: RunCommand
 ) -> None:
     night = ("run", "--campaign", "smoke", "--models", "table1")
     run_command(*night, "--days", "1")
-    use(NEW_SIGNAL)
-    assert run_command("simulate", "smoke").exit_code == 7
-    assert "added: tyre_pressure" in run_command("migrate").stderr
-    assert run_command(*night).exit_code == 0
-    assert "nothing to do" in run_command("migrate").stderr
+    configs = configs_with(tmp_path / "configs", signals=NEW_SIGNAL)
+    other = {"env": {**os.environ, "FLEET_SLIP_CONFIG": str(configs.folder)}}
+    assert run_command("simulate", "smoke", **other).exit_code == 7
+    assert "added: tyre_pressure" in run_command("migrate", **other).stderr
+    assert run_command(*night, **other).exit_code == 0
+    assert "nothing to do" in run_command("migrate", **other).stderr
 
 
 ROOTS = sorted((Path(__file__).parents[1] / "evidence/roots").glob("*.tar.gz"))
@@ -167,7 +158,7 @@ def test_a_root_is_migrated_read_and_sound(fleet: Fleet) -> None:
     assert fleet.check().drives == DRIVES
     (rows,) = fleet.sql("SELECT count(*) FROM log").fetchall()
     assert rows == (ROWS,)
-    assert not fleet.verify(full=True).damage
+    assert not fleet.verify(full=True).findings
     assert not fleet.quality().findings
 
 

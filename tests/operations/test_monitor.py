@@ -23,6 +23,7 @@ from fleet_slip.regression.figures import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import counts, drive
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, ask, land, log_rows
 
@@ -50,14 +51,14 @@ def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warehouse = Warehouse(LocalFolder(root))
     add_days(warehouse, 0, TRAINING_DAYS)
     planned = answer_request(warehouse, SelectionRequest(models="table1"))
-    publish_challenger(Registry(warehouse.root / "models"), manifest_of(planned, "m"), planned)
+    publish_challenger(Registry(warehouse.root, CATALOG), manifest_of(planned, "m"), planned)
     return root
 
 
 @pytest.fixture
 def trained(of_training_days: Path, warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
     shutil.copytree(of_training_days, str(warehouse.root))
-    return warehouse, Registry(warehouse.root / "models").resolve("m")
+    return warehouse, Registry(warehouse.root, CATALOG).resolve("m")
 
 
 def new_days(chart: Chart) -> list[tuple[date, tuple[str, ...]]]:

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.faults import Fault
+from fleet_slip.catalog.faults import Fault
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
@@ -20,9 +20,11 @@ from fleet_slip.operations.labels import find_repeated
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
 from fleet_slip.regression.gram import Gram
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive, gram_of, with_course
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand
 from tests.support.counts import table_of
 from tests.support.logs import DAY, land, log_rows, random_counts
@@ -46,11 +48,12 @@ def cohort_of(some: Sequence[Driven]) -> Cohort:
     for name, values in {"day": [*days], **same}.items():
         table = table.append_column(name, [values])
     return Cohort(
-        condition=parse_condition("true"),
+        condition=parse_condition(SIGNALS, "true"),
         logs_version=1,
         grams_version=1,
         drives=table,
         tables=(table_of(grams),),
+        catalog=CATALOG,
     )
 
 
@@ -168,8 +171,8 @@ def test_drives_in_order_raise_no_alarm() -> None:
 
 
 def choose_limits(monkeypatch: pytest.MonkeyPatch, **changes: int) -> None:
-    limits = thresholds().quality.model_copy(update=changes)
-    chosen = thresholds().model_copy(update={"quality": limits})
+    limits = thresholds(SHIPPED_CONFIGS).quality.model_copy(update=changes)
+    chosen = thresholds(SHIPPED_CONFIGS).model_copy(update={"quality": limits})
     monkeypatch.setattr(quality, "thresholds", lambda: chosen)
 
 

@@ -28,6 +28,7 @@ from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import marked_models
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.storage.local import LocalFolder
@@ -36,6 +37,7 @@ from fleet_slip.storage.table import Change, Snapshot, Table
 from fleet_slip.warehouse.forgotten import Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.operations.test_forget import CARS, drive, fill, mentions
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, run
 from tests.support.logs import ask, land, path_of
 from tests.support.measured import SIGNALS, a_mapping, csv_text, good_columns, ingest_file
@@ -172,7 +174,7 @@ def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
-    campaign = load_campaign("smoke")
+    campaign = load_campaign("smoke", SHIPPED_CONFIGS)
     batches = campaign.batches(campaign.days()[0])
     gone = batches[0].drives[0]
     audit = Audit(warehouse.root)
@@ -264,7 +266,7 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
 ) -> None:
     """Whoever selected before the erasure and publishes after it."""
     warehouse = fill(tmp_path, *CARS)
-    registry, answers = Registry(warehouse.root / "models"), {}
+    registry, answers = Registry(warehouse.root, CATALOG), {}
     cohorts = {"of_all": "true", "of_others": "vehicle_id <> 'beta'"}
     for name, cohort in cohorts.items():
         request = SelectionRequest(nested="ay,yaw_rate")
@@ -273,10 +275,10 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
     forget(warehouse, BETA, now=True)
     for name, answer in answers.items():
         publish_challenger(registry, manifests[name], answer, force=True)
-    assert marked_models(warehouse.root) == {"of_all@1"}
+    assert marked_models(warehouse) == {"of_all@1"}
     (kept,) = Path(str(registry.folder_of("of_others"))).glob("drives-*.bin")
     kept.unlink()  # then it cannot be told
-    assert marked_models(warehouse.root) == {"of_all@1", "of_others@1"}
+    assert marked_models(warehouse) == {"of_all@1", "of_others@1"}
 
 
 def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it(
@@ -286,11 +288,11 @@ def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it
     Audit(warehouse.root).begin(BETA, 3, [], {"beta": 0})
     answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
     publish_challenger(
-        Registry(warehouse.root / "models"), manifest_of(answer, "beta"), answer, force=True
+        Registry(warehouse.root, CATALOG), manifest_of(answer, "beta"), answer, force=True
     )
-    assert marked_models(warehouse.root) == {"beta@1"}
+    assert marked_models(warehouse) == {"beta@1"}
     Audit(warehouse.root).end(BETA, grams_version=0)
-    assert not marked_models(warehouse.root)
+    assert not marked_models(warehouse)
 
 
 def test_the_command_says_what_may_be_left_and_finishes_when_it_is_repeated(

@@ -86,6 +86,13 @@ def test_what_worked_before_and_is_refused_now_is_one(warehouse: Warehouse) -> N
     assert problem.endswith("failed with exit code 7: the champion is better")
 
 
+def test_a_name_that_is_not_recorded_is_explained(warehouse: Warehouse) -> None:
+    path_of(warehouse.root).mkdir()
+    fail(warehouse, StorageError("car.csv: cannot be read"), "car.csv")
+    (problem,) = status_of(warehouse).problems
+    assert problem.endswith("***.csv: cannot be read (***: a name that is not recorded)")
+
+
 def test_a_typo_after_a_failure_does_not_hide_it(warehouse: Warehouse) -> None:
     path_of(warehouse.root).mkdir()
     fail(warehouse, StorageError("the disk is full"), "beta")

@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,16 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.errors import StorageError
+from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams import check
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
+from fleet_slip.models.registry import CHAMPION, Registry
 from fleet_slip.operations import verify as verification
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.status import status_of
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
@@ -28,6 +31,7 @@ from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
+from tests.support.manifests import manifest, publish
 from tests.support.once import filled_once
 
 
@@ -39,7 +43,7 @@ def filled(warehouse: Warehouse) -> None:
     for name in "ab":
         land(warehouse, name, log_rows(name, random_counts(rng, 300)))
     update_grams(warehouse)
-    DocumentFolder(warehouse.root / "evaluations").append({"drive": "ä", "values": [1, 2.5]})
+    DocumentFolder(warehouse.root, "evaluations").append({"drive": "ä", "values": [1, 2.5]})
 
 
 def flip(file: Path, bit: int) -> None:
@@ -193,7 +197,7 @@ def test_a_log_file_lost_with_its_gram_rows_is_told_and_the_rest_rebuilt(
 
 
 def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
-    folder = DocumentFolder(filled.root / "models" / "m" / "history")
+    folder = DocumentFolder(filled.root, "models/m/history")
     for number in range(3):
         folder.append({"number": number})
     (path_of(folder.folder) / "2.json").unlink()
@@ -203,6 +207,55 @@ def test_a_document_is_checked_to_the_last_byte(filled: Warehouse) -> None:
         ("document", "models/m/history/2.json"),
         ("document", "models/m/history/3.json"),
     }
+
+
+@pytest.fixture
+@filled_once
+def decided(warehouse: Warehouse) -> None:
+    """Logs, an erased car, and a pinned model of two versions."""
+    rng = np.random.default_rng(0)
+    for car in "ab":
+        land(warehouse, car, log_rows(car, random_counts(rng, 30), vehicle_id=f"car-{car}"))
+    forget(warehouse, Forgettable("vehicle", "car-b"))
+    registry = Registry.of(warehouse)
+    for number in (1, 2):
+        publish(registry, manifest(Fraction(number)))
+    registry.hold("sideslip", CHAMPION, "pin")
+
+
+@pytest.mark.parametrize(
+    ("lost", "command"),
+    [
+        ("forgotten/1.json", ("forget", "--vehicle", "car-a")),
+        ("forgotten/2.json", ("forget", "--vehicle", "car-a")),
+        ("models/sideslip/history/1.json", ("show", "sideslip")),
+        ("models/sideslip/history/3.json", ("show", "sideslip")),
+        ("models/sideslip/versions/2.json", ("models",)),
+    ],
+)
+def test_a_lost_decision_stops_commands_until_its_loss_is_accepted(
+    decided: Warehouse, run_command: RunCommand, lost: str, command: tuple[str, ...]
+) -> None:
+    (path_of(decided.root) / lost).unlink()
+    refused = run_command(*command)
+    assert refused.exit_code == StorageError.exit_code
+    assert f"{lost}: the document was written and is missing. Restore" in refused.stderr
+    assert any(lost in problem for problem in status_of(decided).problems)
+    assert ("document", lost) in damaged(decided)
+    repair(decided, verify(decided))
+    assert ("document", lost) in damaged(decided)
+    accepted = run_command("verify", "--accept-loss", lost)
+    assert f"accepted the loss of {lost}" in accepted.stdout + accepted.stderr
+    assert ("document", lost) not in damaged(decided)
+    assert run_command(*command).exit_code != StorageError.exit_code
+
+
+def test_an_accepted_loss_names_a_lost_document(
+    decided: Warehouse, run_command: RunCommand
+) -> None:
+    answer = run_command("verify", "--accept-loss", "forgotten/1.json")
+    assert answer.exit_code == QuestionError.exit_code
+    assert "no document is missing" in answer.stderr
 
 
 def test_leftovers_and_a_backlog_are_remarks(filled: Warehouse) -> None:

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import find_config
+from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.plan import DriveDraw, GridPlan
 from fleet_slip.simulation.roads import load_track, random_generator
-from fleet_slip.simulation.scenario import load_scenario, shipped_scenarios
+from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 from fleet_slip.vehicle.parameters import load_vehicle
 
-LOAD: dict[str, Callable[[str], Any]] = {
+LOAD: dict[str, Callable[[str, Configs], Any]] = {
     "campaigns": load_campaign,
     "scenarios": load_scenario,
     "tracks": load_track,
@@ -43,7 +43,7 @@ def segment(*curvature: float, length_m: float = 9.0) -> str:
 
 def changed(name: str, old: str, new: str) -> str:
     """Return a shipped config with its last `old` replaced."""
-    text = find_config(*name.split("/")).read_text(encoding="utf-8")
+    text = SHIPPED_CONFIGS.find(*name.split("/")).read_text(encoding="utf-8")
     before, found, after = text.rpartition(old)
     assert found, f"{name} has no {old}"
     return before + new + after
@@ -101,7 +101,7 @@ def test_a_mistake_is_named_with_file_key_and_reason(
     file = tmp_path / "mine.toml"
     file.write_text(changed(name, old, new) if old else new)
     with pytest.raises(ConfigError) as error:
-        LOAD[name.partition("/")[0]](str(file))
+        LOAD[name.partition("/")[0]](str(file), SHIPPED_CONFIGS)
     assert str(file) in str(error.value)
     assert complaint in str(error.value)
 
@@ -132,9 +132,9 @@ def test_every_key_changes_the_digest(tmp_path: Path, name: str, old: str, new: 
         if kind != "campaigns":
             file = tmp_path / "campaign.toml"
             file.write_text(changed(SMOKE, f'["{of}"]', f'["{tmp_path}/mine.toml"]'))
-        campaign = load_campaign(str(file))
+        campaign = load_campaign(str(file), SHIPPED_CONFIGS)
         found.append({batch.digest for batch in campaign.batches(campaign.first_day)})
-    shipped = load_campaign(of if kind == "campaigns" else "smoke")
+    shipped = load_campaign(of if kind == "campaigns" else "smoke", SHIPPED_CONFIGS)
     assert found[0] == {batch.digest for batch in shipped.batches(shipped.first_day)}
     assert found[0].isdisjoint(found[1])
 
@@ -145,10 +145,10 @@ def test_the_pace_determines_the_batch_and_further_days_none(tmp_path: Path) -> 
         (tmp_path / "mine.toml").write_text(
             f"{MINE}pace = [{{ station_m = 9, factor = {factor} }}]"
         )
-        digests.append(load_scenario(str(tmp_path / "mine.toml")).batch().digest)
+        digests.append(load_scenario(str(tmp_path / "mine.toml"), SHIPPED_CONFIGS).batch().digest)
     assert digests[0] == digests[2] != digests[1]
     for name in ("smoke", "fleet"):
-        campaign = load_campaign(name)
+        campaign = load_campaign(name, SHIPPED_CONFIGS)
         longer = campaign.model_copy(update={"number_of_days": campaign.number_of_days + 5})
         assert longer.days()[: campaign.number_of_days] == campaign.days()
         for day in campaign.days()[:3]:
@@ -158,24 +158,24 @@ def test_the_pace_determines_the_batch_and_further_days_none(tmp_path: Path) -> 
 def test_open_tracks_have_no_laps(tmp_path: Path) -> None:
     file = tmp_path / "campaign.toml"
     file.write_text(changed(SMOKE, '["waterford_hills"]', '["straight"]'))
-    assert load_campaign(str(file)).drives_per_day == 4
+    assert load_campaign(str(file), SHIPPED_CONFIGS).drives_per_day == 4
     file.write_text(file.read_text().replace("laps = 0.5", "laps = 2"))
     with pytest.raises(ConfigError, match=r"laps is 2\.0, but the track 'straight' is open"):
-        load_campaign(str(file))
+        load_campaign(str(file), SHIPPED_CONFIGS)
 
 
-OF_SMOKE = find_config("campaigns", "smoke").read_text(encoding="utf-8")
+OF_SMOKE = SHIPPED_CONFIGS.find("campaigns", "smoke").read_text(encoding="utf-8")
 
 
 def load_text(folder: Path, text: str) -> Campaign:
     file = folder / "campaign.toml"
     file.write_text(text)
-    return load_campaign(str(file))
+    return load_campaign(str(file), SHIPPED_CONFIGS)
 
 
 @pytest.mark.parametrize("name", ["smoke", "fleet"])
 def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str) -> None:
-    campaign = load_campaign(name)
+    campaign = load_campaign(name, SHIPPED_CONFIGS)
     for day in campaign.days()[:3]:
         batches = campaign.batches(day)
         assert [batch.index for batch in batches] == list(range(len(batches)))
@@ -190,15 +190,15 @@ def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str)
 
 
 def test_drive_names_can_be_read() -> None:
-    drive = load_campaign("smoke").drives(date(2024, 5, 2))[3]
+    drive = load_campaign("smoke", SHIPPED_CONFIGS).drives(date(2024, 5, 2))[3]
     assert (drive.drive_id, drive.vehicle_id) == ("smoke-2024-05-02-0003", "smoke-0000")
     assert drive.source == "simulated"
 
 
 def test_grid_takes_every_combination_once_before_any_twice() -> None:
-    plan = load_campaign("waterford").plan
+    plan = load_campaign("waterford", SHIPPED_CONFIGS).plan
     assert isinstance(plan, GridPlan)
-    sensors = load_campaign("waterford").sensors
+    sensors = load_campaign("waterford", SHIPPED_CONFIGS).sensors
     count = len(plan.lateral_mps2) * len(plan.speed_factor)
     none = random_generator(0)
     taken = [plan.assignment(DriveDraw(n, sensors, none, none)) for n in range(2 * count)]
@@ -209,7 +209,7 @@ def test_grid_takes_every_combination_once_before_any_twice() -> None:
 
 
 def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
-    campaign = load_campaign("waterford")
+    campaign = load_campaign("waterford", SHIPPED_CONFIGS)
     assert isinstance(campaign.plan, GridPlan)
     lowest, highest = min(campaign.plan.speed_factor), max(campaign.plan.speed_factor)
     for day in campaign.days():
@@ -227,7 +227,7 @@ def test_cars_of_a_grid_are_its_vehicles_and_masses(tmp_path: Path) -> None:
 
 
 def test_cars_of_a_fleet_differ_and_keep_their_properties() -> None:
-    campaign = load_campaign("fleet")
+    campaign = load_campaign("fleet", SHIPPED_CONFIGS)
     drives = [d for day in campaign.days() for d in campaign.drives(day)]
     cars = {(d.vehicle_id, d.vehicle, d.sensors) for d in drives}
     assert len(cars) == len({d.vehicle_id for d in drives}) == 300
@@ -250,11 +250,11 @@ def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> N
 @pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
 def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
     with pytest.raises(ConfigError, match="goes from 2024-05-01 to 2024-05-02"):
-        load_campaign("smoke").batches(day)
+        load_campaign("smoke", SHIPPED_CONFIGS).batches(day)
 
 
 def test_the_scenarios_of_the_paper_come_first_in_the_order_of_its_figures() -> None:
-    papers = [scenario.paper for scenario in shipped_scenarios()]
+    papers = [scenario.paper for scenario in load_scenarios(SHIPPED_CONFIGS)]
     figures = [paper for paper in papers if paper]
     assert papers[: len(figures)] == figures
     assert figures[0].startswith("Figures 1")
@@ -262,7 +262,10 @@ def test_the_scenarios_of_the_paper_come_first_in_the_order_of_its_figures() -> 
 
 
 def test_a_scenario_differs_from_its_base_only_in_what_it_says() -> None:
-    base, noisy = load_scenario("nominal"), load_scenario("noise_doubled")
+    base, noisy = (
+        load_scenario("nominal", SHIPPED_CONFIGS),
+        load_scenario("noise_doubled", SHIPPED_CONFIGS),
+    )
     assert noisy.sensors.ax_bias_mps2 == 0.3
     assert noisy.sensors.wheel_speed_std_rad_s == base.sensors.wheel_speed_std_rad_s
     assert noisy.sensors.gps == base.sensors.gps
@@ -271,13 +274,22 @@ def test_a_scenario_differs_from_its_base_only_in_what_it_says() -> None:
 
 
 def test_failures_are_added_to_the_drive_of_the_base() -> None:
-    assert load_scenario("wheel_stuck").drive_id == load_scenario("nominal").drive_id
-    assert load_scenario("gps_tunnel").drive_id == load_scenario("gps_clear").drive_id
-    assert load_scenario("mass_1000").drive_id != load_scenario("nominal").drive_id
+    assert (
+        load_scenario("wheel_stuck", SHIPPED_CONFIGS).drive_id
+        == load_scenario("nominal", SHIPPED_CONFIGS).drive_id
+    )
+    assert (
+        load_scenario("gps_tunnel", SHIPPED_CONFIGS).drive_id
+        == load_scenario("gps_clear", SHIPPED_CONFIGS).drive_id
+    )
+    assert (
+        load_scenario("mass_1000", SHIPPED_CONFIGS).drive_id
+        != load_scenario("nominal", SHIPPED_CONFIGS).drive_id
+    )
 
 
 def test_speed_follows_the_pace() -> None:
-    (drive,) = load_scenario("nominal").batch().drives
+    (drive,) = load_scenario("nominal", SHIPPED_CONFIGS).batch().drives
     planned = replace(drive, pace=()).profile
     factor = drive.profile.speed_mps / planned.speed_mps
     station = planned.station_m

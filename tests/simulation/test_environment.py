@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.environment import TICK_S, WHEELS, SideSlipEnv, Trial
 from fleet_slip.vehicle.highway import FourWheelVehicle
+from tests.support.catalog import SIGNALS
 
 NOTHING = np.zeros(4, dtype=np.float32)
 GENTLE = {"speed_mps": 20.0, "steering_rad": 0.5, "adhesion": 1.0}
@@ -35,7 +35,7 @@ def drive(options: dict[str, float], action: Any = NOTHING, **made: Any) -> list
 def test_gymnasium_makes_it_and_has_no_complaint() -> None:
     env = gymnasium.make("fleet_slip/SideSlip-v0")
     check_env(env.unwrapped, skip_render_check=True)
-    assert env.observation_space.shape == (len(catalogue().inputs),)
+    assert env.observation_space.shape == (len(SIGNALS.inputs),)
 
 
 def test_without_brakes_the_car_is_that_of_the_equations() -> None:
@@ -75,7 +75,7 @@ def test_sensors_are_noisy_and_in_counts_and_the_angle_is_not_among_them() -> No
     rows = np.array([one["seen"] for one in drive({**GENTLE, "steering_rad": 1e-9})], dtype=float)
     yaw = rows[:, env.signals.index("yaw_rate")]
     assert np.std(yaw) == pytest.approx(0.01, rel=0.15)
-    counts = yaw / float(catalogue()["yaw_rate"].scale)
+    counts = yaw / float(SIGNALS["yaw_rate"].scale)
     assert np.abs(counts - np.round(counts)).max() < 1e-3
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from fleet_slip.resources import find_config
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Range, RoadImperfections
 from fleet_slip.simulation.job import simulate_logs
@@ -15,9 +15,10 @@ from fleet_slip.simulation.roads import load_track, surface
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
+from tests.support.catalog import SIGNALS
 
-FLEET = find_config("campaigns", "fleet").read_text(encoding="utf-8")
-SEDAN = load_vehicle("d_class_sedan")
+FLEET = SHIPPED_CONFIGS.find("campaigns", "fleet").read_text(encoding="utf-8")
+SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 
 
 def test_ranges_are_drawn_within_their_bounds_in_the_order_of_their_class() -> None:
@@ -59,14 +60,14 @@ def test_a_car_keeps_its_imperfections_and_a_drive_has_its_own_road(tmp_path: Pa
     )
     text = FLEET.replace("cars = 300", "cars = 3")
     file.write_text(text.replace("[plan.load]", f"{ranges}[plan.load]"))
-    campaign = load_campaign(str(file))
+    campaign = load_campaign(str(file), SHIPPED_CONFIGS)
     drives = [drive for day in campaign.days()[:2] for drive in campaign.drives(day)]
     lash = {(d.vehicle_id, d.flaws.car.steering_lash_deg) for d in drives}
     assert len(lash) == 3
     assert len({d.flaws.road.wind_mps for d in drives}) == len(drives)
     assert (
         campaign.batches(campaign.days()[0])[0].digest
-        != load_campaign("fleet").batches(campaign.days()[0])[0].digest
+        != load_campaign("fleet", SHIPPED_CONFIGS).batches(campaign.days()[0])[0].digest
     )
 
 
@@ -74,9 +75,11 @@ def test_imperfections_change_nothing_else_that_is_drawn(tmp_path: Path) -> None
     file = tmp_path / "campaign.toml"
     ranges = "[plan.imperfections.car]\nsteering_lash_deg = { min = 1.0, max = 4.0 }\n"
     file.write_text(FLEET.replace("[plan.load]", f"{ranges}[plan.load]"))
-    day = load_campaign("fleet").days()[0]
+    day = load_campaign("fleet", SHIPPED_CONFIGS).days()[0]
     for one, other in zip(
-        load_campaign("fleet").drives(day), load_campaign(str(file)).drives(day), strict=True
+        load_campaign("fleet", SHIPPED_CONFIGS).drives(day),
+        load_campaign(str(file), SHIPPED_CONFIGS).drives(day),
+        strict=True,
     ):
         assert (one.vehicle, one.sensors, one.limits, one.speed_factor) == (
             other.vehicle,
@@ -107,7 +110,7 @@ def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
 
 
 def roughness(**road: float) -> list[np.ndarray]:
-    track = load_track("waterford_hills")
+    track = load_track("waterford_hills", SHIPPED_CONFIGS)
     station_m, _ = track.grid(1.0)
     found = surface(
         RoadImperfections.model_validate(road),
@@ -126,7 +129,7 @@ def test_slopes_pull_downhill_and_bends_lean_inwards() -> None:
     assert not along.any()
     assert not wind.any()
     np.testing.assert_array_equal(left, right)
-    track = load_track("waterford_hills")
+    track = load_track("waterford_hills", SHIPPED_CONFIGS)
     curvature = track.curvature(track.grid(1.0)[0])
     inwards = roughness(superelevation_percent=6.0)[1]
     assert (inwards * curvature >= 0).all()
@@ -147,10 +150,10 @@ def test_adhesion_differs_along_the_road_and_across_it() -> None:
 
 
 @pytest.mark.parametrize("name", ["imperfect", "imperfect_car", "imperfect_sensors"])
-def test_shipped_scenarios_with_imperfections_are_driven_and_measured(name: str) -> None:
-    (spec,) = load_scenario(name).batch().drives
-    (usual,) = load_scenario("nominal").batch().drives
-    (log, plain) = simulate_logs([replace(spec, laps=0.2), replace(usual, laps=0.2)])
+def test_load_scenarios_with_imperfections_are_driven_and_measured(name: str) -> None:
+    (spec,) = load_scenario(name, SHIPPED_CONFIGS).batch().drives
+    (usual,) = load_scenario("nominal", SHIPPED_CONFIGS).batch().drives
+    (log, plain) = simulate_logs(SIGNALS, [replace(spec, laps=0.2), replace(usual, laps=0.2)])
     assert log.lost_control_s is None
     assert log.measurement.saturated == 0
     assert log.rows == pytest.approx(plain.rows, rel=0.05)
@@ -163,7 +166,7 @@ def test_shipped_scenarios_with_imperfections_are_driven_and_measured(name: str)
 
 def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:
     """Characteristic speeds v = √(L / K) of today's cars: 65 to 100 km/h, some beyond."""
-    campaign = load_campaign("fleet_realistic")
+    campaign = load_campaign("fleet_realistic", SHIPPED_CONFIGS)
     drives = [drive for day in campaign.days()[:6] for drive in campaign.drives(day)]
     speeds_kmh = []
     for drive in drives:
@@ -183,7 +186,7 @@ def test_tyres_wear_from_day_to_day_and_new_ones_follow(tmp_path: Path) -> None:
     )
     text = text.replace("number_of_days = 25", "number_of_days = 201")
     file.write_text(text.replace("[plan.load]", f"{wear}[plan.load]"))
-    campaign = load_campaign(str(file))
+    campaign = load_campaign(str(file), SHIPPED_CONFIGS)
     tyres = [drive.vehicle.tyre for day in campaign.days() for drive in campaign.drives(day)]
     new, old = tyres[0], tyres[100]
     assert old.peak_stiffness_n / new.peak_stiffness_n == pytest.approx(1.05)
@@ -192,7 +195,7 @@ def test_tyres_wear_from_day_to_day_and_new_ones_follow(tmp_path: Path) -> None:
     assert tyres[200] == new
     plain = tmp_path / "plain.toml"
     plain.write_text(text)
-    (first,) = load_campaign(str(plain)).drives(campaign.days()[0])
+    (first,) = load_campaign(str(plain), SHIPPED_CONFIGS).drives(campaign.days()[0])
     assert first.vehicle.tyre == new
     with pytest.raises(ValidationError, match="a tread does not grow"):
         ImperfectionRanges(tread_wear_per_100_days=Range(min=-0.1, max=0.1))

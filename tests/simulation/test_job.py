@@ -11,6 +11,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 
 from fleet_slip.base import no_progress
 from fleet_slip.errors import RefusedError
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
 from fleet_slip.storage.local import LocalFolder
@@ -25,7 +26,7 @@ DAYS = 5
 def campaign(**changes: object) -> Campaign:
     """Return days of one drive of a few seconds."""
     plan = {"number_of_days": DAYS, "drives_per_day": 1, "laps": 0.03, **changes}
-    return load_campaign("smoke").model_copy(update=plan)
+    return load_campaign("smoke", SHIPPED_CONFIGS).model_copy(update=plan)
 
 
 def run(root: Path, plan: Campaign, progress: Callable[[int, int], None]) -> SimulationReport:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.receivers import Receiver, ReceiverLog
 from fleet_slip.simulation.sensors import Measurement
+from tests.support.catalog import SIGNALS
 
 TICK_S = 0.01
 RAD = 2 * np.pi / 65536
@@ -39,7 +41,7 @@ def truth(ticks: int = 3000, speed: float = 15.0) -> dict[str, NDArray[np.float6
 
 def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> Measurement:
     """Return what is logged of a drive that comes in blocks."""
-    log = ReceiverLog(receiver, np.random.default_rng(5))
+    log = ReceiverLog(SIGNALS, receiver, np.random.default_rng(5))
     for begin, end in zip((0, *cuts), (*cuts, len(drive["vx_mps"])), strict=True):
         log.record({name: values[begin:end] for name, values in drive.items()})
     return log.measurement()
@@ -110,9 +112,12 @@ def test_blocks_change_neither_heading_nor_fixes() -> None:
 
 def test_a_campaign_with_receivers_has_the_drives_of_its_base(tmp_path: Path) -> None:
     (tmp_path / "received.toml").write_text(OF_SMOKE)
-    plain, received = load_campaign("smoke"), load_campaign(str(tmp_path / "received.toml"))
+    plain, received = (
+        load_campaign("smoke", SHIPPED_CONFIGS),
+        load_campaign(str(tmp_path / "received.toml"), SHIPPED_CONFIGS),
+    )
     day = plain.days()[0]
-    (before,), (after,) = (simulate_logs(c.drives(day)[:1]) for c in (plain, received))
+    (before,), (after,) = (simulate_logs(SIGNALS, c.drives(day)[:1]) for c in (plain, received))
     assert before.spec.drive_id != after.spec.drive_id
     assert before.fixes is None and after.fixes is not None
     for name, counts in before.measurement.counts.items():

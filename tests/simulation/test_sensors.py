@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import Signal, catalogue
+from fleet_slip.catalog.signals import Signal
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import (
     EXACT,
@@ -28,6 +28,7 @@ from fleet_slip.simulation.sensors import (
 )
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections
+from tests.support.catalog import SIGNALS
 
 TICKS = 200_000
 GPS = Gps(rate_hz=10, velocity_std_mps=0.05, time_between_outages_s=60, outage_duration_s=5)
@@ -48,7 +49,7 @@ SENSORS = Sensors(
 def constant_truth(ticks: int = TICKS) -> dict[str, NDArray[np.float64]]:
     return {
         signal.column: np.full(ticks, 0.01 * (i + 1))
-        for i, signal in enumerate(catalogue().signals.values())
+        for i, signal in enumerate(SIGNALS.signals.values())
     }
 
 
@@ -60,7 +61,7 @@ def test_noise_has_the_stated_bias_and_standard_deviation() -> None:
     truth = constant_truth()
     measured = measure(truth, SENSORS, generator())
     for name, (bias, std) in SENSORS.bias_and_std.items():
-        signal = catalogue()[name]
+        signal = SIGNALS[name]
         error = measured.counts[name] * float(signal.scale) - truth[signal.column]
         # Rounding to counts adds a variance of scale² / 12.
         expected = np.hypot(std, float(signal.scale) / np.sqrt(12))
@@ -89,7 +90,7 @@ def test_gps_has_its_own_rate_noise_and_outages() -> None:
     assert np.diff(np.flatnonzero(measured.gps_fix)).max() > 200, "an outage lasts for seconds"
     for name in ("gps_vx", "gps_vy"):
         velocity = measured.counts[name][measured.gps_fix] * 0.005
-        error = velocity - truth[catalogue()[name.removeprefix("gps_")].column][0]
+        error = velocity - truth[SIGNALS[name.removeprefix("gps_")].column][0]
         assert np.std(error) == pytest.approx(0.05, rel=0.03)
         assert not measured.counts[name][~measured.gps_fix].any()
 
@@ -109,18 +110,18 @@ def test_values_out_of_range_saturate_and_are_counted() -> None:
 
 
 def test_halves_round_to_even() -> None:
-    signal = catalogue()["wheel_fl"].model_copy(update={"scale": Decimal("0.25")})
+    signal = SIGNALS["wheel_fl"].model_copy(update={"scale": Decimal("0.25")})
     counts, clipped = quantise(np.array([0.125, 0.375, 0.625, -0.125, -0.375]), signal)
     assert counts.tolist() == [0, 2, 2, 0, -2]
     assert clipped == 0
 
 
 @given(
-    name=st.sampled_from(sorted(catalogue().signals)),
+    name=st.sampled_from(sorted(SIGNALS.signals)),
     values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=20),
 )
 def test_counts_are_the_nearest_within_the_valid_range(name: str, values: list[float]) -> None:
-    signal = catalogue()[name]
+    signal = SIGNALS[name]
     counts, clipped = quantise(np.array(values), signal)
     inside = 0
     for value, count in zip(values, counts.tolist(), strict=True):
@@ -300,7 +301,7 @@ def measure(
     truth: Mapping[str, FloatArray], sensors: Sensors, generator: np.random.Generator
 ) -> Measurement:
     """Measure one drive in one block; see `Recorder`."""
-    recorder = Recorder(sensors, generator)
+    recorder = Recorder(SIGNALS, sensors, generator)
     recorder.record(truth)
     return recorder.measurement()
 

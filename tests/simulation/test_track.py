@@ -11,6 +11,7 @@ from scipy.integrate import quad
 from scipy.special import fresnel
 
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import (
     CLASSES,
     Segment,
@@ -42,7 +43,7 @@ def make_track(*segments: tuple[float, float, float], closed: bool = False) -> T
 def test_circuits_have_the_stated_length_and_close(
     name: str, length_m: float, gap_m: float
 ) -> None:
-    track = load_track(name)
+    track = load_track(name, SHIPPED_CONFIGS)
     assert track.length_m == pytest.approx(length_m, abs=0.06)
     gap, turn = track.closure()
     assert gap <= gap_m
@@ -64,11 +65,13 @@ def test_segments_are_those_of_the_source(name: str, file: str) -> None:
             (float(r["length_m"]), float(r["kappa_start_1pm"]), float(r["kappa_end_1pm"]))
             for r in csv.DictReader(lines)
         ]
-    assert rows == [(s.length_m, *s.curvature_1pm) for s in load_track(name).segments]
+    assert rows == [
+        (s.length_m, *s.curvature_1pm) for s in load_track(name, SHIPPED_CONFIGS).segments
+    ]
 
 
 def test_circle_is_a_circle() -> None:
-    line = load_track("skid_pad").centre_line(0.7)
+    line = load_track("skid_pad", SHIPPED_CONFIGS).centre_line(0.7)
     assert np.allclose(np.hypot(line.x_m, line.y_m - 50.0), 50.0, rtol=0, atol=1e-11)
     assert line.y_m.max() > 99.9, "positive curvature bends left"
 
@@ -83,7 +86,7 @@ def test_clothoid_is_the_fresnel_integral() -> None:
 
 
 def test_heading_integrates_curvature() -> None:
-    track = load_track("waterford_hills")
+    track = load_track("waterford_hills", SHIPPED_CONFIGS)
     line = track.centre_line(50.0)
     ends = np.cumsum([segment.length_m for segment in track.segments])
     for a, b, change in zip(
@@ -95,10 +98,10 @@ def test_heading_integrates_curvature() -> None:
 
 
 def test_grid_of_a_closed_track_leaves_out_its_end() -> None:
-    station, spacing = load_track("skid_pad").grid(1.0)
+    station, spacing = load_track("skid_pad", SHIPPED_CONFIGS).grid(1.0)
     assert len(station) == 314
     assert station[-1] + spacing == pytest.approx(314.159265)
-    station, spacing = load_track("straight").grid(1.0)
+    station, spacing = load_track("straight", SHIPPED_CONFIGS).grid(1.0)
     assert (len(station), spacing, station[-1]) == (1001, 1.0, 1000.0)
 
 
@@ -121,15 +124,18 @@ def test_a_road_is_of_its_class(named: tuple[str, int]) -> None:
 
 
 def test_a_name_is_a_class_and_a_seed() -> None:
-    assert load_track("country_17").segments == draw_road("country", 17).segments
-    assert load_track("country_17").segments != load_track("country_18").segments
-    assert load_track("hill_17").name == "hill_17"
+    assert load_track("country_17", SHIPPED_CONFIGS).segments == draw_road("country", 17).segments
+    assert (
+        load_track("country_17", SHIPPED_CONFIGS).segments
+        != load_track("country_18", SHIPPED_CONFIGS).segments
+    )
+    assert load_track("hill_17", SHIPPED_CONFIGS).name == "hill_17"
 
 
 @pytest.mark.parametrize("name", ["country", "country_", "field_3", "country_-1", "country_1e3"])
 def test_another_name_is_none(name: str) -> None:
     with pytest.raises(ConfigError):
-        load_track(name)
+        load_track(name, SHIPPED_CONFIGS)
 
 
 @given(ROADS)
@@ -152,12 +158,14 @@ def test_who_cuts_turns_as_far_and_less_sharply(named: tuple[str, int], cut_m: f
 
 
 def test_who_wanders_stays_near_the_line_and_in_its_direction() -> None:
-    road = load_track("straight")
+    road = load_track("straight", SHIPPED_CONFIGS)
     line = driven_line(road, 0.0, 0.2, 30.0, random_generator(1)).centre_line(1.0)
     assert 0.05 < np.std(line.y_m - np.polyval(np.polyfit(line.x_m, line.y_m, 1), line.x_m)) < 2
 
 
-TRACKS = {name: load_track(name) for name in ("waterford_hills", "melbourne", "skid_pad")}
+TRACKS = {
+    name: load_track(name, SHIPPED_CONFIGS) for name in ("waterford_hills", "melbourne", "skid_pad")
+}
 S_BEND = Track(
     name="s_bend",
     description="open: a straight, a left and a right bend",

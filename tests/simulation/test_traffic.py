@@ -12,12 +12,14 @@ import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
 from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import traffic
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.imperfections import Uniform
 from fleet_slip.simulation.job import simulate_batch, simulate_logs
 from fleet_slip.simulation.roads import SLOWEST_MPS
 from fleet_slip.simulation.traffic import SITES, TrafficDrive
+from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run
 
 SHORT = """
@@ -41,7 +43,7 @@ print(digests_of(sys.argv[1:]))
 
 def drives(roads: list[str], duration_s: float = 3.0) -> tuple[DriveSpec, ...]:
     """Return a drive on each road, whose names and seeds do not depend on their order."""
-    campaign = load_campaign("traffic")
+    campaign = load_campaign("traffic", SHIPPED_CONFIGS)
     length = Uniform(min=duration_s, max=duration_s)
     specs = []
     for road in roads:
@@ -53,12 +55,12 @@ def drives(roads: list[str], duration_s: float = 3.0) -> tuple[DriveSpec, ...]:
 
 
 def batch_of(roads: list[str]) -> Batch:
-    return Batch("traffic", load_campaign("traffic").first_day, 0, drives(roads))
+    return Batch("traffic", load_campaign("traffic", SHIPPED_CONFIGS).first_day, 0, drives(roads))
 
 
 def digests_of(order: list[str]) -> list[tuple[str, int, str]]:
     """Simulate a drive on each road, in an order; return the roads, rows and their digests."""
-    table = simulate_batch(batch_of(order)).combine_chunks()
+    table = simulate_batch(SIGNALS, batch_of(order)).combine_chunks()
     found = []
     for road in sorted(order):
         rows = table.filter([name.as_py() == road for name in table["track"]]).to_pylist()
@@ -100,7 +102,7 @@ def test_the_plan_keeps_the_driver_s_limits_and_lasts_as_long_as_asked(spec: Dri
 
 
 def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
-    (log,) = simulate_logs([spec], ("lateral_offset_m",))
+    (log,) = simulate_logs(SIGNALS, [spec], ("lateral_offset_m",))
     assert log.lost_control_s is None
     assert log.rows == pytest.approx(spec.expected_rows, rel=0.02)
     assert np.abs(log.motion["lateral_offset_m"]).max() < 1.0
@@ -183,7 +185,7 @@ def test_traffic_of_another_kind_is_refused(
 
 
 def test_every_road_and_car_is_in_the_campaign() -> None:
-    campaign: Campaign = load_campaign("traffic")
+    campaign: Campaign = load_campaign("traffic", SHIPPED_CONFIGS)
     specs = [spec for day in campaign.days() for spec in campaign.drives(day)]
     assert {spec.track.name for spec in specs} == set(SITES)
     assert len({spec.vehicle_id for spec in specs}) == 4

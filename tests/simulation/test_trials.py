@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -10,29 +11,30 @@ import pyarrow.compute as pc
 import pytest
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.blind import blind_scenarios
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import job as simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.job import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.simulation.plan import TrialPlan
 from fleet_slip.simulation.roads import CLASSES, SLOWEST_MPS, Manoeuvre, load_track, road_with
-from fleet_slip.simulation.scenario import shipped_scenarios
+from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.simulation.test_sensors import measure
+from tests.support.catalog import SIGNALS
 from tests.support.logs import schema_without
 from tests.support.rolling import simulate_drives
 
-SEDAN = load_vehicle("d_class_sedan")
+SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 
 
 @pytest.fixture(scope="module")
 def drives() -> tuple[DriveSpec, ...]:
-    campaign = load_campaign("proving_ground")
+    campaign = load_campaign("proving_ground", SHIPPED_CONFIGS)
     return tuple(drive for day in campaign.days() for drive in campaign.drives(day))
 
 
@@ -42,7 +44,7 @@ def straight(speed_mps: float = 20.0, *, closed: bool = False) -> Road:
 
 
 def test_one_car_is_tested_and_others_take_turns(drives: tuple[DriveSpec, ...]) -> None:
-    plan = load_campaign("proving_ground").plan
+    plan = load_campaign("proving_ground", SHIPPED_CONFIGS).plan
     assert isinstance(plan, TrialPlan)
     tested = [d for d in drives if d.vehicle_id == "proving_ground-0000"]
     assert len(tested) == len(drives) * (plan.other_every - 1) // plan.other_every
@@ -54,7 +56,7 @@ def test_one_car_is_tested_and_others_take_turns(drives: tuple[DriveSpec, ...]) 
 
 
 def test_no_drive_of_a_scenario_is_driven(drives: tuple[DriveSpec, ...]) -> None:
-    tests = [scenario.batch().drives[0] for scenario in shipped_scenarios()]
+    tests = [scenario.batch().drives[0] for scenario in load_scenarios(SHIPPED_CONFIGS)]
     assert {d.seed for d in drives}.isdisjoint(d.seed for d in tests)
     plans = {(d.vehicle, d.track.name, d.limits, d.adhesion) for d in drives}
     assert plans.isdisjoint((d.vehicle, d.track.name, d.limits, d.adhesion) for d in tests)
@@ -101,7 +103,7 @@ def test_a_car_drives_the_lateral_acceleration_of_a_slalom() -> None:
 
 @pytest.fixture(scope="module")
 def on_roads() -> tuple[DriveSpec, ...]:
-    campaign = load_campaign("proving_roads")
+    campaign = load_campaign("proving_roads", SHIPPED_CONFIGS)
     return campaign.drives(campaign.first_day)
 
 
@@ -132,9 +134,12 @@ def test_load_and_wear_are_of_the_drive_and_all_else_of_the_car(
 def test_no_road_of_the_plan_is_a_blind_one() -> None:
     """Names reach to nine digits; a version's seeds are below that once in 10⁹ versions."""
     with pytest.raises(ConfigError):
-        load_track("country_1000000000")
-    assert min(one.seed for one in blind_scenarios("ab" * 32)) > 1e9
-    assert load_campaign("proving_roads").seed != load_campaign("proving_ground").seed
+        load_track("country_1000000000", SHIPPED_CONFIGS)
+    assert min(one.seed for one in blind_scenarios("ab" * 32, SHIPPED_CONFIGS)) > 1e9
+    assert (
+        load_campaign("proving_roads", SHIPPED_CONFIGS).seed
+        != load_campaign("proving_ground", SHIPPED_CONFIGS).seed
+    )
 
 
 DAY = date(2024, 5, 1)
@@ -142,7 +147,7 @@ DAY = date(2024, 5, 1)
 
 def short_batch(laps: float = 0.05) -> Batch:
     """Return the four drives of a smoke day, a few seconds each."""
-    drives = load_campaign("smoke").drives(DAY)
+    drives = load_campaign("smoke", SHIPPED_CONFIGS).drives(DAY)
     return Batch("smoke", DAY, 0, tuple(replace(drive, laps=laps) for drive in drives))
 
 
@@ -161,12 +166,12 @@ def synthetic_table(*truths: Truth, lost_control_s: float | None = None) -> pa.T
         DriveLog(spec, measure(truth, spec.sensors, spec.generator()), at_s)
         for spec, truth, at_s in zip(batch.drives, truths, lost, strict=False)
     ]
-    return tabulate(batch, logs)
+    return tabulate(SIGNALS, batch, logs)
 
 
 def physical(table: pa.Table, name: str) -> NDArray[np.float64]:
     counts: NDArray[np.float64] = table[name].to_numpy().astype(np.float64)
-    return counts * float(catalogue()[name].scale)
+    return counts * float(SIGNALS[name].scale)
 
 
 def test_table_has_the_schema_of_the_logs_with_strings_as_dictionaries() -> None:
@@ -175,7 +180,7 @@ def test_table_has_the_schema_of_the_logs_with_strings_as_dictionaries() -> None
         field.with_type(field.type.value_type) if pa.types.is_dictionary(field.type) else field
         for field in table.schema
     ]
-    assert pa.schema(plain) == schema_without(catalogue().optional)
+    assert pa.schema(plain) == schema_without(SIGNALS.optional)
     table.validate(full=True)
 
 
@@ -200,12 +205,12 @@ def test_drive_columns_say_what_was_driven() -> None:
         "saturated": 0,
     }
     assert {name: row[name] for name in expected} == expected
-    assert [*expected] == [n for n in catalogue().drive if n not in catalogue().optional]
+    assert [*expected] == [n for n in SIGNALS.drive if n not in SIGNALS.optional]
 
 
 def test_only_gps_between_fixes_is_null() -> None:
     table = synthetic_table(synthetic_truth(30), synthetic_truth(20))
-    for name in set(catalogue().signals) - set(catalogue().extras):
+    for name in set(SIGNALS.signals) - set(SIGNALS.extras):
         is_fix = [tick % 10 == 0 for tick in table["tick"].to_pylist()]
         expected = is_fix if name.startswith("gps_") else [True] * 50
         assert table[name].is_valid().to_pylist() == expected, name
@@ -223,26 +228,26 @@ def test_clipped_values_are_counted_in_every_row_of_their_drive() -> None:
 def test_bytes_do_not_depend_on_which_drives_run_side_by_side(
     together: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = simulate_batch(short_batch())
+    expected = simulate_batch(SIGNALS, short_batch())
     monkeypatch.setattr(simulate, "DRIVES_AT_ONCE", together)
-    assert simulate_batch(short_batch()).equals(expected)
+    assert simulate_batch(SIGNALS, short_batch()).equals(expected)
 
 
 def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
     whole = short_batch()
     batches = [Batch("smoke", DAY, i, (drive,)) for i, drive in enumerate(whole.drives)]
-    one_by_one = [simulate_batch(batch) for batch in batches]
+    one_by_one = [simulate_batch(SIGNALS, batch) for batch in batches]
     with ThreadPoolExecutor(4) as threads:
-        backwards = list(threads.map(simulate_batch, reversed(batches)))
+        backwards = list(threads.map(partial(simulate_batch, SIGNALS), reversed(batches)))
     for here, there in zip(one_by_one, reversed(backwards), strict=True):
         assert here.equals(there)
     unified = pa.concat_tables(one_by_one).unify_dictionaries().combine_chunks()
-    assert unified.equals(simulate_batch(whole))
+    assert unified.equals(simulate_batch(SIGNALS, whole))
 
 
 def test_drives_last_as_long_as_expected() -> None:
     batch = short_batch(laps=0.3)
-    rows = pc.value_counts(simulate_batch(batch)["drive_id"].cast(pa.string())).to_pylist()
+    rows = pc.value_counts(simulate_batch(SIGNALS, batch)["drive_id"].cast(pa.string())).to_pylist()
     for spec, count in zip(batch.drives, rows, strict=True):
         assert count["values"] == spec.drive_id
         assert count["counts"] == pytest.approx(spec.expected_rows, rel=0.05)
@@ -250,12 +255,18 @@ def test_drives_last_as_long_as_expected() -> None:
 
 def on_skid_pad(drive: DriveSpec, lateral_mps2: float) -> DriveSpec:
     limits = drive.limits.model_copy(update={"lateral_mps2": lateral_mps2})
-    return replace(drive, track=load_track("skid_pad"), limits=limits, speed_factor=1.0, laps=1.0)
+    return replace(
+        drive,
+        track=load_track("skid_pad", SHIPPED_CONFIGS),
+        limits=limits,
+        speed_factor=1.0,
+        laps=1.0,
+    )
 
 
 def test_left_turn_has_positive_yaw_rate_lateral_acceleration_and_steer() -> None:
     drive = on_skid_pad(short_batch().drives[0], 4.0)
-    table = simulate_batch(Batch("test", DAY, 0, (drive,)))
+    table = simulate_batch(SIGNALS, Batch("test", DAY, 0, (drive,)))
     steady = table.slice(5 * SAMPLE_RATE_HZ)
     speed = np.sqrt(4.0 * 50.0)
     assert np.mean(physical(steady, "ay")) == pytest.approx(4.0 + 0.15, abs=0.1)
@@ -273,18 +284,18 @@ def test_the_angle_of_a_loaded_car_is_that_of_the_place_where_the_empty_one_has_
 
     300 kg, 1.9 m behind, move the centre of gravity by a third of a metre, and 0.6 degrees.
     """
-    (drive, *_) = load_campaign("smoke").drives(date(2024, 5, 1))
+    (drive, *_) = load_campaign("smoke", SHIPPED_CONFIGS).drives(date(2024, 5, 1))
     empty = on_skid_pad(drive, 0.3)
     body = empty.vehicle.body
     car = empty.vehicle.with_sprung_mass(body.sprung_mass_kg + 300, -1.9)
     shift_m = 300 * 1.9 / (body.mass_kg + 300)
     assert car.body.reference_m == pytest.approx(shift_m)
-    logs = simulate_logs([empty, replace(empty, vehicle=car)], ("vy_mps", "vx_mps"))
+    logs = simulate_logs(SIGNALS, [empty, replace(empty, vehicle=car)], ("vy_mps", "vx_mps"))
     one, other = (np.mean(log.motion["vy_mps"][500:] / log.motion["vx_mps"][500:]) for log in logs)
     radius_m = 1 / float(np.mean(empty.profile.track.curvature(empty.profile.station_m)))
     assert one == pytest.approx(body.rear_axle_m / radius_m, abs=0.002)
     assert other == pytest.approx(one, abs=0.1 * shift_m / radius_m)
-    label = catalogue()["sideslip"]
+    label = SIGNALS["sideslip"]
     for log, expected in zip(logs, (one, other), strict=True):
         measured = np.mean(log.measurement.counts["sideslip"][500:]) * float(label.scale)
         assert measured == pytest.approx(expected, abs=0.0005)
@@ -293,9 +304,9 @@ def test_the_angle_of_a_loaded_car_is_that_of_the_place_where_the_empty_one_has_
 def test_a_drive_longer_than_a_block_goes_on_where_the_block_ended() -> None:
     drive = on_skid_pad(short_batch().drives[0], 4.0)
     long = replace(drive, laps=2 * BLOCK / drive.expected_rows * 1.1)
-    log, short = simulate_logs([long, replace(drive, laps=0.5)])
+    log, short = simulate_logs(SIGNALS, [long, replace(drive, laps=0.5)])
     assert log.rows > 2 * BLOCK
-    table = tabulate(Batch("test", DAY, 0, (long, drive)), [log, short])
+    table = tabulate(SIGNALS, Batch("test", DAY, 0, (long, drive)), [log, short])
     assert table["tick"].to_pylist() == [*range(log.rows), *range(short.rows)]
     for name in ("vx", "station", "yaw_rate"):
         counts = log.measurement.counts[name].astype(int)

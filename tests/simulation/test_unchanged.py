@@ -12,9 +12,11 @@ import polars as pl
 import pyarrow as pa
 import pytest
 
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import simulate_batch
 from fleet_slip.simulation.scenario import load_scenario
+from tests.support.catalog import SIGNALS
 
 CAMPAIGNS = {
     "smoke": (
@@ -80,13 +82,13 @@ def short(batch: Batch) -> Batch:
 
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_campaigns_give_the_same_bits(name: str) -> None:
-    campaign = load_campaign(name)
+    campaign = load_campaign(name, SHIPPED_CONFIGS)
     batch = campaign.batches(campaign.days()[0])[0]
-    found = (campaign.digest, batch.digest, checksum(simulate_batch(short(batch))))
+    found = (campaign.digest, batch.digest, checksum(simulate_batch(SIGNALS, short(batch))))
     assert found == CAMPAIGNS[name]
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_scenarios_give_the_same_bits(name: str) -> None:
-    batch = load_scenario(name).batch()
-    assert (batch.digest, checksum(simulate_batch(batch))) == SCENARIOS[name]
+    batch = load_scenario(name, SHIPPED_CONFIGS).batch()
+    assert (batch.digest, checksum(simulate_batch(SIGNALS, batch))) == SCENARIOS[name]

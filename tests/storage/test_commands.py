@@ -1,5 +1,6 @@
 """The command line on an object store: the same bits as in a folder, and nothing told of keys."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from fleet_slip.storage.checksums import checksum_in
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import finish, start_on
 from tests.support.dask_processes import dask_processes
 from tests.support.s3_server import SECRET_KEY, ServerApart, command_on
@@ -112,6 +114,24 @@ def test_a_car_is_forgotten_and_its_files_are_gone(copied: Folder) -> None:
     assert command_on(root, "sql", "--json", query).json == [{"n": 0}]
     assert command_on(root, "compact").exit_code == 0
     assert command_on(root, "verify", "--full").exit_code == 0
+
+
+@pytest.mark.parametrize("shift_s", [-60, -2 * 86_400, 600])
+def test_erasure_does_not_depend_on_the_clock_of_the_store(
+    copied: Folder, monkeypatch: pytest.MonkeyPatch, shift_s: int
+) -> None:
+    drive = "smoke-2024-05-01-0001"
+    before = stored(copied)
+    now, now_ns = time.time, time.time_ns
+    monkeypatch.setattr(time, "time", lambda: now() + shift_s)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() + shift_s * 10**9)
+    done = command_on(copied, "forget", "--drive", drive, "--now", "--json")
+    assert (done.exit_code, done.json["pending"]) == (0, [])
+    assert len(before.keys() - stored(copied).keys()) == 3
+    left = [file for file in copied.files() if file.path.endswith(".parquet")]
+    warehouse = Warehouse(copied)
+    active = {f"{t.folder.name}/{f.path}" for t in warehouse.tables for f in t.snapshot().files}
+    assert {file.path for file in left if "/versions/" not in file.path} == active
 
 
 def test_processes_at_once_lose_and_double_nothing(server: ServerApart, local: Folder) -> None:

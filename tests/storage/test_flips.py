@@ -25,6 +25,7 @@ from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.tables import Warehouse
 from tests.models.acceptance.test_champion_rules import publish_from, write
+from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
 from tests.support.s3_server import Server, forget_clients
@@ -147,7 +148,7 @@ QUESTIONS: dict[str, Callable[[Warehouse], Any]] = {
     "load_cohort": lambda w: load_cohort(w).tables[0].products.sum(),
     "fold sums": lambda w: load_cohort(w, folding=Folding()).rows,
     "publish": lambda w: publish_from(w, force=True).version.version,
-    "score": lambda w: score(w, Registry(w.root / "models").resolve("beta").manifest, "true"),
+    "score": lambda w: score(w, Registry(w.root, CATALOG).resolve("beta").manifest, "true"),
     "sql": lambda w: query(w, "SELECT sum(ay) FROM log_counts"),
 }
 

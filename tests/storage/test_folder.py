@@ -83,7 +83,7 @@ def test_of_many_that_create_a_file_one_has_made_it(root: Folder) -> None:
 def test_no_document_is_lost_or_doubled_where_answers_are_lost(
     root: Folder, server: Server
 ) -> None:
-    folder = DocumentFolder(root / "evaluations")
+    folder = DocumentFolder(root, "evaluations")
 
     def write(writer: int) -> list[int]:
         return [folder.append({"writer": writer, "n": n}).number for n in range(8)]

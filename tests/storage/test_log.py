@@ -78,7 +78,7 @@ def test_a_failure_is_recorded_with_its_exit_code_and_raised(tmp_path: Path) -> 
         raise KeyboardInterrupt
     failed, interrupted = runs(tmp_path)
     assert (failed["outcome"], failed["exit_code"]) == ("failed", 4)
-    assert failed["error"] == f"{HIDDEN}: no such file."
+    assert failed["error"] == f"{HIDDEN}.csv: no such file."
     assert [one["name"] for one in failed["steps"]] == ["ingest"]
     assert (interrupted["outcome"], interrupted["exit_code"]) == ("interrupted", 130)
 
@@ -286,6 +286,18 @@ def test_a_killed_run_whose_number_another_process_has_is_not_under_way(tmp_path
     folder.mkdir()
     (folder / f"{now:%Y-%m}.jsonl").write_bytes(b"\n".join(lines) + b"\n")
     assert runs_under_way(LocalFolder(tmp_path)) == names[1:]
+
+
+def test_a_live_run_of_this_machine_is_under_way_whatever_the_clock_says(tmp_path: Path) -> None:
+    now = datetime.now(UTC)
+    began = f"{now - timedelta(hours=30):%Y%m%dT%H%M%S.%fZ}"
+    lines = [
+        write_line(run_of(run_id=f"{began}-{host}", command="learn", host=host))
+        for host in (socket.gethostname(), "elsewhere")
+    ]
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / f"{now:%Y-%m}.jsonl").write_bytes(b"\n".join(lines) + b"\n")
+    assert runs_under_way(LocalFolder(tmp_path)) == [f"{began}-{socket.gethostname()}"]
 
 
 def runs_in(root: Folder) -> list[tuple[object, ...]]:

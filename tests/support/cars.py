@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.regression.gram import Gram
+from tests.support.catalog import SIGNALS
 
 Signals = dict[str, NDArray[np.float64]]
 
@@ -58,14 +58,14 @@ def drive(rng: np.random.Generator, gentleness: float = 1.0) -> Signals:
 def counts(signals: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.int16]]:
     """Return signals in counts."""
     return {
-        name: np.rint(values / float(catalogue()[name].scale)).astype(np.int16)
+        name: np.rint(values / float(SIGNALS[name].scale)).astype(np.int16)
         for name, values in signals.items()
     }
 
 
 def gram_of(told: Mapping[str, NDArray[np.int16]]) -> Gram:
     """Return the Gram of a drive's counts."""
-    names = catalogue().gram_signals
+    names = SIGNALS.gram_signals
     return Gram.from_counts(names, np.column_stack([told[n].astype(np.int64) for n in names]))
 
 

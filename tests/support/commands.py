@@ -1,8 +1,6 @@
 """The command line, in this process or in one of its own, none of which lasts for ever."""
 
 import contextlib
-import functools
-import inspect
 import json
 import os
 import resource
@@ -67,7 +65,6 @@ def run_here(
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         with (
             _left_as_it_was(),
-            _configs_read_anew(env is not None or "--config" in words),
             contextlib.chdir(cwd or "."),
             tempfile.TemporaryFile("w+") as given,
         ):
@@ -115,26 +112,6 @@ def _left_as_it_was() -> Iterator[None]:
                 os.close(copy)
             LOGGER.handlers[:], LOGGER.level, LOGGER.propagate = log
             resource.setrlimit(resource.RLIMIT_DATA, limits)
-
-
-@contextlib.contextmanager
-def _configs_read_anew(anew: bool) -> Iterator[None]:
-    """Forget, before and after, what a process reads of its configs once and makes of it."""
-    if anew:
-        _forget_configs()
-    try:
-        yield
-    finally:
-        if anew:
-            _forget_configs()
-
-
-def _forget_configs() -> None:
-    for name, module in list(sys.modules.items()):
-        for one in vars(module).values() if name.startswith("fleet_slip.") else ():
-            cached = isinstance(one, functools._lru_cache_wrapper) and one.__module__ == name
-            if cached and not inspect.signature(one).parameters:
-                one.cache_clear()
 
 
 def _can_run_here() -> bool:

@@ -14,9 +14,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.grams.on_board import COLUMNS, counted_sets
 from fleet_slip.regression.gram import Gram
+from tests.support.catalog import CATALOG, SIGNALS
 
 START_S = 1_714_557_600
 """2024-05-01, 10:00 in UTC."""
@@ -32,7 +33,7 @@ def row_of(
     **other: Any,
 ) -> dict[str, Any]:
     """A row of the table of a Gram; `other` columns are as they should not be."""
-    (key,) = (one.key for one in counted_sets().values() if one.name == of)
+    (key,) = (one.key for one in counted_sets(CATALOG).values() if one.name == of)
     start = datetime.fromtimestamp(start_s, UTC)
     row = {"source": "received", "vehicle_id": vehicle, "day": start.date(), "feature_set": key}
     row |= {"drive_id": f"{vehicle}-{start:%Y%m%dT%H%M%SZ}", "part": None, "course_late": None}
@@ -56,12 +57,13 @@ def _reading() -> dict[str, Any]:
     return found
 
 
-def rows_of_messages(content: bytes) -> list[dict[str, Any]]:
+def rows_of_messages(content: bytes, catalog: Catalog = CATALOG) -> list[dict[str, Any]]:
     """The rows that the page makes of messages one behind the other."""
     rows: list[dict[str, Any]] = []
+    sets = {one.definition: one for one in counted_sets(catalog).values()}
     while content:
         size = int.from_bytes(content[6:8], "little")
-        rows.append(_reading()["row_of"](content[:size]))
+        rows.append(_reading()["row_of"](content[:size], sets))
         content = content[size:]
     return rows
 
@@ -69,17 +71,17 @@ def rows_of_messages(content: bytes) -> list[dict[str, Any]]:
 def drive_counts(seed: int, rows: int = 500) -> Any:
     """Counts of all signals of a drive, shape (rows, signals), related as those of a car are."""
     random = np.random.default_rng(seed)
-    k = len(catalogue().gram_signals)
+    k = len(SIGNALS.gram_signals)
     hidden = random.normal(0, 900, (rows, 4))
     counts = hidden @ random.normal(0, 1, (4, k)) + random.normal(0, 30, (rows, k))
-    signals = [catalogue()[name] for name in catalogue().gram_signals]
+    signals = [SIGNALS[name] for name in SIGNALS.gram_signals]
     low, high = ([s.min_count for s in signals], [s.max_count for s in signals])
     return np.clip(np.rint(counts), low, high).astype(np.int16)
 
 
 def gram_of(seed: int, rows: int = 500) -> Gram:
     """The Gram of a drive of all signals."""
-    return Gram.from_counts(catalogue().gram_signals, drive_counts(seed, rows).astype(np.int64))
+    return Gram.from_counts(SIGNALS.gram_signals, drive_counts(seed, rows).astype(np.int64))
 
 
 class Message(NamedTuple):
@@ -131,11 +133,11 @@ def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = F
 
     If the label follows, it is a sum of the inputs, the same in all cars, and noise.
     """
-    signals = catalogue().gram_signals
+    signals = SIGNALS.gram_signals
     random = np.random.default_rng(seed)
     k = len(signals)
     n = random.integers(2_000, 360_000, cars)
-    low, high = np.array([(catalogue()[s].min_count, catalogue()[s].max_count) for s in signals]).T
+    low, high = np.array([(SIGNALS[s].min_count, SIGNALS[s].max_count) for s in signals]).T
     half = (high - low) / 2
     mean = (low + high) / 2 + random.uniform(-0.2, 0.2, (cars, k)) * half
     spread = random.normal(0, 0.1, (cars, 4, k)) * half
@@ -156,7 +158,7 @@ def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = F
         "vehicle_id": names,
         "drive_id": [f"{name}-{start:%Y%m%dT%H%M%SZ}" for name in names],
         "day": [start.date()] * cars,
-        "feature_set": [next(iter(counted_sets().values())).key] * cars,
+        "feature_set": [next(iter(counted_sets(CATALOG).values())).key] * cars,
         "part": [None] * cars,
         "course_late": [None] * cars,
         "signals": [",".join(signals)] * cars,

@@ -13,13 +13,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.warehouse.condition import parse_condition
+from tests.support.catalog import CATALOG, SIGNALS
 
 Matrix = NDArray[Any]
 
@@ -159,7 +159,7 @@ def evidence(path: str) -> Any:
     return json.loads((EVIDENCE / path).read_text(encoding="utf-8"))
 
 
-LABEL = catalogue().label
+LABEL = SIGNALS.label
 INPUTS = ("ax", "ay", "yaw_rate", "steering_wheel")
 
 
@@ -221,12 +221,13 @@ def cohort_of(
         for name in ("drive", "vehicle")
     }
     return Cohort(
-        condition=parse_condition(condition),
+        condition=parse_condition(SIGNALS, condition),
         tables=(table,),
         drives=pa.table(columns),
         logs_version=1,
         grams_version=1,
         feature_set=feature_set,
+        catalog=CATALOG,
     )
 
 

@@ -6,11 +6,12 @@ from datetime import date
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, LabelledDrive, loaded_axles
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.job import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
+from tests.support.catalog import SIGNALS
 
 GPS_EVERY = 10
 
@@ -102,11 +103,11 @@ def mirrored(drive: DriveSignals) -> DriveSignals:
 
 def simulated_drive() -> LabelledDrive:
     """Return half a lap at moderate speed in the D-class sedan, as the warehouse would have it."""
-    spec = load_campaign("smoke").drives(date(2024, 5, 1))[0]
-    table = simulate_batch(Batch("smoke", date(2024, 5, 1), 0, (spec,)))
+    spec = load_campaign("smoke", SHIPPED_CONFIGS).drives(date(2024, 5, 1))[0]
+    table = simulate_batch(SIGNALS, Batch("smoke", date(2024, 5, 1), 0, (spec,)))
     columns = {
         signal.column: table[name].to_numpy().astype(float) * float(signal.scale)
-        for name, signal in catalogue().signals.items()
+        for name, signal in SIGNALS.signals.items()
         if name in table.column_names
     }
     names = DriveSignals.__dataclass_fields__

@@ -17,16 +17,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fleet_slip.catalogue.features import PLAIN, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.job import unit_name
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 
-SIGNALS = catalogue().gram_signals
-INPUTS = len(catalogue().inputs)
+SIGNALS = CATALOG.signals.gram_signals
+INPUTS = len(CATALOG.signals.inputs)
 ROWS = 12
 WEIGHT = 16_000
 CHUNK = 50_000
@@ -75,7 +75,7 @@ class Drives:
             "speed_factor": (0.75 + 0.25 * tens).tolist(),
             "saturated": [0] * len(self.numbers),
         }
-        schema = catalogue().drive_schema
+        schema = CATALOG.signals.drive_schema
         columns = {
             field.name: pa.array(
                 values.get(field.name, [None] * len(self.numbers)), type=field.type
@@ -96,7 +96,7 @@ class Drives:
         products = matrices[:, row, column]
         count = len(self.numbers)
         columns = self.metadata() | {
-            "feature_set": pa.repeat(features().identity(PLAIN), count),
+            "feature_set": pa.repeat(CATALOG.identity(PLAIN), count),
             "file": pa.array(files),
             "day": pa.array(days),
             "part": pa.nulls(count, pa.string()),
@@ -163,7 +163,7 @@ def write_grams(warehouse: Warehouse, paths: Sequence[str], rows: int, weight: i
         files = (drives.numbers * len(paths) // rows).tolist()
         table = drives.grams(warehouse, [paths[f] for f in files], [day_of(f) for f in files])
         actions.append(warehouse.grams.write_file(f"growth-{first:09d}", table))
-    identity = features().identity(PLAIN)
+    identity = CATALOG.identity(PLAIN)
     unit = Unit(unit_name(identity), warehouse.logs.snapshot().version or 0)
     warehouse.grams.snapshot().commit(Change(add=actions, units=[unit]))
 
@@ -181,7 +181,7 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
             for drives in drawn_for(files)
         ]
         action = warehouse.grams.write_file("growth", pa.concat_tables(parts))
-        unit = Unit(unit_name(features().identity(PLAIN)), warehouse.logs.snapshot().version or 0)
+        unit = Unit(unit_name(CATALOG.identity(PLAIN)), warehouse.logs.snapshot().version or 0)
         warehouse.grams.snapshot().commit(Change(add=[action], units=[unit]))
     else:
         write_grams(warehouse, paths, grams, WEIGHT)
@@ -190,7 +190,7 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
 def write_versions(root: Path, name: str, versions: int) -> None:
     """Repeat the first version of a model and the first move of its alias so many times."""
     for kind, number in (("versions", "trained_on"), ("history", "version")):
-        folder = DocumentFolder(LocalFolder(root / "models" / name / kind))
+        folder = DocumentFolder(LocalFolder(root), f"models/{name}/{kind}")
         first = folder.read(1).content
         for i in range(2, versions + 1):
             changed = {**first[number], "grams_version": i % 2} if kind == "versions" else i

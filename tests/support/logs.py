@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
-from fleet_slip.views import connect
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.views import open_views
+from fleet_slip.warehouse.tables import Warehouse, open_warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 
 DAY = date(2024, 5, 1)
 
@@ -25,9 +25,10 @@ def path_of(folder: Folder) -> Path:
     return Path(str(folder))
 
 
-def ask(root: Folder | Path, query: str, given: Any = None) -> list[tuple[Any, ...]]:
+def ask(root: Folder | Path | Warehouse, query: str, given: Any = None) -> list[tuple[Any, ...]]:
     """Return the answer to a query, for which no view is opened that it does not name."""
-    with connect(root, query=query) as database:
+    warehouse = root if isinstance(root, Warehouse) else open_warehouse(root)
+    with open_views(warehouse, query) as database:
         return database.execute(query, given).fetchall()
 
 
@@ -39,7 +40,7 @@ def without_names(drives: pa.Table) -> pa.Table:
 def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
     """Counts over the whole int16 range, the extremes among them."""
     counts: dict[str, Any] = {}
-    for name in catalogue().signals:
+    for name in SIGNALS.signals:
         values = rng.integers(-32768, 32768, rows)
         values[:2] = (-32768, 32767)
         counts[name] = values.astype(np.int16)
@@ -48,7 +49,7 @@ def random_counts(rng: np.random.Generator, rows: int) -> dict[str, Any]:
 
 def schema_without(optional: Collection[str]) -> pa.Schema:
     """The schema of a file of the logs whose drives have nothing of some optional columns."""
-    return pa.schema([field for field in catalogue().log_schema if field.name not in optional])
+    return pa.schema([field for field in SIGNALS.log_schema if field.name not in optional])
 
 
 def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
@@ -71,7 +72,7 @@ def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata:
         **metadata,
     }
     columns = {"tick": np.arange(rows, dtype=np.int32), **counts}
-    schema = catalogue().log_schema
+    schema = SIGNALS.log_schema
     every = [
         pa.array(columns[field.name], field.type)
         if field.name in columns
@@ -95,7 +96,7 @@ def state(root: Path, model: str = "smoke") -> dict[str, Any]:
         for table in (warehouse.logs, warehouse.grams)
         for path in table.snapshot().paths
     }
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root), CATALOG)
     return {
         "files": {Path(path).relative_to(root): digest for path, digest in files.items()},
         "versions": [registry.load(model, n).sha256 for n in registry.versions(model)],

@@ -12,11 +12,13 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.base import shown
+from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 
 TIME = {"column": "t", "unit": "s"}
@@ -41,7 +43,7 @@ class MeasuredLog:
     """A measured file, ready for the warehouse."""
 
     drives: pa.Table
-    """The catalogue's `log_schema`, of extras those that are mapped, by drive_id, then tick.
+    """The catalog's `log_schema`, of extras those that are mapped, by drive_id, then tick.
 
     Strings are dictionary-encoded.
     """
@@ -86,6 +88,7 @@ def ingest_file(warehouse: Warehouse, file: Path, mapping: Mapping) -> IngestRep
 
 def a_mapping(**changes: Any) -> Mapping:
     """A mapping of t, ax and beta; `time` and `drive` add keys, the rest replaces."""
+    catalog: Catalog = changes.pop("catalog", CATALOG)
     time = changes.pop("time", {})
     drive = changes.pop("drive", {})
     whole = {
@@ -95,7 +98,7 @@ def a_mapping(**changes: Any) -> Mapping:
         "signals": SIGNALS,
         **changes,
     }
-    return Mapping.model_validate(whole)
+    return Mapping.model_validate(whole, context=catalog.signals)
 
 
 def own_clock(**changes: Any) -> Mapping:

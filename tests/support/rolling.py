@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.dynamics import NO_BRAKES, Derivative, derivative
@@ -21,7 +22,7 @@ from fleet_slip.vehicle.parameters import (
     load_vehicle,
 )
 
-SEDAN = load_vehicle("d_class_sedan")
+SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 CAR = constants(SEDAN, adhesion=1.0)
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.rewriting import compact
@@ -25,6 +24,7 @@ from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.commands import PATIENCE_S, RunCommand, finish, run, start_on
 from tests.support.logs import DAY, log_rows, state
 from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
@@ -191,7 +191,7 @@ def write(root: Path, writer: int) -> None:
         real = time.time
         time.time = lambda: real() - 86_400
     logs = Warehouse(LocalFolder(root)).logs
-    counts = {name: np.arange(ROWS) for name in catalogue().signals}
+    counts = {name: np.arange(ROWS) for name in SIGNALS.signals}
     for number in range(COMMITS):
         name = f"car{writer}-{number}"
         drives = [log_rows(f"{name}-{part}", counts) for part in range(FILES)]

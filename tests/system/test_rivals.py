@@ -14,20 +14,20 @@ from benchmarks.rivals.__main__ import LEARNERS, all_signals
 from benchmarks.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sample
 from benchmarks.rivals.learners import FittedLearner, hold_back, one_thread
 from benchmarks.rivals.tree_filter import LeafNoise, TreeFilter, fit_tree_filter
-from fleet_slip.catalogue.features import features
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filters import FILTERS, FilterEstimate
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.drives import noisy, slalom
 
 HERE = Path(__file__).resolve().parents[2]
-CAR = load_vehicle("d_class_sedan")
+CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 CLASS = next(one for one in FILTERS if one.name == "ekf_class")
 
 
@@ -63,8 +63,8 @@ def test_whole_drives_are_held_back() -> None:
 def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> None:
     """Its estimate is the window itself: the same number in a sample and on a drive."""
     names = ("ay", "ay_mean_16")
-    definition = {"ay_mean_16": features().time_columns["ay_mean_16"].definition}
-    scale = float(catalogue()["ay"].scale)
+    definition = {"ay_mean_16": CATALOG.time_columns["ay_mean_16"].definition}
+    scale = float(SIGNALS["ay"].scale)
     inputs = Inputs({"ay": scale, "ay_mean_16": scale / 16}, {}, definition)
     warehouse = Warehouse(LocalFolder(smoke_root))
     cohort = load_cohort(warehouse, "campaign = 'smoke'")

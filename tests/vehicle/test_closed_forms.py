@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections, constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from tests.support.linear_bicycle import LinearBicycle, steer
@@ -19,7 +20,7 @@ SMALL_RAD = 0.002
 """Angle of the road wheels: half a metre per second squared."""
 
 TIME_S = np.arange(0.0, 4.0, 0.01)
-RIGID = LinearBicycle.of(load_vehicle("d_class_sedan"), SPEED_MPS)
+RIGID = LinearBicycle.of(load_vehicle("d_class_sedan", SHIPPED_CONFIGS), SPEED_MPS)
 
 
 def lagged_step(bicycle: LinearBicycle, lag_s: float) -> FloatArray:
@@ -33,7 +34,7 @@ def lagged_step(bicycle: LinearBicycle, lag_s: float) -> FloatArray:
 
 @pytest.mark.parametrize("name", CARS)
 def test_a_small_step_of_the_steering_answers_as_the_bicycle(name: str) -> None:
-    car = load_vehicle(name)
+    car = load_vehicle(name, SHIPPED_CONFIGS)
     bicycle = LinearBicycle.of(car, SPEED_MPS)
     found = steer(car, PERFECT, np.full(len(TIME_S), car.steering.ratio * SMALL_RAD), SPEED_MPS)
     vy, rate = SMALL_RAD * lagged_step(bicycle, car.steering.lag_s)
@@ -49,7 +50,7 @@ def test_a_small_sine_of_the_steering_answers_as_the_bicycle(
     name: str, frequency_hz: float
 ) -> None:
     """Around the yaw resonance, in amplitude and phase."""
-    car = load_vehicle(name)
+    car = load_vehicle(name, SHIPPED_CONFIGS)
     time_s = np.arange(0.0, 8.0, 0.01)
     wave = np.exp(2j * np.pi * frequency_hz * time_s)
     demand = car.steering.ratio * SMALL_RAD * wave.imag
@@ -65,7 +66,7 @@ def test_a_small_sine_of_the_steering_answers_as_the_bicycle(
 
 def test_tyres_that_relax_answer_as_the_bicycle_with_two_more_states() -> None:
     """Each axle follows its lateral velocity u: L ḟ = v (u − f), and its force is −C f / v."""
-    car, length_m, v = load_vehicle("d_class_sedan"), 0.5, SPEED_MPS
+    car, length_m, v = load_vehicle("d_class_sedan", SHIPPED_CONFIGS), 0.5, SPEED_MPS
     c = constants(car, 1.0)
     front = 2 * cornering_stiffness(c.static_front, c.stiffness_front, c) / v
     rear = 2 * cornering_stiffness(c.static_rear, c.stiffness_rear, c) / v
@@ -87,7 +88,7 @@ def test_tyres_that_relax_answer_as_the_bicycle_with_two_more_states() -> None:
 
 
 def test_a_compliant_steering_answers_as_a_softer_front_axle() -> None:
-    car = load_vehicle("d_class_sedan")
+    car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     flaws = CarImperfections(steering_compliance_deg_per_kn=0.15)
     soft = LinearBicycle.of(car, SPEED_MPS, float(np.radians(0.15)) / 1000)
     demand = np.full(len(TIME_S), car.steering.ratio * SMALL_RAD)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.resources import config_names
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -189,7 +189,7 @@ def test_nothing_blows_up_in_any_spin(x: State, u: Controls, adhesion: float) ->
 @pytest.mark.parametrize("name", ["compact_hatchback", "d_class_sedan", "rear_drive_sedan", "suv"])
 @pytest.mark.parametrize("share", [0.75, 1.0, 1.33])
 def test_every_car_understeers_at_every_mass(name: str, share: float) -> None:
-    car = load_vehicle(name)
+    car = load_vehicle(name, SHIPPED_CONFIGS)
     known = handling(car.with_sprung_mass(share * car.body.sprung_mass_kg))
     assert 0.2 < math.degrees(known.understeer * GRAVITY_MPS2) < 3.0
 
@@ -221,9 +221,9 @@ def test_slow_cars_do_not_oscillate(vx: float) -> None:
     assert np.abs(curvature).max() < 1e-5
 
 
-@pytest.mark.parametrize("name", config_names("vehicles"))
+@pytest.mark.parametrize("name", SHIPPED_CONFIGS.names("vehicles"))
 def test_shipped_cars_are_named_after_their_file_and_plausible(name: str) -> None:
-    car = load_vehicle(name)
+    car = load_vehicle(name, SHIPPED_CONFIGS)
     assert car.name == name
     body = car.body
     assert (

@@ -9,6 +9,7 @@ import pytest
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.highway import FourWheelVehicle, PlainVehicle, bicycle_of
 from fleet_slip.vehicle.parameters import Controls, State, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
@@ -104,7 +105,7 @@ def test_it_drives_among_others_on_a_road() -> None:
 
 def test_the_class_of_another_car_is_made_by_highway_env() -> None:
     class Suv(FourWheelVehicle):
-        PARAMETERS = load_vehicle("suv")
+        PARAMETERS = load_vehicle("suv", SHIPPED_CONFIGS)
         ADHESION = 0.5
 
     road = Road(RoadNetwork.straight_road_network(2), np_random=np.random.RandomState(1))

@@ -9,6 +9,7 @@ import pytest
 
 from fleet_slip.compiling import inner_loop
 from fleet_slip.errors import ConfigError
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
@@ -24,7 +25,7 @@ def road(name: str, lateral_mps2: float, speed_factor: float = 1.0) -> Road:
     limits = SpeedLimits(
         lateral_mps2=lateral_mps2, acceleration_mps2=2.5, braking_mps2=4.0, top_speed_mps=45.0
     )
-    track = load_track(name)
+    track = load_track(name, SHIPPED_CONFIGS)
     profile = speed_profile(track, limits, spacing_m=1.0)
     return Road(
         profile.spacing_m,
@@ -81,7 +82,7 @@ def test_the_driver_keeps_within_two_and_a_half_metres(track: str, lateral_mps2:
 @pytest.mark.parametrize("name", ["compact_hatchback", "rear_drive_sedan", "suv"])
 def test_the_other_cars_keep_to_the_line_too(name: str) -> None:
     for track in TRACKS:
-        truth = drive(load_vehicle(name), road(track, 6.0))
+        truth = drive(load_vehicle(name, SHIPPED_CONFIGS), road(track, 6.0))
         assert truth.lost_control_tick is None
         assert np.abs(truth.lateral_offset_m).max() < 2.5
 

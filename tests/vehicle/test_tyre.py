@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.compiling import kernel
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.driver import LARGEST_GRIP_USE, Handling, slip_growth
 from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, followed
 from fleet_slip.vehicle.parameters import Constants, constants, load_vehicle
@@ -119,7 +120,7 @@ def test_arctangent_over_a_million_ratios() -> None:
 
 @given(st.floats(1.0, 60_000.0), st.sampled_from(CARS))
 def test_cornering_stiffness_without_sine_is_an_identity(load: float, name: str) -> None:
-    c = constants(load_vehicle(name), adhesion=1.0)
+    c = constants(load_vehicle(name, SHIPPED_CONFIGS), adhesion=1.0)
     exact = c.stiffness_front * math.sin(2 * math.atan(load * c.inverse_stiffness_load))
     assert abs(cornering_stiffness(load, c.stiffness_front, c) - exact) < 1e-12 * c.stiffness_front
 
@@ -157,7 +158,7 @@ def test_the_drivers_growth_of_slip_stays_below_the_brush_tyres() -> None:
 def test_the_cars_lags_are_long_against_the_step() -> None:
     """So that the series of `followed` is short of the exponential by less than 0.05 %."""
     for name in CARS:
-        c = constants(load_vehicle(name), adhesion=1.0)
+        c = constants(load_vehicle(name, SHIPPED_CONFIGS), adhesion=1.0)
         for inverse_lag in (c.inverse_steering_lag, c.inverse_drive_lag):
             exact = -math.expm1(-STEP_S * inverse_lag) / inverse_lag
             assert abs(followed(1.0, inverse_lag, STEP_S) / exact - 1) < 5e-4

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort, sum_days
 from fleet_slip.grams.folding import Folding
@@ -20,6 +19,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest
 
@@ -136,7 +136,7 @@ def drives(fleet: Warehouse) -> pa.Table:
 
 @pytest.mark.parametrize("text", LASTING)
 def test_what_stands_in_statements_means_what_was_written(drives: pa.Table, text: str) -> None:
-    condition = parse_condition(text)
+    condition = parse_condition(SIGNALS, text)
     with DATABASE.cursor() as database:
         database.register("drives", drives)
         written, meant = (
@@ -144,14 +144,14 @@ def test_what_stands_in_statements_means_what_was_written(drives: pa.Table, text
             for where in (text, condition.sql)
         )
     assert written == meant
-    assert parse_condition(condition.sql)
+    assert parse_condition(SIGNALS, condition.sql)
     assert str(condition) == text
 
 
 @pytest.mark.parametrize("text", [*NOT_ALONE, *FLEETING, *MORE_THAN_COLUMNS])
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(QuestionError) as refused:
-        parse_condition(text)
+        parse_condition(SIGNALS, text)
     assert str(refused.value).isprintable()
     assert len(str(refused.value)) < 1500
 
@@ -168,8 +168,8 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
         lambda: sum_days(fleet, ["ay"], text),
         lambda: examine_drives(fleet, text),
         lambda: score(fleet, published, text),
-        lambda: monitor(fleet, ModelVersion(1, published, ""), text),
-        lambda: monitor(fleet, ModelVersion(1, kept, "")),
+        lambda: monitor(fleet, ModelVersion(1, published, "", fleet.catalog), text),
+        lambda: monitor(fleet, ModelVersion(1, kept, "", fleet.catalog)),
     )
     for way in ways:
         with pytest.raises(QuestionError, match="the condition"):
@@ -177,16 +177,16 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
 
 
 def test_a_score_may_ask_about_rows() -> None:
-    assert "abs(ay_mps2) > 3" in cohort_of_rows("abs(ay_mps2) > 3").sql
+    assert "abs(ay_mps2) > 3" in cohort_of_rows(SIGNALS, "abs(ay_mps2) > 3").sql
     with pytest.raises(QuestionError, match="ay_mps2"):
-        parse_condition("abs(ay_mps2) > 3")
+        parse_condition(SIGNALS, "abs(ay_mps2) > 3")
 
 
 def test_conditions_are_joined_as_they_are_meant() -> None:
-    both = parse_condition("adhesion < 1 OR true") & parse_condition("false")
+    both = parse_condition(SIGNALS, "adhesion < 1 OR true") & parse_condition(SIGNALS, "false")
     answer = DATABASE.execute(f"SELECT {both.sql} FROM (SELECT 2 AS adhesion)").fetchall()
     assert answer == [(False,)]
-    assert parse_condition(both.text)
+    assert parse_condition(SIGNALS, both.text)
 
 
 @settings(max_examples=300)
@@ -207,13 +207,13 @@ def test_conditions_are_joined_as_they_are_meant() -> None:
 )  # fmt: skip
 def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
     try:
-        condition = parse_condition(text)
+        condition = parse_condition(SIGNALS, text)
     except QuestionError:
         return
-    names = {**catalogue().drive_schema.empty_table().to_pydict(), "day": []}
+    names = {**SIGNALS.drive_schema.empty_table().to_pydict(), "day": []}
     columns = ", ".join(
-        f"{'0' if catalogue().drive[n].type != 'string' else repr('x')} AS {n}"
-        if n in catalogue().drive
+        f"{'0' if SIGNALS.drive[n].type != 'string' else repr('x')} AS {n}"
+        if n in SIGNALS.drive
         else f"DATE '2024-05-01' AS {n}"
         for n in names
     )
@@ -225,7 +225,7 @@ def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
 
 
 def test_asking_ends_when_the_time_is_over() -> None:
-    condition = parse_condition("true")
+    condition = parse_condition(SIGNALS, "true")
     endless = "SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y % 7 = 3"
     with (
         duckdb.connect() as database,
@@ -249,6 +249,6 @@ def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
     query = "SELECT CAST(if(i < 9000, '1', 'spa') AS INTEGER) FROM range(10000) t(i)"
     with open_database() as database:
         batches = database.sql(query).to_arrow_reader(1000)
-        asked = parse_condition("campaign = 1")
+        asked = parse_condition(SIGNALS, "campaign = 1")
         with pytest.raises(QuestionError, match="string 'spa'"), asking(database, asked):
             assert not list(batches)

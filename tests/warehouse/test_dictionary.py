@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.views import VIEWS, connect
 from fleet_slip.warehouse.tables import COMMON, column_descriptions
+from tests.support.catalog import SIGNALS
 
 
 def columns(root: Path) -> dict[str, dict[str, tuple[str, str]]]:
@@ -31,7 +31,7 @@ def test_every_description_is_of_a_column_and_every_column_has_one(tmp_path: Pat
 
 def test_a_column_has_the_unit_of_its_view(tmp_path: Path) -> None:
     found = columns(tmp_path)
-    signal = catalogue()["ay"]
+    signal = SIGNALS["ay"]
     assert found["log_counts"]["ay"] == (f"{signal.scale} {signal.unit}", signal.description)
     assert found["log"][signal.column] == (signal.unit, signal.description)
     assert found["log"]["time_s"][0] == "s"

@@ -2,11 +2,12 @@
 
 A server, started once, imports what formats need and forks one reader for each file. A reader
 confines itself, opens the file, and answers what it is asked: lines of JSON on a socket. An answer
-is two sizes, JSON, and rows as an Arrow stream.
+is two sizes, JSON, and rows as an Arrow stream. Who asks bounds the sum of its temporary files.
 
 A reader keeps that file, a folder for its temporary files, and the installed code, of which
-libraries import parts late. It cannot connect, start programs or processes, or signal others. Where
-the kernel has no Landlock (before 5.13, or switched off) other files stay readable.
+libraries import parts late. It cannot connect, start programs or processes, or signal, slow or
+limit others. Where the kernel has no Landlock (before 5.13, or switched off) other files stay
+readable.
 """
 
 import contextlib
@@ -223,8 +224,24 @@ _FORBIDDEN = (
     (92, None), (93, 55), (94, None), (260, 54), (188, 5), (189, 6), (190, 7),
     # utime, utimes, futimesat, utimensat, shmget, msgget, semget
     (132, None), (235, None), (261, None), (280, 88), (29, 194), (68, 186), (64, 190),
+    # shmat, shmctl, semop, semtimedop, semctl, msgsnd, msgrcv, msgctl, mq_open, mq_unlink
+    (30, 196), (31, 195), (65, 193), (220, 192), (66, 191), (69, 189), (70, 188), (71, 187),
+    (240, 180), (241, 181),
+    # sched_setscheduler, sched_setparam, sched_setattr, ioprio_set, setpgid
+    (144, 119), (142, 118), (314, 274), (251, 30), (109, 154),
+    # pidfd_open, process_madvise, process_mrelease, move_pages, migrate_pages, kcmp
+    (434, 434), (440, 440), (448, 448), (279, 239), (256, 238), (312, 272),
+    # memfd_create, memfd_secret
+    (319, 279), (447, 447),
 )  # fmt: skip
 """System calls by their numbers on x86_64 and aarch64."""
+_PRLIMIT = (302, 261)
+"""Allowed for the process itself, which is 0."""
+_FORBIDDEN_COMMANDS = (
+    ((72, 25), (8, 10, 15)),  # fcntl: F_SETOWN, F_SETSIG, F_SETOWN_EX
+    ((16, 29), (0x5412, 0x8901, 0x8902)),  # ioctl: TIOCSTI, FIOSETOWN, SIOCSPGRP
+)
+"""By system call the second arguments that let the kernel signal, or type for, other processes."""
 _PASSED_BY = ((90, None), (91, 52), (268, 53), (452, 452))
 """Those that seem to work and do nothing, since who copies a file calls them: chmod and others."""
 _CLONE, _CLONE3, _CLONE_THREAD = (56, 220), 435, 0x10000
@@ -305,6 +322,16 @@ def _forbid_calls() -> None:
         (_RETURN, 0, 0, _ALLOW),
         (_AT_LEAST, 0, 1, 0x40000000), (_RETURN, 0, 0, _KILL),  # numbers of 32-bit programs
     ]  # fmt: skip
+    steps += [
+        (_EQUAL, 0, 4, _PRLIMIT[place]),
+        (_LOAD, 0, 0, 16), (_EQUAL, 1, 0, 0), (_RETURN, 0, 0, _REFUSE | _PERM),
+        (_RETURN, 0, 0, _ALLOW),
+    ]  # fmt: skip
+    for calls, commands in _FORBIDDEN_COMMANDS:
+        steps += [(_EQUAL, 0, 2 + 2 * len(commands), calls[place]), (_LOAD, 0, 0, 24)]
+        for command in commands:
+            steps += [(_EQUAL, 0, 1, command), (_RETURN, 0, 0, _REFUSE | _PERM)]
+        steps.append((_RETURN, 0, 0, _ALLOW))
     for numbers in (*_FORBIDDEN, *_PASSED_BY):
         answer = _REFUSE if numbers in _PASSED_BY else _REFUSE | _PERM
         if (number := numbers[place]) is not None:

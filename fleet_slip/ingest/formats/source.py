@@ -160,7 +160,7 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
 
 
 def describe_unknown(signal: str, known: Iterable[str]) -> str:
-    """Return what to say of a signal that the catalogue does not have."""
+    """Return what to say of a signal that the catalog does not have."""
     names = list(known)
     near = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
     near += [name for name in names if signal in name.split("_") and name not in near]

@@ -39,7 +39,7 @@ class ParquetSource(FormatSource):
 
     def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
         """Take the bytes of a file, and what it may become."""
-        _require_small_footer(stream, budget.file)
+        require_small_footer(stream, budget.file)
         self._file, self._stream = budget.file, stream
         parquet = pq.ParquetFile(stream)
         _require_within(budget, parquet.metadata)
@@ -98,7 +98,8 @@ def partition_keys(file: Path) -> dict[str, str]:
     return {key: unquote(text) for key, equals, text in named if key and equals}
 
 
-def _require_small_footer(stream: pa.NativeFile, file: Path) -> None:
+def require_small_footer(stream: pa.NativeFile, file: Path) -> None:
+    """Raise `InputError` for a footer whose parsing would take too much memory."""
     tail = stream.read_at(8, max(0, stream.size() - 8))
     if tail[4:] == PARQUET_MAGIC and int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
         raise InputError(

@@ -8,14 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation import blind
 from fleet_slip.evaluation.blind import blind_scenarios, evaluate_blind_drives
 from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import Scenario, load_scenario
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.reported import answer
 
 HASH = "5e" * 32
@@ -24,13 +25,13 @@ HASH = "5e" * 32
 @pytest.fixture(scope="module")
 def scenarios() -> tuple[Scenario, ...]:
     """Those of one hash."""
-    return blind_scenarios(HASH)
+    return blind_scenarios(HASH, SHIPPED_CONFIGS)
 
 
 @given(drawn=st.binary(min_size=32, max_size=32))
 @settings(max_examples=3, deadline=None)  # half a second each
 def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn: bytes) -> None:
-    others = blind_scenarios(drawn.hex())
+    others = blind_scenarios(drawn.hex(), SHIPPED_CONFIGS)
     assert len({one.name for one in others}) == len(others) == 24
     assert len({one.track.name for one in others}) == 8
     assert {one.seed for one in others}.isdisjoint(one.seed for one in scenarios)
@@ -39,22 +40,23 @@ def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn:
 
 def test_the_same_hash_has_the_same_set(scenarios: tuple[Scenario, ...]) -> None:
     first, again = (
-        [one.model_dump() for one in some] for some in (scenarios, blind_scenarios(HASH))
+        [one.model_dump() for one in some]
+        for some in (scenarios, blind_scenarios(HASH, SHIPPED_CONFIGS))
     )
     assert str(first) == str(again)
 
 
 def test_estimators_see_what_a_log_would_hold_and_the_truth_is_exact() -> None:
-    scenario = load_scenario("imperfect")
-    (drive,) = simulate_drives([scenario])
-    (log,) = simulate_logs(scenario.batch().drives)
-    for name in catalogue().inputs:
-        one = catalogue()[name]
+    scenario = load_scenario("imperfect", SHIPPED_CONFIGS)
+    (drive,) = simulate_drives(SIGNALS, [scenario])
+    (log,) = simulate_logs(SIGNALS, scenario.batch().drives)
+    for name in SIGNALS.inputs:
+        one = SIGNALS[name]
         np.testing.assert_array_equal(
             np.rint(drive.signals[one.column] / float(one.scale)), log.measurement.counts[name]
         )
     np.testing.assert_array_equal(np.isfinite(drive.signals["gps_vx_mps"]), log.measurement.gps_fix)
-    scale = float(catalogue()["vy"].scale)
+    scale = float(SIGNALS["vy"].scale)
     assert np.abs(drive.vy_mps - scale * log.measurement.counts["vy"]).max() <= scale / 2 + 1e-12
     assert len(np.unique(drive.vy_mps)) > 0.99 * len(drive.vy_mps), "no counts"
 
@@ -66,9 +68,9 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
 ) -> None:
     """On the first road and the last, in all weathers."""
     some = (*scenarios[:3], *scenarios[-3:])
-    monkeypatch.setattr(blind, "blind_scenarios", {HASH: some}.__getitem__)
-    drives = simulate_drives(some)
-    monkeypatch.setattr(blind, "simulate_drives", lambda scenarios: drives)  # the same again
+    monkeypatch.setattr(blind, "blind_scenarios", lambda sha256, _: {HASH: some}[sha256])
+    drives = simulate_drives(SIGNALS, some)
+    monkeypatch.setattr(blind, "simulate_drives", lambda _, scenarios: drives)  # the same again
 
     def right(drive: TestDrive) -> np.ndarray:
         return drive.sideslip_rad
@@ -80,7 +82,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
         return np.full_like(drive.sideslip_rad, np.nan)
 
     estimators = {"right": right, "zero": zero, "silent@1": silent}
-    judged = evaluate_blind_drives(HASH, estimators)
+    judged = evaluate_blind_drives(CATALOG, HASH, estimators)
     rows = {row["name"]: row for row in judged}
     assert rows["all"]["drives"] == 6
     assert [rows[name]["drives"] for name in ("dry", "wet", "ice")] == [2, 2, 2]

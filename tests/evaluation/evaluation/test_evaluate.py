@@ -13,7 +13,6 @@ from rich.text import Text
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import kalman
@@ -27,12 +26,14 @@ from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visibl
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Scenario, load_scenario
-from fleet_slip.storage.documents import DocumentFolder
+from fleet_slip.storage.documents import DocumentFolder, Inventory
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.reported import LITTLE_S, SCENARIOS, answer
 
 
@@ -56,16 +57,16 @@ def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: An
 def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept = DocumentFolder(LocalFolder(tmp_path))
-    numbers = DocumentFolder.numbers
+    kept = DocumentFolder(LocalFolder(tmp_path), "evaluations")
+    inventory = DocumentFolder.inventory
 
-    def overtaken(folder: DocumentFolder) -> list[int]:
-        before = numbers(folder)
+    def overtaken(folder: DocumentFolder) -> Inventory:
+        before = inventory(folder)
         monkeypatch.undo()
         store_evaluation(kept, {"models": 5})
         return before
 
-    monkeypatch.setattr(DocumentFolder, "numbers", overtaken)
+    monkeypatch.setattr(DocumentFolder, "inventory", overtaken)
     assert store_evaluation(kept, {"models": 5}).number == 1
     assert store_evaluation(kept, {"models": 6}).number == 2
     assert store_evaluation(kept, {"models": 6}).number == 2
@@ -126,13 +127,13 @@ def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
 
 def test_the_published_model_gets_the_same_estimates_as_in_sql(root: Path, again: Any) -> None:
     """SQL measures against the noisy label, here the truth counts: 0.03 degrees between them."""
-    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
+    manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
     in_sql = score(Warehouse(LocalFolder(root)), manifest, "drive_id = 'scenario-nominal'")
     one = again["scenarios"][0]
     here = one["results"]["smoke@1"]
     assert here["rows"] == in_sql.rows == one["truth"]["rows"]
     assert here["error_mean_deg"] == pytest.approx(in_sql.error_mean_deg, abs=0.001)
-    label_noise_deg = np.degrees(load_scenario("nominal").sensors.sideslip_std_rad)
+    label_noise_deg = np.degrees(load_scenario("nominal", SHIPPED_CONFIGS).sensors.sideslip_std_rad)
     expected = np.hypot(here["error_std_deg"], label_noise_deg)
     assert in_sql.error_std_deg == pytest.approx(expected, rel=0.01)
 
@@ -158,10 +159,10 @@ def test_a_missing_signal_costs_the_models_that_need_it(again: Any) -> None:
 
 
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
-    (drive,) = simulate_drives([load_scenario("nominal")])
+    (drive,) = simulate_drives(SIGNALS, [load_scenario("nominal", SHIPPED_CONFIGS)])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
-    manifest = Registry(LocalFolder(root / "models")).resolve("smoke").manifest
-    estimate = PublishedEstimate(Predictor.of(manifest))(drive)
+    manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
+    estimate = PublishedEstimate(SIGNALS, Predictor.of(SIGNALS, manifest))(drive)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
@@ -187,21 +188,23 @@ def test_a_car_identified_from_the_same_drives_competes(again: Any) -> None:
 
 
 def test_filters_know_the_mass_where_the_model_does() -> None:
-    (drive,) = simulate_drives([load_scenario("adhesion_0_4")])
+    (drive,) = simulate_drives(SIGNALS, [load_scenario("adhesion_0_4", SHIPPED_CONFIGS)])
     scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
     heavy = replace(drive, scenario=scenario)
     for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
         estimate = FilterEstimate(FILTERS[1], FILTERS[1].parameters, weighed)
         assert estimate.car(heavy).body.sprung_mass_kg == kg
-    assert class_car("suv", 2000.0) == load_vehicle("suv").with_sprung_mass(2000.0)
-    assert class_car("a_strangers_car", None) is None
+    assert class_car("suv", 2000.0, SHIPPED_CONFIGS) == load_vehicle(
+        "suv", SHIPPED_CONFIGS
+    ).with_sprung_mass(2000.0)
+    assert class_car("a_strangers_car", None, SHIPPED_CONFIGS) is None
 
 
 def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None:
-    scenario = load_scenario("nominal")
-    (drive,) = simulate_drives([scenario])
+    scenario = load_scenario("nominal", SHIPPED_CONFIGS)
+    (drive,) = simulate_drives(SIGNALS, [scenario])
     with connect(root, query="SELECT source FROM log") as database:
-        alone = read_drive(database, scenario.drive_id)
+        alone = read_drive(SIGNALS, database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
     found = FilterEstimate(FILTERS[0], FILTERS[0].parameters)(drive)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
@@ -213,7 +216,7 @@ ROWS = 1000
 def drive(scenario: Scenario) -> TestDrive:
     """Return a drive straight ahead: the estimate is the error."""
     zeros, speed = np.zeros(ROWS), np.full(ROWS, 20.0)
-    signals = {catalogue()[name].column: zeros for name in visible_signals()}
+    signals = {SIGNALS[name].column: zeros for name in visible_signals(SIGNALS)}
     time_s = np.arange(ROWS) / 100
     return TestDrive(scenario, time_s, signals, speed, zeros, zeros, zeros, None)
 
@@ -232,7 +235,8 @@ def run(
 ) -> EvaluatedDrive[TestDrive]:
     parts = {k: v if isinstance(v, tuple) else (v, 0) for k, v in errors_deg.items()}
     estimators = {name: off_by(*part) for name, part in parts.items()}
-    (evaluated,) = evaluate([drive(scenario or load_scenario("nominal"))], estimators)
+    scenario = scenario or load_scenario("nominal", SHIPPED_CONFIGS)
+    (evaluated,) = evaluate([drive(scenario)], estimators)
     return evaluated
 
 
@@ -264,14 +268,18 @@ def test_who_leaves_rows_out_neither_wins_nor_is_close() -> None:
 
 def test_drives_that_differ_in_satellite_navigation_alone_count_once() -> None:
     names = ("gps_clear", "nominal", "gps_urban", "wheel_missing", "gps_tunnel", "noise_doubled")
-    found = rank([run(load_scenario(name), ours=0.1, ekf=0.2) for name in names], "ours", gps=())
+    found = rank(
+        [run(load_scenario(name, SHIPPED_CONFIGS), ours=0.1, ekf=0.2) for name in names],
+        "ours",
+        gps=(),
+    )
     same = [one["same_as"] for one in found["standings"]]
     assert same == [None, "gps_clear", "gps_clear", None, "gps_clear", None]
     assert (found["drives"], found["won"]) == (3, 3)
 
 
 def test_wins_and_close_losses_are_counted_apart() -> None:
-    nominal = load_scenario("nominal")
+    nominal = load_scenario("nominal", SHIPPED_CONFIGS)
     runs = [
         run(nominal.model_copy(update={"seed": seed}), ours=error, ekf=0.2)
         for seed, error in enumerate((0.1, 0.2, 0.24, 0.26))

@@ -10,6 +10,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import error_statistics
 from fleet_slip.evaluation.filters import LinearEstimate
 from fleet_slip.evaluation.test_drives import TestDrive, apply_failure, join, peak_slip
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Failure, load_scenario
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from fleet_slip.vehicle.tyre import cornering_stiffness
@@ -49,7 +50,7 @@ def test_an_estimator_without_any_estimate_has_no_figures() -> None:
 def test_a_null_signal_leaves_no_estimate() -> None:
     model = LinearEstimate(0.5, {"ay_mps2": 2.0, "yaw_rate_rad_s": -1.0})
     signals = {"ay_mps2": np.array([1.0, np.nan]), "yaw_rate_rad_s": np.array([3.0, 3.0])}
-    zero, scenario = np.zeros(2), load_scenario("nominal")
+    zero, scenario = np.zeros(2), load_scenario("nominal", SHIPPED_CONFIGS)
     drive = TestDrive(scenario, zero, signals, zero, zero, zero, zero, None)
     np.testing.assert_array_equal(model(drive), [-0.5, np.nan])
 
@@ -74,7 +75,7 @@ def test_a_failure_after_the_drives_end_is_an_error() -> None:
 
 
 def test_the_peak_of_a_tyre_whose_friction_does_not_fall_is_full_sliding() -> None:
-    car = load_vehicle("d_class_sedan")
+    car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     tyre = car.tyre.model_copy(update={"friction_decay_speed_mps": 1e9})
     steady = car.model_copy(update={"tyre": tyre})
     for adhesion in (1.0, 0.4):
@@ -87,7 +88,7 @@ def test_the_peak_of_a_tyre_whose_friction_does_not_fall_is_full_sliding() -> No
 
 
 def test_the_peak_moves_inwards_when_friction_falls_with_sliding() -> None:
-    car = load_vehicle("d_class_sedan")
+    car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     tyre = car.tyre.model_copy(update={"friction_decay_speed_mps": 1e9})
     steady = car.model_copy(update={"tyre": tyre})
     assert peak_slip(car, 1.0).front_rad < peak_slip(steady, 1.0).front_rad

@@ -23,6 +23,7 @@ from fleet_slip.evaluation.measured_evaluation import with_acceleration
 from fleet_slip.evaluation.single_track import DriveSignals
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.request import SelectionRequest
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
@@ -71,7 +72,7 @@ def test_kinds_of_driving_are_left_out_whole() -> None:
 
 
 def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
-    car, still = load_vehicle("d_class_sedan"), np.zeros(ROWS)
+    car, still = load_vehicle("d_class_sedan", SHIPPED_CONFIGS), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
     logged, measured = replace(a_drive(0), signals=signals), Measured.of(car)

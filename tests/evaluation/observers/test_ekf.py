@@ -22,10 +22,11 @@ from fleet_slip.evaluation.single_track import (
     loaded_axles,
     rates,
 )
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, steady_sideslip_rad
 
-CAR = load_vehicle("d_class_sedan")
+CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 FRONT_M = CAR.body.front_axle_m
 CHASSIS = chassis(CAR)
 NOISE = variances(EkfNoise())

@@ -13,10 +13,11 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom
 
-CAR = load_vehicle("d_class_sedan")
+CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 ESTIMATORS: dict[str, tuple[Callable[..., FloatArray], Any]] = {
     "kalman": (kalman.estimate, kalman.FilterNoise()),
     "ekf": (ekf.estimate, ekf.EkfNoise()),

@@ -16,6 +16,7 @@ from fleet_slip.evaluation import kalman
 from fleet_slip.evaluation.gaussian_state import GaussianState, independent_state
 from fleet_slip.evaluation.kalman import FilterNoise, covariances, fuse, predict, update
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import (
     GPS_EVERY,
@@ -27,7 +28,7 @@ from tests.support.drives import (
     without_fixes,
 )
 
-CAR = load_vehicle("d_class_sedan")
+CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 H = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0]])
 NOISE = FilterNoise(ax_std_mps2=0.1, ay_std_mps2=0.2, bias_walk_mps2_per_sqrt_s=0.02)
 

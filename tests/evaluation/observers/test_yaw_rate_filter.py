@@ -9,10 +9,11 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import yaw_rate_filter
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, undriven_axle
 from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, slalom
 
-CAR = load_vehicle("d_class_sedan")
+CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 NOISE = YawRateNoise()
 
 
@@ -72,7 +73,7 @@ def test_wheels_of_a_braking_car_are_not_believed() -> None:
 
 @pytest.mark.parametrize("name", ["d_class_sedan", "rear_drive_sedan"])
 def test_undriven_axle_gives_speed_and_yaw_rate_of_a_rolling_car(name: str) -> None:
-    car = load_vehicle(name)
+    car = load_vehicle(name, SHIPPED_CONFIGS)
     one = np.ones(1)
     vx, vy, rate, steer = 12.0, -0.2, 0.35, 0.08
     drive = rolling_drive(car, vx * one, vy * one, rate * one, steer * one)

@@ -10,6 +10,7 @@ from fleet_slip.evaluation.report_data import ReportData
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG
 from tests.support.once import made_once
 from tests.support.reported import Reported, call
 
@@ -25,5 +26,5 @@ def reported(tmp_path_factory: pytest.TempPathFactory, evaluated: Path) -> Repor
 
 @pytest.fixture(scope="session")
 def data(reported: Reported) -> ReportData:
-    version = Registry(LocalFolder(reported.root / "models")).resolve("smoke")
+    version = Registry(LocalFolder(reported.root), CATALOG).resolve("smoke")
     return gather(Warehouse(LocalFolder(reported.root)), version)

@@ -40,7 +40,7 @@ from fleet_slip.evaluation.report_data import (
 )
 from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.page import Cell, number
-from fleet_slip.resources import config_names
+from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.tables import Warehouse
@@ -171,7 +171,7 @@ def test_claims_name_scenarios_that_ship(data: ReportData, monkeypatch: pytest.M
     monkeypatch.setattr(StoredEvaluation, "statistics", statistics)
     verdicts = evaluate_claims(replace(data, evaluated=evaluated))
     assert {"melbourne", "mass_1000", "tyres_soft", "car_rear_drive_sedan"} <= names
-    assert names <= {*config_names("scenarios")}
+    assert names <= {*SHIPPED_CONFIGS.names("scenarios")}
     untested = [v.claim for v in verdicts if "The evaluation has no" in v.why]
     assert untested == [many_vehicles, generally_able], "no fleet, and no drive beyond the paper"
 

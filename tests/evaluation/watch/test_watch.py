@@ -15,6 +15,7 @@ import fleet_slip
 from fleet_slip.errors import ConfigError, QuestionError, UsageError
 from fleet_slip.evaluation import watch
 from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch, scenario_frames
+from fleet_slip.resources import Configs
 
 DRIVE = "smoke-2024-05-01-0000"
 
@@ -57,7 +58,7 @@ def test_the_car_moves_as_fast_as_it_drives_and_where_it_goes(frames: DriveFrame
 def test_a_drive_on_a_track_whose_file_is_gone_is_drawn_by_its_motion(
     smoke_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load_track(name: str) -> None:
+    def load_track(name: str, _: Configs) -> None:
         raise ConfigError(f"nothing is called {name!r}")
 
     monkeypatch.setattr(watch, "load_track", load_track)

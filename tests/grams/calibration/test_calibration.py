@@ -11,10 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.course import TURNED, turned_scale
-from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, CAR_NUMBERS
-from fleet_slip.catalogue.features import features, input_scales
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, CAR_NUMBERS
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence, calibrate, roads_of
 from fleet_slip.grams.car_estimates import (
@@ -27,6 +25,7 @@ from fleet_slip.grams.car_estimates import (
     NO_RECEIVER,
     NO_TYRE,
     STRAIGHT,
+    CarTerms,
     estimate_numbers,
     kinds_by_set,
 )
@@ -38,13 +37,14 @@ from fleet_slip.regression.least_squares import ExactSums, fit, solve
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import done_on
 from tests.support.logs import land, log_rows
 
 DAY = date(2024, 5, 1)
 TRUE = {"yaw_rate_offset": 0.013, "ay_offset": -0.21, "steering_offset": 0.004}
 NONE_OFF = dict.fromkeys(TRUE, 0.0)
-COLUMNS = features().feature_set("calibration").columns[:-1]
+COLUMNS = CATALOG.feature_set("calibration").columns[:-1]
 
 
 def biased(rng: np.random.Generator, offsets: dict[str, float]) -> dict[str, Any]:
@@ -83,7 +83,7 @@ def row_of(columns: Sequence[str], counts: Any, drive: str, car: str = "car") ->
 
 def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
-    return CarEvidence(collect_sums(batches, KINDS, lacking=LACKING))
+    return CarEvidence(CATALOG, collect_sums(batches, KINDS, lacking=LACKING))
 
 
 def calibrated(found: CarEvidence, car: str) -> dict[str, CalibratedNumber]:
@@ -160,7 +160,7 @@ def test_least_squares_is_the_exact_fit() -> None:
     names = ("yaw_rate", "course_rate", "slowness")
     gram = Gram.from_counts(names, rng.integers(-3000, 3000, (50, 3)))
     expected = fit(gram, names[1:], "yaw_rate").model
-    scales = {name: input_scales()[name] for name in names}
+    scales = {name: CATALOG.input_scales[name] for name in names}
     found = solve(FLAT.system(ExactSums(gram, {n: {n: scales[n]} for n in names}), 0))
     assert found is not None
     assert found[0] == expected.intercept * scales["yaw_rate"]
@@ -320,7 +320,7 @@ def test_one_drive_of_one_car_has_no_uncertainty() -> None:
 def test_no_gram_rows_tell_nothing() -> None:
     for banked in (False, True):
         for sums in ({}, {kind: Gram.zero(c) for kind, c in KINDS.items()}):
-            told = estimate_numbers(sums, banked)
+            told = estimate_numbers(CarTerms(CATALOG), sums, banked)
             assert {*told.values()} == {NO_COURSE, NO_RECEIVER}
             assert told.keys() == CAR_NUMBERS.keys()
 
@@ -392,7 +392,9 @@ def test_a_car_that_stood_still_tells_the_bias_of_its_gyroscope() -> None:
 
 
 RATIO, LEVER_M, COMPLIANCE, BIAS_RAD = 1.07, 1.3, -0.006, 0.004
-BY_SET = {set_: columns for set_, kind in kinds_by_set().items() for columns in kind.values()}
+BY_SET = {
+    set_: columns for set_, kind in kinds_by_set(SIGNALS.label).items() for columns in kind.values()
+}
 
 
 def levels(rng: np.random.Generator) -> dict[str, Any]:
@@ -401,7 +403,7 @@ def levels(rng: np.random.Generator) -> dict[str, Any]:
     speed = 15 + 8 * np.sin(time_s / 20)
     late = RATIO * (15 + 8 * np.sin((time_s - 0.5) / 20)) + 0.1 * rng.standard_normal(6000)
     counts = {name: np.rint(speed / 0.31 / 0.01) for name in BY_SET[BY_SATELLITE][:4]}
-    satellite = np.rint(late / float(catalogue()["satellite_speed"].scale))
+    satellite = np.rint(late / float(SIGNALS["satellite_speed"].scale))
     return {**counts, "slowness": np.rint(1 / speed / 4e-5), "satellite_speed": satellite}
 
 
@@ -410,11 +412,11 @@ def changes(rng: np.random.Generator) -> dict[str, Any]:
     curvature, ay, turned = rng.standard_normal((3, 5000)) * [[0.01], [2.0], [0.3]]
     label = LEVER_M * curvature + COMPLIANCE * ay + BIAS_RAD + 0.01 * turned
     label += 0.002 * rng.standard_normal(5000)
-    scales = {name: float(scale) for name, scale in input_scales().items()}
-    wanted = {"curvature": curvature, "ay": ay, TURNED: turned, catalogue().label: label}
+    scales = {name: float(scale) for name, scale in CATALOG.input_scales.items()}
+    wanted = {"curvature": curvature, "ay": ay, TURNED: turned, SIGNALS.label: label}
     scales |= {
-        TURNED: turned_scale(),
-        catalogue().label: float(catalogue()[catalogue().label].scale),
+        TURNED: turned_scale(SIGNALS),
+        SIGNALS.label: float(SIGNALS[SIGNALS.label].scale),
     }
     return {name: np.rint(values / scales[name]) for name, values in wanted.items()}
 
@@ -432,14 +434,14 @@ def told() -> dict[str, CalibratedNumber]:
             row_of(BY_SET[name], stacked(BY_SET[name], make(rng)), f"drive-{drive}")
             for drive in range(4)
         ]
-        sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set()[name])
-    stated = CarEvidence(sums).stated("car")
+        sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set(SIGNALS.label)[name])
+    stated = CarEvidence(CATALOG, sums).stated("car")
     return {name: one for name, one in stated.items() if isinstance(one, CalibratedNumber)}
 
 
 def test_the_sets_have_the_columns() -> None:
     for name, columns in BY_SET.items():
-        assert set(columns) <= set(features().feature_set(name).columns)
+        assert set(columns) <= set(CATALOG.feature_set(name).columns)
 
 
 def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedNumber]) -> None:
@@ -461,9 +463,11 @@ def test_the_course_tells_how_a_car_slips(told: dict[str, CalibratedNumber]) -> 
 def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     """A heading has no lever; that of an antenna far away is none of a car."""
     counts = changes(np.random.default_rng(6))
-    counts[catalogue().label] = times * counts[catalogue().label]
+    counts[SIGNALS.label] = times * counts[SIGNALS.label]
     columns = BY_SET[BY_COURSE]
     table = stacked(columns, counts).astype(np.int64)
-    told = estimate_numbers({"slip": Gram.from_counts(columns, table)}, banked=False)
+    told = estimate_numbers(
+        CarTerms(CATALOG), {"slip": Gram.from_counts(columns, table)}, banked=False
+    )
     assert {*told.values()} == {NO_COURSE, NO_CAR}
     assert told["slip_lever"] == told["slip_compliance"] == NO_CAR

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
 from fleet_slip.grams import reader
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
@@ -21,6 +21,7 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse, open_tables
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
 from tests.support.logs import land, log_rows, random_counts
 
@@ -41,10 +42,11 @@ def cohort() -> Cohort:
         "n": [10] * len(ROWS),
     }
     return Cohort(
-        condition=parse_condition("true"),
+        condition=parse_condition(SIGNALS, "true"),
         logs_version=1,
         grams_version=1,
         drives=pa.table(columns),
+        catalog=CATALOG,
     )
 
 
@@ -159,7 +161,7 @@ def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
 def test_a_reader_that_failed_leaves_nothing(warehouse: Warehouse, opened: list[object]) -> None:
     land_another(warehouse, 0)
     with pytest.raises(DataError, match="as a query may"), GramReader(warehouse) as failing:
-        failing.opened(PLAIN, parse_condition("true"))
+        failing.opened(PLAIN, parse_condition(SIGNALS, "true"))
         raise DataError("as a query may")
     load_cohort(warehouse)
     assert len(opened) == 2

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.facts import CAR_NUMBERS
-from fleet_slip.catalogue.features import features
+from fleet_slip.catalog.facts import CAR_NUMBERS
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError
@@ -22,6 +21,7 @@ from fleet_slip.models.score import score
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import table_of
 from tests.support.logs import land, log_rows
 
@@ -99,7 +99,7 @@ def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]
 
 
 def plan_of(names: tuple[str, ...]) -> ColumnPlan:
-    known = features()
+    known = CATALOG
     definitions = {name: one for name in names if (one := known.definition(name)) is not None}
     return ColumnPlan.of(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
 
@@ -107,8 +107,8 @@ def plan_of(names: tuple[str, ...]) -> ColumnPlan:
 def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
     cohort = load_cohort(filled, "true", "fleet")
     (table,) = cohort.tables
-    lacking = set(features().feature_set("fleet").inputs) - set(table.signals)
-    numbers_lacking = {features().calibrated[name].number for name in lacking}
+    lacking = set(CATALOG.feature_set("fleet").inputs) - set(table.signals)
+    numbers_lacking = {CATALOG.calibrated[name].number for name in lacking}
     assert numbers_lacking == {"slip_lever", "slip_compliance"}  # no car has a receiver
     numbers = calibrate(filled).counts()
     for at, row in enumerate(cohort.drives.to_pylist()):
@@ -134,7 +134,7 @@ def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
     rows = compute_columns(plan_of(names), counts_of_drive(filled, "car-0-0", {}))
     np.testing.assert_array_equal(rows[2], rows[0] * rows[1])
     assert not rows[3].any()
-    usual = features().time_columns["understeer_ay"].definition.number
+    usual = CATALOG.time_columns["understeer_ay"].definition.number
     assert usual is not None
     assert usual.less * float(CAR_NUMBERS["understeer"].grain) == pytest.approx(0.003)
 
@@ -154,11 +154,11 @@ def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
 
     frame = fleet.sql("SELECT * FROM log ORDER BY drive_id, tick").to_arrow_table()
     with pytest.raises(InputError, match="fleet-slip calibrate --car"):
-        predict(manifest, frame)
+        predict(SIGNALS, manifest, frame)
     cars_of = calibrate(filled)
     for name in used:
         values = [cars_of.car(car)[name].value for car in frame["vehicle_id"].to_pylist()]
         frame = frame.append_column(name, [values])
-    angle = predict(manifest, frame).to_numpy()
+    angle = predict(SIGNALS, manifest, frame).to_numpy()
     error = np.degrees(angle - frame["sideslip_rad"].to_numpy())
     assert float(np.sqrt(np.mean(error**2))) == pytest.approx(found.rmse_deg, rel=1e-12)

@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalogue.features import PLAIN
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError
 from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
@@ -21,10 +21,11 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.growth_history import write_fleet, write_grams
 from tests.support.logs import DAY, land, log_rows, random_counts
 
-MODELS = load_model_list("table1")
+MODELS = load_model_list(CATALOG, "table1")
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +193,9 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
 
     with GramReader(warehouse) as reader:
         before = load_cohort(reader, folding=plan)
-        opened = reader.opened(PLAIN, parse_condition("true")).database
+        opened = reader.opened(PLAIN, parse_condition(SIGNALS, "true")).database
         assert load_cohort(reader, "adhesion > 0.7", folding=plan).drive_count == 14
-        assert reader.opened(PLAIN, parse_condition("true")).database is opened
+        assert reader.opened(PLAIN, parse_condition(SIGNALS, "true")).database is opened
         assert tables(load_cohort(reader, folding=plan)) == tables(before)
         write_grams(warehouse, [warehouse.logs.snapshot().files[0].path], 10)
         after = load_cohort(reader, folding=plan)

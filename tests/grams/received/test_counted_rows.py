@@ -112,12 +112,15 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
                 "sums": LONG_SUMS.tolist(),
                 "products": LONG_PRODUCTS.tolist(),
             },
-            "more rows than the day of a drive has time for",
+            "makes its car drive more than 24 hours on a day",
         ),
         ({"sums": [10**9, *GRAM.sums[1:]]}, "sums outside the ranges"),
         ({"products": [2**50, *GRAM.products[1:]]}, "products outside the ranges"),
         ({"products": NEGATIVE.tolist()}, "not positive semidefinite"),
         ({"drive_id": "VIN1-20240501T100000Z"}, "of another car or day"),
+        ({"vehicle_id": "V" * 2_000_000}, "a vehicle_id that has more than 200 characters"),
+        ({"drive_id": "V" * 201}, "a drive_id that has more than 200 characters"),
+        ({"vehicle_id": "V\x1b[2J"}, "a vehicle_id that has characters that cannot be printed"),
     ],
 )
 def test_a_row_that_cannot_be_keeps_the_whole_file_out(
@@ -144,6 +147,111 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
     with pytest.raises(InputError, match=r"row 2 .* is there twice"):
         fleet.ingest_counted(write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))]))
     assert len(gram_rows(fleet)) == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"day": date(2024, 5, 2)},
+        {"vehicle_id": "VIN2"},
+        {"vehicle_id": "VIN2", "day": date(2024, 6, 1)},
+        {},
+    ],
+)
+def test_a_replay_is_refused_on_any_day_of_any_car(
+    fleet: fleet_slip.Fleet, tmp_path: Path, change: dict[str, Any]
+) -> None:
+    replay = row_of(gram_of(1), drive_id="replay", **change)
+    both = write_counted(tmp_path / "both", [row_of(gram_of(1)), replay])
+    with pytest.raises(InputError, match=r"row 2 \(drive replay\) is there twice, first as VIN1-"):
+        fleet.ingest_counted(both)
+    fleet.ingest_counted(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
+    with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
+        fleet.ingest_counted(write_counted(tmp_path / "replay", [replay]))
+    assert len(gram_rows(fleet)) == 1
+
+
+def test_rows_of_a_standing_car_may_equal_those_of_another(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    standing = Gram.from_counts(GRAM.signals, np.zeros((3000, K), np.int64))
+    rows = [row_of(standing, car) for car in ("VIN1", "VIN2")]
+    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    fleet.ingest_counted(write_counted(tmp_path / "third", [row_of(standing, "VIN3")]))
+    again = write_counted(tmp_path / "again", [row_of(standing, "VIN1", drive_id="again")])
+    with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
+        fleet.ingest_counted(again)
+
+
+def long_drive(seed: int, rows: int, name: str) -> dict[str, Any]:
+    times = rows // 500
+    gram = gram_of(seed)
+    sums = [times * value for value in gram.sums]
+    products = [times * value for value in gram.products]
+    return row_of(gram, drive_id=name, n=500 * times, sums=sums, products=products)
+
+
+def test_a_car_drives_24_hours_a_day_at_most(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    drives = [long_drive(seed, LONGEST_ROWS // 2, f"drive-{seed}") for seed in range(4)]
+    reason = "makes its car drive more than 24 hours on a day"
+    with pytest.raises(InputError, match=rf"row 3 \(drive drive-2\) {reason}"):
+        fleet.ingest_counted(write_counted(tmp_path / "three", drives[:3]))
+    fleet.ingest_counted(write_counted(tmp_path / "one", drives[:1]))
+    fleet.ingest_counted(write_counted(tmp_path / "two", drives[1:2]))
+    other = drives[2] | {"vehicle_id": "VIN2"}
+    tomorrow = drives[3] | {"day": date(2024, 5, 2)}
+    with pytest.raises(InputError, match=rf"row 1 \(drive drive-2\) {reason}, with what is stored"):
+        fleet.ingest_counted(write_counted(tmp_path / "third", drives[2:3]))
+    fleet.ingest_counted(write_counted(tmp_path / "others", [other, tomorrow]))
+    assert len(gram_rows(fleet)) == 4
+
+
+@pytest.mark.parametrize("name", [" VIN1", "VIN1\t", "vin1"])
+def test_an_erased_car_does_not_come_back_under_a_similar_name(
+    fleet: fleet_slip.Fleet, tmp_path: Path, name: str
+) -> None:
+    rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
+    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    fleet.forget(vehicle="VIN1")
+    with pytest.raises(InputError, match="was forgotten"):
+        fleet.ingest_counted(
+            write_counted(tmp_path / "again", [row_of(gram_of(3), name, drive_id="a")])
+        )
+
+
+def test_names_are_stored_without_spaces_and_composed(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    row = row_of(gram_of(1), " Zoe\u0308 ", drive_id="d1\n")
+    fleet.ingest_counted(write_counted(tmp_path / "rows", [row]))
+    ((stored),) = gram_rows(fleet)
+    assert (stored["vehicle_id"], stored["drive_id"]) == ("Zo\u00eb", "d1")
+
+
+@pytest.mark.parametrize("subject", [{"drive": "VIN1-20240501T100000Z"}, {"vehicle": "VIN1"}])
+def test_an_erased_drive_is_refused_under_another_name_until_it_is_allowed(
+    fleet: fleet_slip.Fleet, tmp_path: Path, subject: dict[str, Any]
+) -> None:
+    rows = [row_of(gram_of(1)), row_of(gram_of(2), "VIN2")]
+    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    assert fleet.forget(**subject).drives == 1
+    again = row_of(gram_of(1), "pseudonym", START_S + DAY_S)
+    path = write_counted(tmp_path / "again", [again])
+    with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
+        fleet.ingest_counted(path)
+    fleet.allow(**subject)
+    assert fleet.ingest_counted(path).new
+
+
+def test_an_erased_drive_with_a_log_does_not_come_back_as_gram_rows(
+    smoke_copy: Path, tmp_path: Path
+) -> None:
+    fleet = fleet_slip.open(smoke_copy)
+    same, drive = renamed(fleet, "other")
+    fleet.forget(drive=drive)
+    again = write_counted(tmp_path / "rows", [same | {"vehicle_id": "pseudonym"}])
+    with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
+        fleet.ingest_counted(again)
 
 
 def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:

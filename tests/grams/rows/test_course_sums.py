@@ -4,6 +4,7 @@ import math
 from collections import defaultdict
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,19 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.catalogue.course import LARGEST_RAD, TURNED, course_units
-from fleet_slip.catalogue.features import FeatureSet, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.course import LARGEST_RAD, TURNED, course_units
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.grams.changes import Fixes
 from fleet_slip.grams.compute import aggregate, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 APART = 400
-LABEL = catalogue().label
+LABEL = SIGNALS.label
 
 
 def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Table:
@@ -47,7 +47,7 @@ def hostile_drive(name: str, rows: int, seed: int, *, every: int = 10) -> pa.Tab
 def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[int, tuple[int, ...]]:
     """Tick of each change, and its last four columns, in words of plain Python."""
     rows = {row["tick"]: row for row in table.to_pylist()}
-    units, found = course_units(), dict[int, tuple[int, ...]]()
+    units, found = course_units(SIGNALS), dict[int, tuple[int, ...]]()
     whole = math.floor(Fraction(late, 4) + Fraction(1, 2))
     for tick in rows:
         now, before = (rows.get(t + whole, {}).get("course") for t in (tick, tick - apart))
@@ -71,9 +71,9 @@ def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[in
 )
 def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -> None:
     table = hostile_drive("a", 6000, 7)
-    plan = ColumnPlan.of_set(features(), "course")
+    plan = ColumnPlan.of_set(CATALOG, "course")
     workspace, counts = Workspace(plan), counts_of(table, plan, {})
-    rows, columns, _ = Fixes(workspace, counts, late).changes(APART)
+    rows, columns, _ = Fixes(course_units(SIGNALS), workspace, counts, late).changes(APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
     assert counts.ticks[rows].tolist() == [0, *expected]
@@ -85,11 +85,11 @@ def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -
 
 @pytest.mark.parametrize("late", [0, 34])
 def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, late: int
+    warehouse: Warehouse, tmp_path: Path, late: int
 ) -> None:
     times = (Decimal("3.5"), Decimal(4), Decimal(5))
-    three = FeatureSet(description="three", of="fleet", change_s=times)
-    monkeypatch.setitem(features().sets, "three", three)
+    three = '[sets.three]\ndescription = "three"\nof = "fleet"\nchange_s = [3.5, 4, 5]\n'
+    warehouse = Warehouse(warehouse.root, configs_with(tmp_path / "configs", features=three))
     drives = {name: hostile_drive(name, 2000, seed) for seed, name in enumerate("ab")}
     land(warehouse, "one", *drives.values())
     files = warehouse.logs.snapshot().files
@@ -121,14 +121,14 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     slip, r = 0.05 * np.sin(1.3 * time), 0.6 + 0.3 * np.sin(0.5 * time)
     heading = 0.6 * time - 0.6 * np.cos(0.5 * time)
     course = np.rint((heading + slip) * 65536 / (2 * np.pi)).astype(np.int64)
-    counts: dict[str, Any] = {name: np.zeros(5000, np.int16) for name in catalogue().inputs}
+    counts: dict[str, Any] = {name: np.zeros(5000, np.int16) for name in SIGNALS.inputs}
     counts["course"] = pa.array(
         ((course + 32768) % 65536 - 32768).astype(np.int16), mask=np.arange(5000) % 10 != 0
     )
     counts["yaw_rate"] = np.rint(r * 10_000).astype(np.int16)
-    plan = ColumnPlan.of_set(features(), "course")
+    plan = ColumnPlan.of_set(CATALOG, "course")
     workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
-    rows, columns, _ = Fixes(workspace, loaded).changes(APART)
+    rows, columns, _ = Fixes(course_units(SIGNALS), workspace, loaded).changes(APART)
     rows, columns = rows[1:], columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]
@@ -138,6 +138,6 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
 
 
 def test_a_turn_is_a_whole_number_of_integrated_counts() -> None:
-    units = course_units()
+    units = course_units(SIGNALS)
     assert (units.turn, units.divisor) == (12_566_371, 13_107_200)
     assert units.turn * 0.5e-6 == pytest.approx(2 * math.pi, rel=4e-8)

@@ -10,8 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fleet_slip
-from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
@@ -23,10 +22,11 @@ from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.logs import DAY, land, log_rows, random_counts
 
-NAMES = catalogue().gram_signals
+NAMES = SIGNALS.gram_signals
 
 
 def integer_gram(columns: list[list[int]]) -> tuple[list[int], list[int]]:
@@ -232,4 +232,4 @@ def test_files_are_told_by_feature_set(tmp_path: Path) -> None:
 
 def test_no_feature_set_is_called_as_the_rows_of_cars_are() -> None:
     with pytest.raises(ValueError, match="received"):
-        FeatureCatalogue.model_validate({"sets": {"received": {}}})
+        FeatureFile.model_validate({"sets": {"received": {}}}, context=SIGNALS)

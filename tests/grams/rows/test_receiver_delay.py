@@ -13,11 +13,19 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalogue.facts import DELAY
+from fleet_slip.catalog.facts import DELAY
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.reader import open_grams
-from fleet_slip.grams.receiver_delay import ReceiverDelay, receiver_delays, with_pooled, with_types
+from fleet_slip.grams.receiver_delay import (
+    ReceiverDelay,
+    course_delays,
+    receiver_delays,
+    with_pooled,
+    with_types,
+)
 from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from tests.support.catalog import SIGNALS
 
 CAMPAIGN = """
 name = "late"
@@ -123,7 +131,7 @@ def test_a_car_of_few_drives_takes_the_delay_of_its_type_and_one_of_many_its_own
 def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path: Path) -> None:
     """The drives of one car stand in for those of five, of which one has had two receivers."""
     fleet = late_fleet(tmp_path, 0.087)
-    condition = parse_condition("true")
+    condition = parse_condition(SIGNALS, "true")
     with open_grams(fleet.warehouse, DELAY, condition) as opened:
         rows = pa.Table.from_batches(opened.batches(condition)).sort_by("drive_id")
     assert rows["receiver"].unique().to_pylist() == ["box"]
@@ -202,6 +210,15 @@ def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
     for name in ("signals", "course"):
         other.gram(name)
     assert corrected_rows(other) == kept
+
+
+def test_an_erased_car_has_no_delay(late_fleet: LateFleet, tmp_path: Path) -> None:
+    warehouse = late_fleet(tmp_path, 0.087).warehouse
+    grams = warehouse.grams.snapshot()
+    active = frozenset(file.path for file in warehouse.logs.snapshot().files)
+    (car,) = course_delays(warehouse, grams, active)
+    Audit(warehouse.root).begin(Forgettable("vehicle", car), 1, [])
+    assert not course_delays(warehouse, grams, active)
 
 
 def test_what_a_course_of_unknown_delay_taught_is_not_published(

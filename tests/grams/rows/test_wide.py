@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 from math import floor
+from pathlib import Path
 from typing import Any
 
 import duckdb
@@ -11,9 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
-from fleet_slip.catalogue.features import FeatureSet, features
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_columns
@@ -26,6 +25,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.tables import Warehouse
 from tests.export.models import DEFINITIONS as OF_MODELS
 from tests.export.models import SPEED
+from tests.support.catalog import CATALOG, configs_with
 from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
@@ -178,19 +178,20 @@ def hostile_drive(name: str, rows: int, seed: int, *, null: float = 0.1) -> pa.T
     return log_rows(name, {**counts, "tick": ticks - ticks[0]})
 
 
-FEW = FeatureSet(
-    description="few",
-    signals=("ax", "ay", "yaw_rate", "wheel_rl"),
-    features=("curvature", "rear_ay"),
-    windows=("ay_mean_16", "ay_bias", "yaw_rate_speed_mean_8"),
-)
+FEW = """
+[sets.few]
+description = "few"
+signals = ["ax", "ay", "yaw_rate", "wheel_rl"]
+features = ["curvature", "rear_ay"]
+windows = ["ay_mean_16", "ay_bias", "yaw_rate_speed_mean_8"]
+"""
 
 
 @pytest.mark.parametrize("feature_set", ["few", pytest.param("windows", marks=pytest.mark.long)])
 def test_gram_rows_of_the_kernel_are_those_of_the_statement(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch, feature_set: str
+    warehouse: Warehouse, tmp_path: Path, feature_set: str
 ) -> None:
-    monkeypatch.setitem(features().sets, "few", FEW)
+    warehouse = Warehouse(warehouse.root, configs_with(tmp_path / "configs", features=FEW))
     whole = log_rows("whole", random_counts(np.random.default_rng(3), 700))
     land(warehouse, "one", hostile_drive("b", 400, 1), hostile_drive("a", 2, 2).slice(0, 1), whole)
     land(warehouse, "two", hostile_drive("c", 5000, 4, null=0.001))
@@ -235,7 +236,7 @@ def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
     """
     for name in ("gated", "course"):
         with pytest.raises(QuestionError, match="SQL cannot compute"):
-            gram_statement(name)
+            gram_statement(CATALOG, name)
     sums = ", ".join(f"sum(i + {n})" for n in range(statement.MOST_SUMS))
     with duckdb.connect() as database:
         rows = database.execute(f"SELECT {sums} FROM range(9) t(i) GROUP BY i % 3").fetchall()
@@ -261,7 +262,7 @@ def test_the_order_of_rows_in_a_file_does_not_matter(warehouse: Warehouse) -> No
 
 
 def test_the_label_is_no_column_to_look_back_on() -> None:
-    label = catalogue().label
+    label = CATALOG.signals.label
     with pytest.raises(ValueError, match="not an input signal"):
         Definition(of=label, over="mean", ticks=4)
     with pytest.raises(ValueError, match="not an input signal"):

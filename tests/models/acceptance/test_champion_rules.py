@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalogue.features import input_scales
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models import acceptance as champion_rules
@@ -25,15 +23,16 @@ from fleet_slip.regression.choice import ANY_WORTH
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
-from fleet_slip.resources import CONFIG_VARIABLE
+from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import land, log_rows
 
 ROWS = 200
 
-LABEL = catalogue().label
+LABEL = SIGNALS.label
 
 WEAK = ("ax", "steering_wheel", "steer_fl")
 """Signals of which each is 0.023 deg of the label, which is not worth refusing."""
@@ -85,7 +84,7 @@ def publish_from(
 
 
 def registry_of(warehouse: Warehouse) -> Registry:
-    return Registry(warehouse.root / "models")
+    return Registry(warehouse.root, CATALOG)
 
 
 def copy(root: Path, folder: Path) -> Warehouse:
@@ -190,7 +189,7 @@ def test_the_champion_is_compared_as_it_is_not_fitted_anew(more: Warehouse) -> N
     answer = answer_request(more, request, "drive_id LIKE 'more%'")
     comparison = champion_rules.compare(answer, [version])
     (as_it_is,) = comparison.incumbents
-    assert as_it_is.counts.coefficients == version.manifest.counts_model().coefficients
+    assert as_it_is.counts.coefficients == version.manifest.counts_model(CATALOG).coefficients
     assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
 
 
@@ -199,7 +198,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules, "worth", lambda: ANY_WORTH)
+    monkeypatch.setattr(champion_rules.Floor, "worth", ANY_WORTH)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = answer_request(warehouse, SelectionRequest(model=every))
@@ -233,9 +232,11 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     for figures, (training, test) in zip(found.folds, groups.splits(), strict=True):
         sets = stepwise_order(training, CHOICE, LABEL, "forward", len(winner.signals))
         model = fit(training, sets[-1], LABEL).model
-        scale = input_scales()[LABEL]
+        scale = CATALOG.input_scales[LABEL]
         assert figures.rmse == held_out_errors(model, training, test).figures(scale).rmse
-    fixed = cross_validate("fixed", groups, least_squares(winner.signals, LABEL), input_scales())
+    fixed = cross_validate(
+        "fixed", groups, least_squares(winner.signals, LABEL), CATALOG.input_scales
+    )
     assert found.pooled.rmse > fixed.pooled.rmse
 
 
@@ -286,37 +287,23 @@ def test_what_was_forced_is_where_it_begins_anew(drives: Warehouse) -> None:
     ],
 )
 def test_a_person_sets_the_floor(
-    drives: Warehouse,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    floor: str,
-    problem: str,
+    drives: Warehouse, tmp_path: Path, floor: str, problem: str
 ) -> None:
     usual = (Path(__file__).parents[3] / "configs" / "publish.toml").read_text()
     name = floor.partition(" ")[0]
     kept = "\n".join(line for line in usual.splitlines() if not line.startswith(name))
-    (tmp_path / "publish.toml").write_text(f"{kept}\n{floor}\n")
-    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path))
-    champion_rules.floor.cache_clear()
-    try:
-        with pytest.raises(RefusedError, match=problem):
-            publish_from(drives)
-    finally:
-        champion_rules.floor.cache_clear()
+    own = tmp_path / "own"
+    own.mkdir()
+    (own / "publish.toml").write_text(f"{kept}\n{floor}\n")
+    with pytest.raises(RefusedError, match=problem):
+        publish_from(Warehouse(drives.root, Configs(own)))
 
 
-def test_a_floor_that_cannot_be_read_lets_nothing_pass(
-    more: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_floor_that_cannot_be_read_lets_nothing_pass(more: Warehouse, tmp_path: Path) -> None:
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "publish.toml").write_text("min_drives = 49\n")
-    monkeypatch.setenv(CONFIG_VARIABLE, str(tmp_path / "own"))
-    champion_rules.floor.cache_clear()
-    try:
-        with pytest.raises(ConfigError, match=r"publish\.toml"):
-            publish_from(more, force=True)
-    finally:
-        champion_rules.floor.cache_clear()
+    with pytest.raises(ConfigError, match=r"publish\.toml"):
+        publish_from(Warehouse(more.root, Configs(tmp_path / "own")), force=True)
 
 
 def hold_by_rollback(registry: Registry) -> None:

@@ -7,12 +7,12 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.catalogue.signals import catalogue
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import MODELS, model_of
+from tests.support.catalog import CATALOG, SIGNALS
 
 MANIFEST = model_of(MODELS["every_kind"], Fraction(1, 7))
 NUMBERS = {"yaw_rate_offset": -30, "speed_ratio": 2003, "understeer": 55}
@@ -21,7 +21,7 @@ NUMBERS = {"yaw_rate_offset": -30, "speed_ratio": 2003, "understeer": 55}
 def drive_of(rows: int, seed: int) -> DriveCounts:
     """Counts of ordinary sizes, some of them missing, with holes between ticks."""
     random = np.random.default_rng(seed)
-    signals = Predictor.of(MANIFEST).plan.signals
+    signals = Predictor.of(SIGNALS, MANIFEST).plan.signals
     counts = {name: random.integers(900, 1800, rows).astype(np.int16) for name in signals}
     present = {name: random.random(rows) < 0.999 for name in signals}
     facts = {"mass_kg": 1320.5 + seed, "vehicle_model": "suv" if seed % 2 else "van"}
@@ -31,7 +31,7 @@ def drive_of(rows: int, seed: int) -> DriveCounts:
 
 def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
     """One workspace for drives of several lengths, against a dot product over all columns."""
-    predictor = Predictor.of(MANIFEST)
+    predictor = Predictor.of(SIGNALS, MANIFEST)
     workspace = Workspace(predictor.plan)
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
@@ -49,8 +49,8 @@ def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
 def frame_of(drive: DriveCounts, name: str) -> pl.DataFrame:
     """A drive in SI units."""
     columns = {
-        catalogue()[one].column: pl.Series(
-            np.where(drive.present[one], counts * float(catalogue()[one].scale), np.nan)
+        SIGNALS[one].column: pl.Series(
+            np.where(drive.present[one], counts * float(SIGNALS[one].scale), np.nan)
         )
         for one, counts in drive.counts.items()
     }
@@ -65,9 +65,9 @@ def frame_of(drive: DriveCounts, name: str) -> pl.DataFrame:
 
 
 def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
-    version = ModelVersion(1, MANIFEST, "0" * 64)
+    version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     drives = {f"drive {seed}": drive_of(rows, seed) for rows, seed in ((1300, 1), (40, 2), (9, 5))}
-    predictor = Predictor.of(MANIFEST)
+    predictor = Predictor.of(SIGNALS, MANIFEST)
     expected = np.concatenate([predictor(one) for one in drives.values()])
     together = pl.concat([frame_of(one, name) for name, one in drives.items()])
     found = version.predict(together).to_numpy()
@@ -79,16 +79,18 @@ def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
 
 
 def test_threads_that_share_a_version_do_not_share_memory() -> None:
-    version = ModelVersion(1, MANIFEST, "0" * 64)
+    version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     frames = [frame_of(drive_of(2000, seed), "drive") for seed in range(4)]
-    expected = [ModelVersion(1, MANIFEST, "0" * 64).predict(one).to_list() for one in frames]
+    expected = [
+        ModelVersion(1, MANIFEST, "0" * 64, CATALOG).predict(one).to_list() for one in frames
+    ]
     with ThreadPoolExecutor(4) as pool:
         found = [*pool.map(lambda one: version.predict(one).to_list(), frames * 8)]
     assert found == expected * 8
 
 
 def test_a_frame_without_rows_has_no_angles() -> None:
-    version = ModelVersion(1, MANIFEST, "0" * 64)
+    version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     empty = frame_of(drive_of(3, 1), "drive").head(0)
     assert version.predict(empty).to_list() == []
     assert version.predict(empty.to_arrow()).to_pylist() == []

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fleet_slip.ingest.mapping import Mapping
+from tests.support.catalog import SIGNALS
 from tests.support.fuzz.mutate import NUMBERS, WORDS, mutate_bytes
 
 COLUMNS = ("t", "ax", "beta", "car", "day")
@@ -30,7 +31,9 @@ _CHANGES: tuple[dict[str, Any], ...] = (
     {"drive": {**_BASE["drive"], "mass_kg": {"column": "beta"}, "track": {"column": "car"}}},
     {"drive": {**_BASE["drive"], "day": {"column": "day"}}},
 )
-MAPPINGS = tuple(Mapping.model_validate({**_BASE, **change}) for change in _CHANGES)
+MAPPINGS = tuple(
+    Mapping.model_validate({**_BASE, **change}, context=SIGNALS) for change in _CHANGES
+)
 """The first is the one that fits the files best."""
 
 

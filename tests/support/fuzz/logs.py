@@ -23,6 +23,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.mapping import Mapping
+from tests.support.catalog import SIGNALS
 from tests.support.fuzz.files import _BASE
 from tests.support.fuzz.mutate import mutate_bytes
 
@@ -48,7 +49,7 @@ _BUS = CanBus(database="car.dbc", text=DBC)
 
 def _mapping(ax: str, beta: str, **changes: Any) -> Mapping:
     signals = {"ax": {"column": ax, "unit": "m/s^2"}, "sideslip": {"column": beta, "unit": "deg"}}
-    mapping = Mapping.model_validate({**_BASE, "signals": signals, **changes})
+    mapping = Mapping.model_validate({**_BASE, "signals": signals, **changes}, context=SIGNALS)
     # The database was read when a mapping is loaded; here it is given.
     return mapping.model_copy(update={"can": _BUS}) if "can" in changes else mapping
 

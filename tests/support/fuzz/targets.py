@@ -20,8 +20,8 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.catalogue.features import FeatureCatalogue
-from fleet_slip.catalogue.signals import SignalCatalogue, catalogue
+from fleet_slip.catalog.features import FeatureFile
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
@@ -34,18 +34,19 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import score
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.forget import load_retention
-from fleet_slip.resources import find_config, folder
+from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.documents import checksum
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import one_query
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
 from tests.support.fuzz.logs import damaged_file
 from tests.support.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
@@ -119,7 +120,9 @@ def names(rng: random.Random, place: Path) -> None:
     drive = {"day": "2024-05-31", "vehicle_id": {"column": "car"}, "vehicle_model": "sedan"}
     mapping = MAPPINGS[0].model_dump(mode="json", exclude_none=True)
     warehouse = Warehouse(data_root(root))
-    ingest_file(warehouse, file, Mapping.model_validate({**mapping, "drive": drive}))
+    ingest_file(
+        warehouse, file, Mapping.model_validate({**mapping, "drive": drive}, context=SIGNALS)
+    )
     update_grams(warehouse, no_progress)
     quoted = vehicle.strip().replace("'", "''")
     condition = rng.choice(
@@ -135,7 +138,7 @@ def names(rng: random.Random, place: Path) -> None:
 def references(rng: random.Random, place: Path) -> None:
     """Name models, aliases, configs and signals that do not exist."""
     warehouse = Warehouse(LocalFolder(template(place)))
-    registry = Registry(warehouse.root / "models")
+    registry = Registry(warehouse.root, CATALOG)
     word = rng.choice([*WORDS, f"{MODEL}@{rng.choice(WORDS)}", f"{rng.choice(WORDS)}@1"])
     match rng.randrange(7):
         case 0:
@@ -143,7 +146,7 @@ def references(rng: random.Random, place: Path) -> None:
         case 1:
             require_model_name(word)
         case 2:
-            find_config(rng.choice(["campaigns", "models", "tracks"]), word)
+            SHIPPED_CONFIGS.find(rng.choice(["campaigns", "models", "tracks"]), word)
         case 3:
             registry.promote(MODEL, 1, word)
         case 4:
@@ -161,15 +164,15 @@ def references(rng: random.Random, place: Path) -> None:
 Load = Callable[[str], object]
 
 LOADERS: dict[str, Load] = {
-    "campaigns": load_campaign,
-    "mappings": load_mapping,
-    "models": load_model_list,
-    "scenarios": load_scenario,
-    "tracks": load_track,
-    "vehicles": load_vehicle,
-    "signals.toml": lambda path: load_config(Path(path), SignalCatalogue),
-    "features.toml": lambda path: load_config(Path(path), FeatureCatalogue),
-    "retention.toml": load_retention,
+    "campaigns": lambda path: load_campaign(path, SHIPPED_CONFIGS),
+    "mappings": lambda path: load_mapping(path, CATALOG),
+    "models": lambda path: load_model_list(CATALOG, path),
+    "scenarios": lambda path: load_scenario(path, SHIPPED_CONFIGS),
+    "tracks": lambda path: load_track(path, SHIPPED_CONFIGS),
+    "vehicles": lambda path: load_vehicle(path, SHIPPED_CONFIGS),
+    "signals.toml": lambda path: load_config(Path(path), SignalCatalog),
+    "features.toml": lambda path: load_config(Path(path), FeatureFile, SIGNALS),
+    "retention.toml": lambda path: load_retention(path, SHIPPED_CONFIGS),
 }
 
 
@@ -237,11 +240,11 @@ def _drive(drive_id: str, counts: np.ndarray[Any, Any]) -> pa.Table:
         field.name: pa.array(given[field.name], field.type)
         if field.name in given
         else pa.array([known.get(field.name)] * rows, field.type)
-        for field in catalogue().log_schema
+        for field in SIGNALS.log_schema
     }
     columns["day"] = pa.array([_DAY] * rows, pa.date32())
     columns["tick"] = pa.array(np.arange(rows), pa.int32())
-    return pa.table(columns, schema=catalogue().log_schema)
+    return pa.table(columns, schema=SIGNALS.log_schema)
 
 
 def manifest(rng: random.Random, place: Path) -> None:
@@ -255,14 +258,15 @@ def manifest(rng: random.Random, place: Path) -> None:
         document = json.loads(file.read_text(encoding="utf-8"))
         document["content"] = mutate_tree(rng, document["content"])
         text = to_json(document)
-        with contextlib.suppress(ValueError, RecursionError):
-            document = json.loads(text)
-            document["sha256"] = checksum(document["content"])  # as a forger does
-            text = to_json(document)
-        file.write_text(text, encoding="utf-8", errors="surrogatepass")
+        file.unlink()
+        try:  # as a forger does
+            folder = DocumentFolder(LocalFolder(root), f"models/{MODEL}/{kind}")
+            folder.create(1, json.loads(text)["content"])
+        except (ValueError, RecursionError):
+            file.write_text(text, encoding="utf-8", errors="surrogatepass")
     if rng.random() < 0.1:
         file.rename(file.with_name(rng.choice(["2.json", "01.json", "9" * 200 + ".json"])))
-    registry = Registry(LocalFolder(root / "models"))
+    registry = Registry(LocalFolder(root), CATALOG)
     steps: list[Callable[[], object]] = [
         registry.as_table,
         registry.history(MODEL).moves,
@@ -319,7 +323,7 @@ def _use(root: Path) -> None:
             lambda: load_cohort(warehouse),
             lambda: answer_request(warehouse, SelectionRequest(nested="ax,ay", folds=2)),
             lambda: score(
-                warehouse, Registry(LocalFolder(root / "models")).resolve(MODEL).manifest, "true"
+                warehouse, Registry(LocalFolder(root), CATALOG).resolve(MODEL).manifest, "true"
             ),
             lambda: update_grams(warehouse, no_progress),
         ]

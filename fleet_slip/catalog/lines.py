@@ -6,23 +6,23 @@ fitted without it: the other would flatter itself.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
 
 from fleet_slip.base import canonical_json, hash_fold, sha256_of
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.definitions import (
     Combination,
     Definition,
     Made,
     Product,
     limit_of,
 )
-from fleet_slip.catalogue.signals import Identifier
+from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config
-from fleet_slip.errors import QuestionError, StorageError
+from fleet_slip.errors import QuestionError
 
 DIGITS = 12
 
@@ -76,44 +76,6 @@ class FittedLine(Config):
         """Return the line that was fitted without a fold; that of all drives where it has none."""
         one = self.folds.get(fold, self.fitted) if fold is not None else self.fitted
         return one.model_copy(update={"line": self.digest})
-
-
-_lines: dict[str, FittedLine] = {}
-_sources: dict[str, Callable[[str], FittedLine | None]] = {}
-
-
-def remember_line(line: FittedLine) -> None:
-    """Know a line by its digest from now on."""
-    _lines[line.digest] = line
-
-
-def look_for_lines(where: str, find: Callable[[str], FittedLine | None]) -> None:
-    """Look for unknown lines there, too, such as in a data root."""
-    _sources.pop(where, None)  # the root opened last is asked first
-    _sources[where] = find
-
-
-def known_line(digest: str) -> FittedLine:
-    """Return a line. Raises `QuestionError` for an unknown one, `StorageError` of the last root.
-
-    A root that was opened before, and cannot be read any more, is passed over.
-    """
-    broken: StorageError | None = None
-    for place, find in enumerate(reversed(_sources.values())):
-        if digest in _lines:
-            break
-        try:
-            found = find(digest)
-        except StorageError as error:
-            broken = broken if place else error
-        else:
-            if found is not None:
-                remember_line(found)
-    if digest not in _lines:
-        raise broken or QuestionError(
-            f"the line {digest} is not in this data root. Publish the model again."
-        )
-    return _lines[digest]
 
 
 @dataclass

@@ -8,8 +8,8 @@ from decimal import Decimal
 from fractions import Fraction
 from typing import Final, Literal
 
-from fleet_slip.catalogue.arithmetic import nearest
-from fleet_slip.catalogue.signals import COUNT_MAX, SIUnit
+from fleet_slip.catalog.arithmetic import nearest
+from fleet_slip.catalog.signals import COUNT_MAX, SIUnit
 from fleet_slip.config import Config
 
 CALIBRATION = "calibration"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.signals import SignalCatalog
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
@@ -189,11 +189,13 @@ ONE_SIDED, TURNING_BOTH_WAYS = 0.5, 0.3
 """Mean over root mean square: a magnitude has about 0.8, a drive with bends to both sides 0.1."""
 
 
-def find_implausible(table: "GramTable", min_correlation: float) -> dict[int, Fault]:
+def find_implausible(
+    table: "GramTable", signals: SignalCatalog, min_correlation: float
+) -> dict[int, Fault]:
     """Return the drives whose sensors contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
     for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
-        found = steering_swapped(moments)
+        found = steering_swapped(moments, signals)
         if len(_witnesses(moments)) >= FEWEST_WITNESSES:
             turning = find_reversed_or_swapped(moments, min_correlation)
             found |= {drive: _joined(several) for drive, several in turning.items()}
@@ -314,7 +316,7 @@ def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
     }
 
 
-def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
+def steering_swapped(moments: MeanMoments, signals: SignalCatalog) -> dict[int, Fault]:
     """Return the drives in which the outer front wheel steers more than the inner one.
 
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
@@ -326,7 +328,7 @@ def steering_swapped(moments: MeanMoments) -> dict[int, Fault]:
     if not {left, right} <= set(moments.signals):
         return {}
     i, j = moments.position(left), moments.position(right)
-    m, scale = moments.matrices, float(catalogue()[left].scale)
+    m, scale = moments.matrices, float(signals[left].scale)
     product = m[:, i, j] * scale**2
     difference = (m[:, 0, i] - m[:, 0, j]) * scale
     ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)

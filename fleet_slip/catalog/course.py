@@ -26,8 +26,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue.faults import Fault
-from fleet_slip.catalogue.signals import HALF_TURN, SAMPLE_TIME_S, catalogue
+from fleet_slip.catalog.faults import Fault
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 
 COURSE, YAW_RATE, SATELLITE_SPEED = "course", "yaw_rate", "satellite_speed"
 TURNED = "turned"
@@ -71,17 +71,16 @@ class CourseUnits:
     unturned: int
 
 
-def course_units() -> CourseUnits:
-    """Return the numbers for the catalogue's scales."""
-    known = catalogue()
-    grain = known[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2
+def course_units(signals: SignalCatalog) -> CourseUnits:
+    """Return the numbers for the scales of a catalog."""
+    grain = signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2
     turn = round(Fraction(Decimal(2) * Decimal(math.pi)) / grain)
-    divisor = round(2 * HALF_TURN * known[known.label].exact_scale / grain)
+    divisor = round(2 * HALF_TURN * signals[signals.label].exact_scale / grain)
     return CourseUnits(
         turn,
         divisor,
         int(2 * HALF_TURN * LARGEST_RAD / grain),
-        int(STRAIGHT_RAD_S / known[YAW_RATE].exact_scale),
+        int(STRAIGHT_RAD_S / signals[YAW_RATE].exact_scale),
         int(STRAIGHT_RAD / grain),
     )
 
@@ -121,9 +120,9 @@ LEVERS_M = (0.6, 2.6)
 """From a small car with the engine behind to a van."""
 
 
-def turned_scale() -> float:
+def turned_scale(signals: SignalCatalog) -> float:
     """Return the rad of a count of `TURNED`."""
-    return float(catalogue()[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * COARSER
+    return float(signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * COARSER
 
 
 @dataclass(frozen=True)

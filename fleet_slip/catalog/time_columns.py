@@ -13,10 +13,10 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
-from fleet_slip.catalogue.arithmetic import nearest_sql, parse
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.arithmetic import nearest_sql, parse
+from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     LARGEST_BITS,
     LONGEST_TICKS,
@@ -34,8 +34,8 @@ from fleet_slip.catalogue.definitions import (
     Slope,
     integer_arithmetic,
 )
-from fleet_slip.catalogue.facts import CAR_NUMBERS, NumberName, Unit
-from fleet_slip.catalogue.signals import Identifier, Scaled, Signal, SIUnit, catalogue
+from fleet_slip.catalog.facts import CAR_NUMBERS, NumberName, Unit
+from fleet_slip.catalog.signals import Identifier, Scaled, Signal, SignalCatalog, SIUnit
 from fleet_slip.config import Config
 
 # Features of `configs/features.toml` as types: integer functions of the counts of one row.
@@ -58,14 +58,14 @@ class Feature(Scaled):
     description: str = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _is_integer_arithmetic(self) -> "Feature":
+    def _is_integer_arithmetic(self, info: ValidationInfo) -> "Feature":
         guarded = self.divided_by is not None and not self._divisor_is_number
         if guarded != (self.at_least is not None):
             raise ValueError("at_least is for a divisor that varies, which must have it")
         if self._divisor_is_number and int(self.divided_by or 0) == 0:
             raise ValueError("divided_by is zero")
         # What a manifest takes, and every target computes: see `columns/operations.py`.
-        if not parse(integer_arithmetic(self.sql)).inputs:
+        if not parse(integer_arithmetic(self.sql, info)).inputs:
             raise ValueError("it is of no signal")
         return self
 
@@ -87,9 +87,8 @@ class Feature(Scaled):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The signals that it is computed from, in catalogue order."""
-        used = parse(self.sql).inputs
-        return tuple(name for name in catalogue().feature_inputs if name in used)
+        """The signals that it is computed from."""
+        return tuple(parse(self.sql).inputs)
 
 
 def _widened(text: str) -> str:
@@ -122,6 +121,7 @@ class KnownColumns:
     `missing` are the names of those that are to be made.
     """
 
+    signals: SignalCatalog
     features: Mapping[str, Feature]
     over_time: dict[str, TimeColumn] = field(default_factory=dict)
     missing: frozenset[str] = frozenset()
@@ -132,9 +132,9 @@ class KnownColumns:
             raise NotYetMadeError
         if found := self.over_time.get(name) or self.features.get(name):
             return found
-        if name not in catalogue().feature_inputs:
+        if name not in self.signals.feature_inputs:
             raise ValueError(f"{name} is no input signal or feature")
-        return catalogue()[name]
+        return self.signals[name]
 
     def definition(self, name: str) -> Definition:
         """Return a column over time, or a row as one. Raises `ValueError` for no input."""
@@ -250,7 +250,10 @@ class Factor(ColumnFamily):
         if base.fact is not None:
             raise ValueError(f"{self.of} has a factor already")
         ratio = known.of(self.of).exact_scale / Fraction(self.scale)
-        fact = Fact(name=self.fact, less=self.less, equals=self.equals, ratio=ratio)
+        fact = Fact.model_validate(
+            {"name": self.fact, "less": self.less, "equals": self.equals, "ratio": ratio},
+            context=known.signals,
+        )
         return {name: self._column(base.model_copy(update={"fact": fact}))}
 
 

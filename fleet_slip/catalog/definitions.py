@@ -18,11 +18,11 @@ from functools import cache
 from random import Random
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, ValidationInfo, model_validator
 
-from fleet_slip.catalogue.arithmetic import evaluate, parse
-from fleet_slip.catalogue.facts import NumberName
-from fleet_slip.catalogue.signals import COUNT_MAX, Identifier, catalogue
+from fleet_slip.catalog.arithmetic import evaluate, parse
+from fleet_slip.catalog.facts import NumberName
+from fleet_slip.catalog.signals import COUNT_MAX, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
@@ -72,22 +72,32 @@ def _ratio(value: Fraction) -> Fraction:
     return value
 
 
-def integer_arithmetic(sql: str) -> str:
-    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic."""
+def _signals_of(info: ValidationInfo) -> SignalCatalog | None:
+    """Return the signals to check names against: the context of a file or document that is read."""
+    return info.context if isinstance(info.context, SignalCatalog) else None
+
+
+def integer_arithmetic(sql: str, info: ValidationInfo) -> str:
+    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
+
+    With a `SignalCatalog` as context it must also be of input signals.
+    """
     if not sql:
         return sql
     try:
         inputs = parse(sql).inputs
     except QuestionError as error:
         raise ValueError(str(error)) from None
-    if unknown := set(inputs) - set(catalogue().feature_inputs):
+    signals = _signals_of(info)
+    if signals and (unknown := set(inputs) - set(signals.feature_inputs)):
         raise ValueError(f"{', '.join(sorted(unknown))}: not an input signal")
     return sql
 
 
-def _not_unknowable(name: str) -> str:
-    if name in NOT_FACTS or name not in catalogue().drive:
-        raise ValueError(f"{name} is not a property of the car that the catalogue has")
+def _not_unknowable(name: str, info: ValidationInfo) -> str:
+    signals = _signals_of(info)
+    if name in NOT_FACTS or (signals and name not in signals.drive):
+        raise ValueError(f"{name} is not a property of the car that the catalog has")
     return name
 
 
@@ -122,8 +132,11 @@ class Fact(Config):
     ratio: Ratio = Fraction(1)
 
     @model_validator(mode="after")
-    def _fits_its_type(self) -> "Fact":
-        text = catalogue().drive[self.name].type == "string"
+    def _fits_its_type(self, info: ValidationInfo) -> "Fact":
+        signals = _signals_of(info)
+        if signals is None:
+            return self
+        text = signals.drive[self.name].type == "string"
         if text != (self.equals is not None):
             raise ValueError(f"{self.name} {'needs' if text else 'is a number without'} equals")
         return self
@@ -161,7 +174,7 @@ class Gate(Config):
 
 
 class Number(Config):
-    """What a car's drives tell of it (`fleet_slip.catalogue.facts`): a factor of a column.
+    """What a car's drives tell of it (`fleet_slip.catalog.facts`): a factor of a column.
 
     The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
     number is not known takes the mean since its drive began, `running`, of the same grain; without
@@ -316,13 +329,16 @@ class Definition(Config):
         return self
 
     @model_validator(mode="after")
-    def _of_is_known(self) -> "Definition":
+    def _of_is_known(self, info: ValidationInfo) -> "Definition":
         logged = not (self.sql or self.made)
         if self.sql and self.made:
             raise ValueError(f"{self.of} is a feature, or made of columns, not both")
-        if logged and self.of not in catalogue().feature_inputs:
+        signals = _signals_of(info)
+        if signals is None:
+            return self
+        if logged and self.of not in signals.feature_inputs:
             raise ValueError(f"{self.of} is not an input signal")
-        if not logged and self.of in {*catalogue().signals, *catalogue().drive, "tick", "day"}:
+        if not logged and self.of in {*signals.signals, *signals.drive, "tick", "day"}:
             raise ValueError(f"{self.of} is the name of a column of the logs")
         return self
 
@@ -426,7 +442,7 @@ def parity(one: Definition) -> int:
     if one.number:
         of = 1 if one.number.alone else parity(one.model_copy(update={"number": None}))
         return -of if one.number.name in OFFSETS else of
-    values = [(_value(one, row), _value(one, _mirrored(row))) for row in _rows()]
+    values = [(_value(one, row), _value(one, _mirrored(row))) for row in _trial_rows(one)]
     if all(a == b for a, b in values):
         return 1
     return -1 if all(a is not None and b == -a for a, b in values) else 0
@@ -436,12 +452,12 @@ def _value(one: Definition, row: Mapping[str, int]) -> int | None:
     return evaluate(one.sql, row) if one.sql else row[one.of]
 
 
-@cache
-def _rows() -> tuple[Mapping[str, int], ...]:
+def _trial_rows(definition: Definition) -> tuple[Mapping[str, int], ...]:
     """Return counts of cars at speed, whose left and right wheels differ, the same every time."""
     draw = Random(1)  # noqa: S311 - no secret
+    names = sorted({*definition.signals, *EXCHANGED})
     return tuple(
-        {name: draw.randint(4000, 6000) for name in catalogue().feature_inputs}
+        {name: draw.randint(4000, 6000) for name in names}
         | {name: draw.choice((-1, 1)) * draw.randint(500, 3000) for name in sorted(OPPOSITE)}
         for _ in range(TRIALS)
     )

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalogue import features as features_module
-from fleet_slip.catalogue.course import CourseRelation, relate
-from fleet_slip.catalogue.definitions import (
+from fleet_slip.catalog.catalog import load_catalog
+from fleet_slip.catalog.course import CourseRelation, relate
+from fleet_slip.catalog.definitions import (
     EXCHANGED,
     OFFSETS,
     OPPOSITE,
@@ -27,17 +27,13 @@ from fleet_slip.catalogue.definitions import (
     limit_of,
     parity,
 )
-from fleet_slip.catalogue.facts import CAR_NUMBERS
-from fleet_slip.catalogue.features import FeatureCatalogue, features, load_features_over
-from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.catalog.facts import CAR_NUMBERS
+from fleet_slip.catalog.features import FeatureFile, load_features_over
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError
-from fleet_slip.grams import compute as aggregation
-from fleet_slip.grams import compute as gram_statement
-from fleet_slip.grams import job
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.request import load_model_list
@@ -45,13 +41,14 @@ from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.table import Change, Unit
 from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts
 
 RADIUS_M = Fraction(31, 100)
 TRACK_M = Fraction(155, 100)
-INPUTS = catalogue().inputs
-LABEL = catalogue().label
+INPUTS = SIGNALS.inputs
+LABEL = SIGNALS.label
 
 Row = dict[str, Fraction]
 
@@ -150,8 +147,8 @@ def counts(rows: int, seed: int) -> dict[str, Any]:
 
 
 def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
-    known = features().features
-    rows = features().rows(known)
+    known = CATALOG.features
+    rows = CATALOG.rows(known)
     drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
     columns = compute_columns(ColumnPlan.of(tuple(known), rows, {}), drive)
     return {
@@ -165,7 +162,7 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     # Ordinary driving too, where the guarded quotients exist and nothing is clipped.
     for name in INPUTS:
         logged[name][200:] = (logged[name][200:] // 40) + (1500 if "wheel" in name else 0)
-    definitions = features().rows(features().features)
+    definitions = CATALOG.rows(CATALOG.features)
     assert set(definitions) == set(PHYSICS)
     with duckdb.connect() as database:
         database.register("log_counts", pa.table(logged))
@@ -174,7 +171,7 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
     by_kernel = computed_by_kernel(logged)
     for name in definitions:
         np.testing.assert_array_equal(by_kernel[name], found[name].to_pylist(), err_msg=name)
-    exact = {name: catalogue()[name].exact_scale for name in INPUTS}
+    exact = {name: SIGNALS[name].exact_scale for name in INPUTS}
     clipped = 0
     for i, row in enumerate(found.to_pylist()):
         physical = {name: int(logged[name][i]) * exact[name] for name in INPUTS}
@@ -184,8 +181,8 @@ def test_every_feature_is_its_physical_definition_rounded_and_clipped() -> None:
             if value is None:
                 assert row[name] is None
                 continue
-            count = nearest(value / features().features[name].exact_scale)
-            limit = limit_of(features().features[name].bits)
+            count = nearest(value / CATALOG.features[name].exact_scale)
+            limit = limit_of(CATALOG.features[name].bits)
             out_of_range += abs(count) > limit
             assert row[name] == max(-limit, min(limit, count)), (name, i)
         assert row["clipped"] == out_of_range
@@ -219,7 +216,7 @@ def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(
     assert old in text
     (tmp_path / "features.toml").write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
-        load_config(tmp_path / "features.toml", FeatureCatalogue)
+        load_config(tmp_path / "features.toml", FeatureFile, SIGNALS)
 
 
 def cohort_gram(warehouse: Warehouse, feature_set: str, signals: list[str]) -> Gram:
@@ -264,20 +261,19 @@ def test_a_set_costs_one_pass_and_stands_beside_the_others(warehouse: Warehouse)
 
 
 def test_a_changed_definition_never_mixes_with_the_old_rows(
-    warehouse: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    warehouse: Warehouse, tmp_path: Path
 ) -> None:
     land(warehouse, "one", drive("a", 300, 1))
     update_grams(warehouse, feature_set="motion")
-    before = features()
+    before = CATALOG
     text = (folder("configs") / "features.toml").read_text(encoding="utf-8")
     changed_text = text.replace("at_least = 120000", "at_least = 400000")
-    (tmp_path / "features.toml").write_text(changed_text, encoding="utf-8")
-    changed = load_config(tmp_path / "features.toml", FeatureCatalogue)
+    configs = configs_with(tmp_path / "configs", features=changed_text)
+    changed = load_catalog(configs)
     assert changed.identity("motion") != before.identity("motion")
     assert changed.identity("delay") == before.identity("delay")
-    for module in (features_module, aggregation, job, gram_statement):
-        monkeypatch.setattr(module, "features", lambda: changed)
-    assert update_grams(warehouse, feature_set="motion").rows_read == 300
+    now = Warehouse(warehouse.root, configs)
+    assert update_grams(now, feature_set="motion").rows_read == 300
     rows = pa.concat_tables(
         [pa.parquet.read_table(path) for path in warehouse.grams.snapshot().paths]
     ).to_pylist()
@@ -309,19 +305,19 @@ def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> No
 
 
 def test_a_gate_that_an_odd_column_opens_makes_a_column_of_neither_kind() -> None:
-    one = features().time_columns["ay_mean_16_cornering_1"].definition
+    one = CATALOG.time_columns["ay_mean_16_cornering_1"].definition
     assert one.gate is not None
-    by_ay = one.gate.model_copy(update={"by": features().time_columns["ay_mean_32"].definition})
+    by_ay = one.gate.model_copy(update={"by": CATALOG.time_columns["ay_mean_32"].definition})
     assert parity(one) == -1 and parity(one.model_copy(update={"gate": by_ay})) == 0
 
 
 @pytest.mark.parametrize("name", ["windows", "course_gated", "fleet"])
 def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> None:
     """By the kernel that Gram rows come from, every column of the set; no other one is odd."""
-    known = features()
+    known = CATALOG
     names = known.feature_set(name).inputs
     random = np.random.default_rng(1)
-    drive = {name: random.integers(4000, 6000, 400) for name in catalogue().inputs}
+    drive = {name: random.integers(4000, 6000, 400) for name in SIGNALS.inputs}
     drive |= {name: random.integers(-3000, 3000, 400) for name in drive if name in OPPOSITE}
     other = {
         name: -drive[name] if name in OPPOSITE else drive[EXCHANGED.get(name, name)]
@@ -350,10 +346,10 @@ def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> 
 
 
 def test_a_search_among_changes_knows_odd_and_short_columns_alone() -> None:
-    found = features().searched("course")
+    found = CATALOG.search_inputs("course")
     assert "ax" not in found and "wheel_fl" not in found and "curvature" not in found
     assert "ay_mean_128" in found and "ay_mean_256" not in found
-    assert features().searched("windows") == features().feature_set("windows").inputs
+    assert CATALOG.search_inputs("windows") == CATALOG.feature_set("windows").inputs
 
 
 BY = Definition(of="ay")
@@ -405,9 +401,9 @@ def test_a_weight_changes_by_no_more_than_its_slope(edges: list[int]) -> None:
 
 
 def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() -> None:
-    known = features()
-    first, second = known.of("rear_ay_mean_16_excess_1"), known.of("rear_ay_mean_16_excess_2")
-    assert first.exact_scale == second.exact_scale == known.of("rear_ay_mean_16").exact_scale
+    known = CATALOG
+    first, second = known.input("rear_ay_mean_16_excess_1"), known.input("rear_ay_mean_16_excess_2")
+    assert first.exact_scale == second.exact_scale == known.input("rear_ay_mean_16").exact_scale
     gates = [
         known.time_columns[f"rear_ay_mean_16_excess_{k}"].definition.gate for k in (1, 2, 3, 4)
     ]
@@ -439,15 +435,15 @@ def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
     own = tmp_path / "features.toml"
     own.write_text(f'[gates.mine]\n{text}\ndescription = "x"\n')
     with pytest.raises(ConfigError, match=words) as caught:
-        load_features_over(SHIPPED, own)
+        load_features_over(SHIPPED, own, SIGNALS)
     assert "gates.mine" in str(caught.value)
 
 
 def test_a_family_in_a_model_list_stands_for_its_members() -> None:
-    models = {model.name: model.signals for model in load_model_list("gated").model}
+    models = {model.name: model.signals for model in load_model_list(CATALOG, "gated").model}
     gates = [name for name in models["all"] if name not in models["no gate"]]
     families = ("excess", "road", "cornering")
-    assert gates == [name for family in families for name in features().members(family)]
+    assert gates == [name for family in families for name in CATALOG.members(family)]
     assert set().union(*(models[family] for family in families)) == set(models["all"])
 
 

@@ -8,12 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_slip.catalogue.features import PLAIN
-from fleet_slip.catalogue.signals import Signal, SignalCatalogue, catalogue
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import Signal, SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams import check
 from fleet_slip.resources import folder
+from tests.support.catalog import SIGNALS, configs_with
 from tests.support.commands import RunCommand
 
 SHIPPED = (folder("configs") / "signals.toml").read_text()
@@ -27,7 +28,7 @@ def edited(tmp_path: Path, old: str, new: str) -> Path:
 
 
 def test_the_paper_s_signals_are_inputs_and_side_slip_is_the_label() -> None:
-    signals = catalogue()
+    signals = SIGNALS
     assert signals.inputs == (
         "ax", "ay", "yaw_rate", "steering_wheel",
         "wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr", "steer_fl", "steer_fr",
@@ -37,8 +38,8 @@ def test_the_paper_s_signals_are_inputs_and_side_slip_is_the_label() -> None:
 
 
 def test_counts_are_int16_and_metadata_has_its_types() -> None:
-    schema = catalogue().log_schema
-    assert all(schema.field(name).type == pa.int16() for name in catalogue().signals)
+    schema = SIGNALS.log_schema
+    assert all(schema.field(name).type == pa.int16() for name in SIGNALS.signals)
     assert schema.field("mass_kg").type == pa.float64()
     assert schema.names[0] == "day"
 
@@ -62,16 +63,16 @@ def test_a_mistake_is_told_with_file_key_and_reason(
 ) -> None:
     file = edited(tmp_path, old, new)
     with pytest.raises(ConfigError) as caught:
-        load_config(file, SignalCatalogue)
+        load_config(file, SignalCatalog)
     assert str(file) in str(caught.value)
     assert fault in str(caught.value)
 
 
-def test_a_missing_catalogue_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
+def test_a_missing_catalog_and_an_unknown_signal_are_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such file"):
-        load_config(tmp_path / "none.toml", SignalCatalogue)
+        load_config(tmp_path / "none.toml", SignalCatalog)
     with pytest.raises(QuestionError, match=r"unknown signal 'beta'. Known signals: ax, ay"):
-        catalogue()["beta"]
+        SIGNALS["beta"]
 
 
 @given(
@@ -91,7 +92,7 @@ def test_valid_counts_are_those_whose_physical_value_is_in_range(
 
 
 def reordered(text: str) -> str:
-    """Return a catalogue with its signals, and its drive columns, in reverse order."""
+    """Return a catalog with its signals, and its drive columns, in reverse order."""
     comment, *tables = re.split(r"(?m)^(?=\[)", text)
     kinds = ("[signals.", "[drive.")
     tables = [one if one.endswith("\n") else one + "\n" for one in tables]
@@ -102,10 +103,10 @@ def reordered(text: str) -> str:
 
 @pytest.fixture
 def other(tmp_path: Path) -> dict[str, str]:
-    """The environment of a user whose catalogue is in reverse order."""
-    file = tmp_path / "signals.toml"
-    file.write_text(reordered((folder("configs") / "signals.toml").read_text()))
-    return {**os.environ, "FLEET_SLIP_SIGNALS": str(file)}
+    """The environment of a user whose signals are in reverse order."""
+    text = reordered((folder("configs") / "signals.toml").read_text())
+    configs = configs_with(tmp_path / "configs", signals=text)
+    return {**os.environ, "FLEET_SLIP_CONFIG": str(configs.folder)}
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_an_order_of_signals_is_no_damage(
     by_sql: set[str],
 ) -> None:
     """DuckDB plans the SQL of `windows` for seconds."""
-    monkeypatch.setattr(check, "has_statement", by_sql.__contains__)
+    monkeypatch.setattr(check, "has_statement", lambda _, name: name in by_sql)
     report = run_command("verify", "--grams", "--json", env=other).json["grams"]
     assert report["drives"] >= report["files"] > 0 < report["wide_drives"]
     for name in ("signals", "windows"):

@@ -1,12 +1,10 @@
-"""The signal catalogue `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
+"""The signal catalog `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cached_property
 from hashlib import blake2b
-from os import environ
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -17,10 +15,7 @@ from pydantic import Field, StringConstraints, model_validator
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
-from fleet_slip.resources import config_file
-
-CATALOGUE_VARIABLE = "FLEET_SLIP_SIGNALS"
-"""Names a signal catalogue to use instead of the shipped one: another fleet, other signals."""
+from fleet_slip.resources import Configs
 
 COUNT_MAX = 2**15 - 1
 """Largest count. The range is symmetric, so that mirroring a drive never overflows."""
@@ -126,21 +121,21 @@ NEEDED_DRIVE_COLUMNS = (
 """What the shipped SQL asks of drives."""
 
 
-class SignalCatalogue(Config):
+class SignalCatalog(Config):
     """All signals and drive columns, in the file's order."""
 
     signals: dict[Identifier, Signal]
     drive: dict[Identifier, DriveColumn]
 
     @model_validator(mode="after")
-    def _consistent(self) -> "SignalCatalogue":
+    def _consistent(self) -> "SignalCatalog":
         labels = [name for name, signal in self.signals.items() if signal.role == "label"]
         if len(labels) != 1:
             raise ValueError(f"exactly one signal must have the role 'label', not {labels}")
         if missing := [name for name in NEEDED_DRIVE_COLUMNS if name not in self.drive]:
             raise ValueError(
                 f"the drive columns {', '.join(missing)} are missing. Copy them from the shipped "
-                "catalogue, configs/signals.toml"
+                "catalog, configs/signals.toml"
             )
         names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
         names += ["day", "tick", "time_s"]
@@ -154,8 +149,8 @@ class SignalCatalogue(Config):
         try:
             return self.signals[name]
         except KeyError:
-            known = ", ".join(self.signals)
-            raise QuestionError(f"unknown signal {name!r}. Known signals: {known}.") from None
+            names = ", ".join(self.signals)
+            raise QuestionError(f"unknown signal {name!r}. Known signals: {names}.") from None
 
     @cached_property
     def label(self) -> str:
@@ -164,12 +159,12 @@ class SignalCatalogue(Config):
 
     @cached_property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the signals that a model may use, in catalogue order."""
+        """Names of the signals that a model may use, in catalog order."""
         return tuple(name for name, signal in self.signals.items() if signal.role == "input")
 
     @cached_property
     def extras(self) -> tuple[str, ...]:
-        """Names of the signals that some cars log besides, in catalogue order.
+        """Names of the signals that some cars log besides, in catalog order.
 
         A file of the logs has their columns only where a drive in it has them.
         """
@@ -182,7 +177,7 @@ class SignalCatalogue(Config):
 
     @cached_property
     def feature_inputs(self) -> tuple[str, ...]:
-        """Names of the signals that a feature may be computed from, in catalogue order."""
+        """Names of the signals that a feature may be computed from, in catalog order."""
         return tuple(name for name in self.signals if name in {*self.inputs, *self.extras})
 
     @cached_property
@@ -192,7 +187,7 @@ class SignalCatalogue(Config):
 
     @property
     def stored_columns(self) -> tuple[str, ...]:
-        """Names of the columns that may come to the table `logs` with a new catalogue."""
+        """Names of the columns that may come to the table `logs` with a new catalog."""
         return (*self.drive, *self.signals)
 
     def null_sql(self, name: str) -> str:
@@ -218,11 +213,9 @@ class SignalCatalogue(Config):
         )
 
 
-@cache
-def catalogue() -> SignalCatalogue:
-    """Return the catalogue of `$FLEET_SLIP_SIGNALS`, else the one that ships with the package."""
-    chosen = environ.get(CATALOGUE_VARIABLE)
-    return load_config(Path(chosen) if chosen else config_file("signals.toml"), SignalCatalogue)
+def load_signals(configs: Configs) -> SignalCatalog:
+    """Return the signal catalog `signals.toml` of a folder of configs. Raises `ConfigError`."""
+    return load_config(configs.file("signals.toml"), SignalCatalog)
 
 
 # From physical values to counts, as the cars' sensors and measured logs make them.

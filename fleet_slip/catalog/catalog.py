@@ -1,0 +1,431 @@
+"""The catalog of a data root: signals, features, feature sets, first-stage models."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from decimal import Decimal
+from fractions import Fraction
+from functools import cached_property, lru_cache
+from typing import Any, Protocol
+
+from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalog.course import BESIDE, YAW_RATE, course_units
+from fleet_slip.catalog.definitions import COUNT_BITS, Definition, parity, plain_column
+from fleet_slip.catalog.facts import CALIBRATION, DELAY
+from fleet_slip.catalog.features import (
+    PLAIN,
+    FeatureFile,
+    FeatureSetEntry,
+    load_features,
+)
+from fleet_slip.catalog.lines import FittedLine, Fitting
+from fleet_slip.catalog.signals import (
+    SAMPLE_TIME_S,
+    Signal,
+    SignalCatalog,
+    load_signals,
+)
+from fleet_slip.catalog.time_columns import (
+    Calibrated,
+    EstimateColumn,
+    Feature,
+    TimeColumn,
+)
+from fleet_slip.config import read_named_file
+from fleet_slip.errors import QuestionError
+from fleet_slip.resources import SHIPPED_CONFIGS, Configs
+
+
+@dataclass(frozen=True)
+class FeatureSet:
+    """The columns of one kind of Gram row, and how a drive's rows are divided.
+
+    Attributes
+    ----------
+    label
+        Name of the label signal, the last column.
+    signals, features, windows, calibrated
+        Names of the columns, families replaced by their members.
+    of
+        Set whose columns these are the changes of; None for a set of its own columns.
+    block_ticks
+        Length of a block of time, in ticks; None if rows are not divided by time.
+    change_s
+        Times over which columns change, in s; empty if columns stand for themselves.
+    as_logged
+        True if the delay of the course is not corrected.
+    """
+
+    label: str
+    description: str = ""
+    signals: tuple[str, ...] = ()
+    features: tuple[str, ...] = ()
+    windows: tuple[str, ...] = ()
+    calibrated: tuple[str, ...] = ()
+    of: str | None = None
+    block_ticks: int | None = None
+    change_s: tuple[Decimal, ...] = ()
+    as_logged: bool = False
+
+    @property
+    def change_ticks(self) -> tuple[int, ...]:
+        """Numbers of ticks over which columns change; empty if columns stand for themselves."""
+        return tuple(int(Fraction(time_s) / SAMPLE_TIME_S) for time_s in self.change_s)
+
+    @property
+    def change_text(self) -> str:
+        """The times over which columns change, as messages say them."""
+        *others, last = (f"{time_s:f}" for time_s in self.change_s)
+        return f"{', '.join(others)} and {last} s" if others else f"{last} s"
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the delays of receivers are corrected in the Gram rows."""
+        return bool(self.change_ticks) and not self.as_logged
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """What a model of this set may use."""
+        return (*self.signals, *self.features, *self.windows, *self.calibrated)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of a Gram row, in its order; calibrated ones follow from it."""
+        beside = BESIDE if self.change_ticks else ()
+        return (*self.signals, *self.features, *self.windows, *beside, self.label)
+
+
+class FirstStageModels(Protocol):
+    """Finds first-stage models by digest."""
+
+    def find(self, digest: str) -> FittedLine | None:
+        """Return a model; None if there is none. Raises `StorageError`."""
+
+
+@dataclass(frozen=True)
+class Catalog:
+    """Everything that a data root's columns can be made of.
+
+    A `Warehouse` owns it; functions receive it. It reads no environment and does not change.
+
+    Attributes
+    ----------
+    signals
+        The signals and drive columns of `signals.toml`.
+    file
+        The features and feature sets of `features.toml`.
+    configs
+        The folder of configs that both were read from.
+    first_stage_models
+        Source of the first-stage models of a data root; None outside one.
+    """
+
+    signals: SignalCatalog
+    file: FeatureFile
+    configs: Configs = SHIPPED_CONFIGS
+    first_stage_models: FirstStageModels | None = None
+    _identities: dict[str, str] = field(default_factory=dict, repr=False, compare=False)
+    _estimates: dict[str, str | None] = field(default_factory=dict, repr=False, compare=False)
+    """Identity of each set, and the estimate that it needs: computed once, shared by copies, as
+    they follow from the content alone."""
+
+    @property
+    def features(self) -> Mapping[str, Feature]:
+        """The features, by name."""
+        return self.file.features
+
+    @property
+    def sets(self) -> Mapping[str, FeatureSetEntry]:
+        """The feature sets as the file states them, by name."""
+        return self.file.sets
+
+    @property
+    def calibrated(self) -> Mapping[str, Calibrated]:
+        """The calibrated columns, by name."""
+        return self.file.calibrated
+
+    @property
+    def estimates(self) -> Mapping[str, EstimateColumn]:
+        """The estimates of first-stage models, by name."""
+        return self.file.estimates
+
+    @property
+    def time_columns(self) -> Mapping[str, TimeColumn]:
+        """Every column over time, by name."""
+        return self.file.time_columns
+
+    @cached_property
+    def input_scales(self) -> Mapping[str, Fraction]:
+        """Physical value of one count of every input signal, feature, column and the label."""
+        names = (*self.signals.feature_inputs, self.signals.label)
+        scales = {name: self.signals[name].exact_scale for name in names}
+        columns: dict[str, Feature | TimeColumn] = {**self.features, **self.time_columns}
+        return scales | {name: column.exact_scale for name, column in columns.items()}
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of everything that a model may use."""
+        return (*self.signals.feature_inputs, *self.features, *self.time_columns)
+
+    def input(self, name: str) -> Signal | Feature | TimeColumn:
+        """Return an input: a logged signal, a feature, or a column over time."""
+        return self.time_columns.get(name) or self.features.get(name) or self.signals[name]
+
+    def definition(self, name: str) -> Definition | None:
+        """Return the definition of an input that is more than a signal or a feature of 16 bits."""
+        if name in self.time_columns:
+            return self.time_columns[name].definition
+        feature = self.features.get(name)
+        if feature is None or feature.bits == COUNT_BITS:
+            return None
+        return Definition(of=name, sql=feature.sql, of_bits=feature.bits, bits=feature.bits)
+
+    def rows(self, names: Iterable[str]) -> dict[str, Definition]:
+        """Return the definitions of the features among names, as columns of one row."""
+        features = {name: self.features[name] for name in names if name in self.features}
+        return {
+            name: plain_column(name, feature.sql, feature.bits)
+            for name, feature in features.items()
+        }
+
+    def definitions(self, name: str, fold: str | None = None) -> dict[str, Definition]:
+        """Return the definitions of a set's columns over time, by name.
+
+        A set with a first-stage model uses, for drives of a `fold`, the fit without that fold.
+        """
+        model = self.first_stage_model(name)
+        windows = self.feature_set(name).windows
+        definitions = {window: self.time_columns[window].definition for window in windows}
+        if model is None:
+            return definitions
+        fitting = Fitting(model, fold)
+        return {window: fitting(definition) for window, definition in definitions.items()}
+
+    def first_stage_model(self, name: str) -> FittedLine | None:
+        """Return the first-stage model of a set `SET_DIGEST`; None for other sets.
+
+        Raises `QuestionError` if it does not exist or its estimate has another scale now.
+        """
+        base, _, digest = name.rpartition("_")
+        if name in self.sets or base not in self.sets:
+            return None
+        model = self.first_stage_models.find(digest) if self.first_stage_models else None
+        if model is None:
+            raise QuestionError(
+                f"the line {digest} is not in this data root. Publish the model again."
+            )
+        estimate = self.estimates.get(model.estimate)
+        if estimate is None or estimate.scale != model.scale:
+            raise QuestionError(
+                f"{name}: the line's estimate was in counts of {model.scale} rad. "
+                "configs/features.toml has changed: publish the model again, from its list."
+            )
+        return model
+
+    @cached_property
+    def stacked_sets(self) -> Mapping[str, str]:
+        """Sets whose columns need a first-stage model, and the estimate that each needs."""
+        estimates = {name: self._estimate_of(name) for name in self.sets}
+        return {name: estimate for name, estimate in estimates.items() if estimate}
+
+    def _estimate_of(self, name: str) -> str | None:
+        """Return the estimate that a set's columns are made of; None without one."""
+        if name not in self._estimates:
+            seen = set[int]()
+            windows = (self.time_columns[w].definition for w in self.feature_set(name).windows)
+            rows = (row.of for definition in windows for row in definition.rows(seen))
+            self._estimates[name] = next((row for row in rows if row in self.estimates), None)
+        return self._estimates[name]
+
+    def feature_set(self, name: str) -> FeatureSet:
+        """Return a feature set, its families replaced by their members.
+
+        Raises `QuestionError` for an unknown one.
+        """
+        if name == PLAIN:
+            return FeatureSet(self.signals.label, "The logged signals", self.signals.inputs)
+        base = name.rpartition("_")[0] if self.first_stage_model(name) else name
+        if base not in self.sets:
+            names = ", ".join((PLAIN, *self.sets))
+            raise QuestionError(f"no feature set is called {name!r}. Feature sets: {names}.")
+        entry = self.sets[base]
+        return self.resolve(entry)
+
+    def resolve(self, entry: FeatureSetEntry) -> FeatureSet:
+        """Return a feature set as the file states it with its families replaced by members."""
+        members = [member for window in entry.windows for member in self.members(window)]
+        feature_set = FeatureSet(
+            self.signals.label,
+            entry.description,
+            entry.signals,
+            entry.features,
+            tuple(dict.fromkeys(members)),
+            entry.calibrated,
+            entry.of,
+            entry.block_ticks,
+            entry.change_s,
+            entry.as_logged,
+        )
+        if entry.of is None:
+            return feature_set
+        return self._add_changing_columns(feature_set, self.feature_set(entry.of))
+
+    def _add_changing_columns(self, feature_set: FeatureSet, source: FeatureSet) -> FeatureSet:
+        """Return a set of changes with the informative columns of its source.
+
+        Left out are: sums of the yaw rate, whose gyroscope noise also enters the course label;
+        means since the drive began, which hardly change; and numbers of the car, which are
+        constant.
+        """
+
+        def columns(kind: str) -> tuple[str, ...]:
+            names = dict.fromkeys((*getattr(source, kind), *getattr(feature_set, kind)))
+            return tuple(name for name in names if self._changes(name))
+
+        return replace(
+            feature_set,
+            signals=columns("signals"),
+            features=columns("features"),
+            windows=columns("windows"),
+            calibrated=columns("calibrated"),
+        )
+
+    def _changes(self, name: str) -> bool:
+        if name not in self.time_columns:
+            return True
+        column = self.time_columns[name].definition
+        alone = column.number is not None and column.number.alone
+        summed = column.over == "sum" and YAW_RATE in column.signals
+        return not (alone or summed or column.over == "running_mean")
+
+    def auxiliary_sets(self, name: str) -> tuple[str, ...]:
+        """Return the sets that a model of changes needs for its intercept and course delay."""
+        feature_set = self.feature_set(name)
+        source = (feature_set.of,) if feature_set.of else ()
+        return (*source, CALIBRATION, DELAY) if feature_set.change_ticks else ()
+
+    def is_odd(self, name: str) -> bool:
+        """Return True if a column changes sign when left and right are exchanged."""
+        row = self.rows([name]).get(name)
+        return parity(self.definition(name) or row or plain_column(name)) == -1
+
+    def search_inputs(self, name: str) -> tuple[str, ...]:
+        """Return the inputs that a search may choose from; of changes, the odd and short ones.
+
+        Changes do not determine an intercept, which an even column would absorb. A window longer
+        than half of the change time follows the errors of the course more than the angle.
+        """
+        feature_set = self.feature_set(name)
+        if not feature_set.change_ticks:
+            return feature_set.inputs
+        longest = max(feature_set.change_ticks) // 2
+        if feature_set.of:
+            source = self.feature_set(feature_set.of)
+            feature_set = replace(feature_set, features=source.features)
+        return tuple(
+            column
+            for column in feature_set.inputs
+            if column not in self.time_columns
+            or self.time_columns[column].definition.ticks <= longest
+            if self.is_odd(column)
+        )
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """Return the columns of a family of windows or gates; any other name stays."""
+        family = self.file.windows.get(name) or self.file.gates.get(name)
+        return family.names(name) if family else (name,)
+
+    def families(self, signals: Iterable[str]) -> dict[str, int]:
+        """Return names and member counts, complete families of windows and gates by their own.
+
+        A signal that is no family has the count 0.
+        """
+        names = {name: (name, 0) for name in signals}
+        for family in (*self.file.windows, *self.file.gates):
+            members = self.members(family)
+            if names.keys() >= set(members):
+                names |= dict.fromkeys(members, (family, len(members)))
+        return dict(names.values())
+
+    def identity(self, name: str) -> str:
+        """Return what the Gram rows of a set carry: its name and a checksum of its definition.
+
+        The set of the logged signals is called `signals`, without a checksum.
+        """
+        if name == PLAIN:
+            return PLAIN
+        self.first_stage_model(name)  # raises without the model, which another root may have
+        if name not in self._identities:
+            self._identities[name] = self._identity(name)
+        return self._identities[name]
+
+    def _identity(self, name: str) -> str:
+        feature_set, signals = self.feature_set(name), self.signals
+        content: dict[str, Any] = {
+            "columns": list(feature_set.columns),
+            "signals": {signal: str(signals[signal].scale) for signal in signals.inputs},
+            "features": {
+                feature: self._feature_content(feature) for feature in feature_set.features
+            },
+            "regimes": {},  # these three keep the identities of sets of earlier releases
+            "row_folds": None,
+            "lagged": False,
+        }
+        if model := self.first_stage_model(name):
+            content["line"] = {"sha256": model.sha256}
+        if extras := self._extras(feature_set):
+            content["extras"] = {extra: str(signals[extra].scale) for extra in extras}
+        if feature_set.block_ticks:
+            content["block_ticks"] = feature_set.block_ticks
+        if feature_set.change_ticks:
+            ticks = list(feature_set.change_ticks)
+            content["change"] = {"ticks": ticks, **vars(course_units(signals))}
+        if feature_set.windows:
+            content["windows"] = {
+                window: self.time_columns[window].model_dump(mode="json", exclude={"description"})
+                for window in feature_set.windows
+            }
+        return f"{name}-{sha256_of(canonical_json(content))[:12]}"
+
+    def _extras(self, feature_set: FeatureSet) -> tuple[str, ...]:
+        """Return the extra signals that a set is made of."""
+        names = {*feature_set.signals}
+        for feature in feature_set.features:
+            names |= set(self.features[feature].inputs)
+        for window in feature_set.windows:
+            names |= set(self.time_columns[window].definition.signals)
+        return tuple(name for name in self.signals.extras if name in names)
+
+    def _feature_content(self, name: str) -> Mapping[str, str]:
+        feature = self.features[name]
+        content = {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}
+        return content if feature.bits == COUNT_BITS else content | {"bits": str(feature.bits)}
+
+    def name_of(self, identity: str) -> str:
+        """Return the name of the set that Gram rows are of, if its definition is unchanged.
+
+        Raises `QuestionError` otherwise.
+        """
+        name = identity.rpartition("-")[0] or identity
+        exists = name in {PLAIN, *self.sets} or self.first_stage_model(name)
+        if exists and self.identity(name) == identity:
+            return name
+        raise QuestionError(
+            f"the feature set {identity} is not defined as it was then: configs/features.toml has "
+            "changed. Publish the model again."
+        )
+
+
+def load_catalog(configs: Configs = SHIPPED_CONFIGS) -> Catalog:
+    """Return the catalog of a folder of configs, without first-stage models.
+
+    Raises `ConfigError` for an invalid file.
+    """
+    files = [configs.file("signals.toml"), configs.file("features.toml")]
+    return _load(configs, tuple(read_named_file(file) for file in files))
+
+
+@lru_cache(maxsize=16)
+def _load(configs: Configs, contents: tuple[bytes, ...]) -> Catalog:  # noqa: ARG001
+    """Parse the catalog of a folder, once for each content of its files."""
+    signals = load_signals(configs)
+    return Catalog(signals, load_features(configs, signals), configs)

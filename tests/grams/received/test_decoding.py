@@ -1,0 +1,148 @@
+"""A table of Gram rows is refused before it decodes to more than a file of them may be."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import fleet_slip
+from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.grams import on_board
+from fleet_slip.grams.parquet_sizes import DELTA_BYTE_ARRAY, read_page_headers, read_row_groups
+from tests.support.counted_rows import START_S, gram_of, list_array, row_of, rows_of_fleet
+from tests.support.counted_rows import write_counted as write
+
+ROWS = 2_000
+MEBIBYTE = 2**20
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+    return fleet_slip.open(tmp_path / "data")
+
+
+def repeated(text: str, rows: int = ROWS) -> pa.DictionaryArray:
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([text]))
+
+
+def with_column(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
+    return table.set_column(table.column_names.index(name), name, values)
+
+
+def test_a_text_that_is_repeated_is_refused_by_its_decoded_size(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(on_board, "MAX_TEXT_BYTES", MEBIBYTE)
+    table = rows_of_fleet(ROWS, START_S, seed=1)
+    for name in ("signals", "source", "feature_set", "part"):
+        path = write(tmp_path / name, with_column(table, name, repeated("x" * 20_000)))
+        with pytest.raises(InputError, match="decodes to more than"):
+            fleet.ingest_counted(path)
+
+
+def test_lists_of_equal_numbers_are_refused_before_they_are_decoded(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(on_board, "MAX_DECODED_BYTES", MEBIBYTE)
+    monkeypatch.setattr(on_board, "_decode", lambda *_: pytest.fail("it was decoded"))
+    table = rows_of_fleet(10, START_S, seed=1)
+    zeros = list_array(np.zeros((10, 20_000), np.int64))
+    path = write(tmp_path / "rows", with_column(table, "sums", zeros))
+    assert path.stat().st_size < 20_000
+    with pytest.raises(InputError, match="decodes to more than"):
+        fleet.ingest_counted(path)
+
+
+def test_a_column_that_is_not_documented_is_not_read(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    table = rows_of_fleet(20, START_S, seed=1)
+    path = write(tmp_path / "rows", table.append_column("other", repeated("marked text", 20)))
+    content = bytearray(path.read_bytes())
+    content[content.index(b"marked text")] ^= 1  # its checksum no longer fits
+    path.write_bytes(content)
+    assert fleet.ingest_counted(path).gram_rows == 20
+
+
+def test_a_column_of_another_type_is_named(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    table = rows_of_fleet(2, START_S, seed=1)
+    nested = with_column(table, "n", list_array(np.zeros((2, 1), np.int64)))
+    with pytest.raises(InputError, match=r"column n has the type list<.*write it as int64"):
+        fleet.ingest_counted(write(tmp_path / "nested", nested))
+    texts = with_column(table, "sums", pa.array([["1"], ["2"]]))
+    with pytest.raises(InputError, match=r"column sums has the type list<"):
+        fleet.ingest_counted(write(tmp_path / "texts", texts))
+    twice = table.append_column("n", table["n"])
+    with pytest.raises(InputError, match="two columns n"):
+        fleet.ingest_counted(write(tmp_path / "twice", twice))
+
+
+def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    row = row_of(gram_of(1))
+    wide = {"vehicle_id": pa.large_string(), "sums": pa.large_list(pa.int64()), "part": pa.null()}
+    columns = [
+        pa.array([row[field.name]], wide.get(field.name, field.type)) for field in on_board.COLUMNS
+    ]
+    table = pa.table(columns, names=on_board.COLUMNS.names)
+    assert fleet.ingest_counted(write(tmp_path / "rows", table)).rows == 500
+
+
+def test_texts_that_repeat_prefixes_are_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    path = tmp_path / "rows"
+    names = [name for name in on_board.COLUMNS.names if name not in {"sums", "products"}]
+    pq.write_table(
+        rows_of_fleet(20, START_S, seed=1),
+        path,
+        write_page_checksum=True,
+        use_dictionary=[name for name in names if name != "drive_id"],
+        column_encoding={"drive_id": "DELTA_BYTE_ARRAY"},
+    )
+    with pytest.raises(InputError, match="drive_id has the encoding DELTA_BYTE_ARRAY"):
+        fleet.ingest_counted(path)
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.0"])
+def test_headers_state_what_pages_hold(version: str) -> None:
+    rows, stream = 100_000, io.BytesIO()
+    table = pa.table(
+        {"a": pa.array(range(rows)), "b": pa.array([["x", "y"]] * rows), "c": ["abc"] * rows}
+    )
+    pq.write_table(
+        table,
+        stream,
+        write_page_checksum=True,
+        data_page_version=version,
+        use_dictionary=["b.list.element"],
+        column_encoding={"a": "PLAIN", "c": "DELTA_BYTE_ARRAY"},
+        data_page_size=1000,
+        write_batch_size=100,
+    )
+    (group,) = read_row_groups(stream.getvalue())
+    assert group.rows == rows
+    for number, values in enumerate((rows, 2 * rows, rows)):
+        chunk = group.chunks[number]
+        assert (chunk.column, chunk.values) == ("abc"[number], values)
+        pages = list(read_page_headers(stream.getvalue(), chunk))
+        assert sum(page.values for page in pages if not page.is_dictionary) == values
+        assert all(page.has_checksum for page in pages)
+        assert len(pages) > 1
+        assert [page.is_dictionary for page in pages].count(True) == (number == 1)
+        assert any(page.encoding == DELTA_BYTE_ARRAY for page in pages) == (number == 2)
+
+
+def test_damaged_files_are_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+    random = np.random.default_rng(1)
+    sound = write(tmp_path / "rows", rows_of_fleet(2, START_S, seed=1)).read_bytes()
+    path = tmp_path / "damaged"
+    for _ in range(300):
+        content = bytearray(sound)
+        for place in random.integers(0, len(sound), random.integers(1, 4)):
+            content[place] ^= 1 << int(random.integers(8))
+        path.write_bytes(content)
+        try:
+            on_board._read(path, bytes(content))
+        except FleetSlipError as error:
+            assert isinstance(error, InputError)
