@@ -13,7 +13,7 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse, open_warehouse
 from tests.support.catalog import CATALOG, SIGNALS
@@ -92,7 +92,9 @@ def log_rows(
 def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:
     """Commit drives as one file of the logs."""
     action = warehouse.logs.write_file(name, pa.concat_tables(drives), day)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit(f"test/{name}", 1)]))
+    warehouse.logs.snapshot().commit(
+        Change(add=[action], transactions=[AppTransaction(f"test/{name}", 1)])
+    )
 
 
 def state(root: Path, model: str = "smoke") -> dict[str, Any]:
