@@ -7,6 +7,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+VERSION_OF = $(1) -c 'import platform; print(platform.python_version())'
+PYTHON_VERSION := $(shell $(call VERSION_OF,$(PYTHON)))
 CAMPAIGN ?= waterford
 MODEL ?= $(CAMPAIGN)
 ROOT ?= data
@@ -62,9 +64,13 @@ bench: $(VENV)/.dev-installed
 
 setup: $(VENV)/.installed
 
+# The environment is made again if PYTHON is another version than its own.
+$(VENV)/.python-$(PYTHON_VERSION):
+	test "$$($(call VERSION_OF,$(BIN)/python) 2>&1)" = "$(PYTHON_VERSION)" || $(PYTHON) -m venv --clear $(VENV)
+	touch $@
+
 # What running needs, what the checks need, and what the pages need.
-$(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
+$(VENV)/.installed: pyproject.toml constraints.txt $(VENV)/.python-$(PYTHON_VERSION)
 	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt pip
 	-$(BIN)/python -m pip install --quiet --constraint constraints.txt uv
 	$(call INSTALL,--editable .)

@@ -84,9 +84,9 @@ def code_folder(digest: str) -> Path | None:
     None, and a remark, if there is no such folder or others can write it: what is kept is pickled
     machine code. Files that are not as the process left them that wrote them are deleted.
     """
-    given = os.environ.get("NUMBA_CACHE_DIR")
+    chosen = os.environ.get("NUMBA_CACHE_DIR")  # numba's own; needed when a module is imported
     try:
-        base = Path(given or cache_folder("compiled")).resolve()
+        base = Path(chosen or cache_folder("compiled")).resolve()
         folder = base / f"{PREFIX}{digest}"
         new = not folder.is_dir()
         for one in reversed([folder, *folder.parents]):

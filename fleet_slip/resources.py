@@ -137,7 +137,11 @@ def _is_file(path: Traversable) -> bool:
 
 
 def cache_folder(name: str) -> Path:
-    """Return a folder of this user for what can be lost."""
+    """Return a folder of this user for what can be lost.
+
+    The system's variables are read here: modules need the folder for compiled code when they are
+    imported, before anybody opens a data root.
+    """
     service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
     return Path(service or Path(home, "fleet-slip"), name)

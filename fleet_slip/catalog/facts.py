@@ -36,14 +36,14 @@ NumberName = Literal[
 ]
 
 
-Unit = SIUnit | Literal["1"]
+ColumnUnit = SIUnit | Literal["1"]
 """A unit, or none."""
 
 
 class CarNumber(Config):
     """One number of a car: its unit, its grain and what it means."""
 
-    unit: Unit
+    unit: ColumnUnit
     grain: Decimal
     description: str
 
@@ -59,7 +59,7 @@ def round_number(value: Fraction, grain: Fraction) -> int | None:
     return count if abs(count) <= COUNT_MAX else None
 
 
-_NUMBERS: tuple[tuple[NumberName, Unit, str, str], ...] = (
+_NUMBERS: tuple[tuple[NumberName, ColumnUnit, str, str], ...] = (
     ("yaw_rate_offset", "rad/s", "0.00000625",
      "What the gyroscope says when the car does not turn, by ay over speed"),
     ("ay_offset", "m/s^2", "0.0000625",

@@ -34,7 +34,7 @@ from fleet_slip.catalog.definitions import (
     Slope,
     integer_arithmetic,
 )
-from fleet_slip.catalog.facts import CAR_NUMBERS, NumberName, Unit
+from fleet_slip.catalog.facts import CAR_NUMBERS, ColumnUnit, NumberName
 from fleet_slip.catalog.signals import Identifier, Scaled, Signal, SignalCatalog, SIUnit
 from fleet_slip.config import Config
 
@@ -105,7 +105,7 @@ class TimeColumn(Scaled):
     """One column over time: how it is defined, and what a count of it is worth."""
 
     definition: Definition
-    unit: Unit
+    unit: ColumnUnit
     column: Identifier
     description: str
 

@@ -13,7 +13,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received
-from fleet_slip.grams.job import unit_name
+from fleet_slip.grams.job import transaction_name
 from fleet_slip.grams.receiver_delay import recorded_cars
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
@@ -75,7 +75,7 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         name
         for name in warehouse.feature_sets()
         if catalog.feature_set(name).windows
-        and grams.landed(unit_name(catalog.identity(name))) is not None
+        and grams.landed(transaction_name(catalog.identity(name))) is not None
     )
     for name in wide:
         missing = find_backlog(logs, grams, catalog.identity(name)).missing

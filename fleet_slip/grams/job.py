@@ -35,7 +35,7 @@ from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.storage.table import Change, Snapshot, TableFile, Unit, retrying
+from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
 from fleet_slip.warehouse.condition import parse_cohort
 from fleet_slip.warehouse.tables import Warehouse, gram_snapshots
 
@@ -119,7 +119,7 @@ def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list
     """Bring up to date what was computed here before, but for `unreadable` log files."""
     grams = warehouse.grams.snapshot()
     identities = {name: warehouse.catalog.identity(name) for name in warehouse.feature_sets()}
-    used = [n for n, i in identities.items() if grams.landed(unit_name(i)) is not None]
+    used = [n for n, i in identities.items() if grams.landed(transaction_name(i)) is not None]
     over_time = [name for name in used if warehouse.catalog.feature_set(name).windows]
     drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
     reports = []
@@ -147,8 +147,8 @@ def _unique(
     return pa.concat_arrays(found).unique()
 
 
-def unit_name(identity: str) -> str:
-    """Return the name of the unit of work that lands Gram rows of a feature set."""
+def transaction_name(identity: str) -> str:
+    """Return the name of the transaction that lands Gram rows of a feature set."""
     return f"gram/{identity}"
 
 
@@ -283,9 +283,9 @@ def _land(
     add: Sequence[AddAction],
     remove: Sequence[TableFile] = (),
 ) -> None:
-    units = [Unit(unit_name(identity), logs.version or 0)]
+    transactions = [AppTransaction(transaction_name(identity), logs.version or 0)]
     note = {"job": "gram", "feature_set": identity, "logs_version": logs.version}
-    grams.commit_or_discard(Change(add, remove, units, note))
+    grams.commit_or_discard(Change(add, remove, transactions, note))
 
 
 def _as_file(action: AddAction) -> TableFile:

@@ -63,7 +63,7 @@ from fleet_slip.ingest.formats.tables import require_small_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
-from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts
+from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
@@ -278,7 +278,7 @@ BATCH_ROWS_READ = 2**12
 LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
 """Rows of a day: the drives of a car that begin on one day have no more together."""
 ONE_AT_A_TIME = "receive"
-"""Unit of every such commit: two at once, which could bring the same drive, are a conflict."""
+"""Transaction of every such commit, so that two at once, perhaps of one drive, are a conflict."""
 
 
 @dataclass(frozen=True)
@@ -305,9 +305,9 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
     content = read_named_file(file, MAX_FILE_BYTES, InputError)
     table = _read(file, content)
     digest = hashlib.sha256(content).hexdigest()
-    unit = Unit(f"receive/{digest}", 1)
+    transaction = AppTransaction(f"receive/{digest}", 1)
     drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py()
-    new = warehouse.grams.snapshot().landed(unit.name) is None
+    new = warehouse.grams.snapshot().landed(transaction.name) is None
     report = CountedReport(str(file), new, len(table), drives, rows or 0)
     if not new:
         return report
@@ -319,16 +319,18 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
-        if grams.landed(unit.name) is not None:  # meanwhile, by another process
+        if grams.landed(transaction.name) is not None:  # meanwhile, by another process
             return
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         _require_allowed(file, warehouse, numbered)
         _require_new(file, grams, numbered)
         replaced = files_to_rewrite(grams, frozenset())
         merged = list(rows_to_keep(grams, replaced, frozenset()))
-        single = Unit(ONE_AT_A_TIME, (grams.version or 0) + 1)
+        single = AppTransaction(ONE_AT_A_TIME, (grams.version or 0) + 1)
         grams.commit_or_discard(
-            Change(write_rows(warehouse, [*merged, new_rows]), replaced, [unit, single], _NOTE)
+            Change(
+                write_rows(warehouse, [*merged, new_rows]), replaced, [transaction, single], _NOTE
+            )
         )
 
     retry_conflicts(attempt)

@@ -39,18 +39,18 @@ from fleet_slip.ingest.recordings import (
     TableName,
     are_gone,
     digest_of,
+    file_transaction,
     fingerprints_of,
     keep_drives,
     keep_refused,
     let_return,
     size_of,
     tables_of,
-    unit_of,
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.rendering import Answer, Part, TextTable
-from fleet_slip.storage.table import Change, Snapshot, Table, Unit, retry_conflicts
+from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, retry_conflicts
 from fleet_slip.warehouse.forgotten import Audit
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -160,9 +160,9 @@ class WrittenFile:
 
 
 class NewFiles(NamedTuple):
-    """Data files of one table that are not committed yet, and the units of work that they are."""
+    """Data files of one table that are not committed yet, and their transactions."""
 
-    units: tuple[Unit, ...]
+    transactions: tuple[AppTransaction, ...]
     files: tuple[AddAction, ...]
 
 
@@ -216,9 +216,9 @@ def ingest_files(
         committed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
         failures += committed.failures
         for one in committed.files:
-            unit = unit_of(one.digest).name
-            yield _finished(warehouse, one, is_new=unit in new)
-            new -= {unit}  # the same content in another file is not new
+            transaction = file_transaction(one.digest).name
+            yield _finished(warehouse, one, is_new=transaction in new)
+            new -= {transaction}  # the same content in another file is not new
             if known is not None:
                 known.remember(one.log, one.digest)
     if failures:
@@ -512,10 +512,10 @@ class DataFiles:
         self._of_this_log = []
 
     def finish(self) -> NewFiles:
-        """Return all data files, written, and the units that they are."""
+        """Return all data files, written, and their transactions."""
         self._write_waiting()
         files = tuple(file for writing in self._written for file in writing.result())
-        return NewFiles(tuple(map(unit_of, sorted(self.digests))), files)
+        return NewFiles(tuple(map(file_transaction, sorted(self.digests))), files)
 
     def _write_waiting(self) -> None:
         """Write rows in the order of their logs' digests, and so of the names of drives."""
@@ -589,7 +589,7 @@ def commit_batch(
     note: dict[str, str],
     take_out: TakeOut | None = None,
 ) -> tuple[WrittenBatch, frozenset[str]]:
-    """Commit what was written of a batch; return it, and the units that this put into the logs.
+    """Commit what was written of a batch; return it, and the transactions added to the logs.
 
     Where something was forgotten, or committed by another process, since it was written, `write`
     writes it again. What gives way to the new files is taken out in the same commits.
@@ -600,11 +600,11 @@ def commit_batch(
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         if Audit(warehouse.root).begun() != written.forgotten:
             return True
-        landed = snapshot.landed_among(len(written.new[name].units))
-        if any(landed(unit.name) for unit in written.new[name].units):
+        landed = snapshot.landed_among(len(written.new[name].transactions))
+        if any(landed(transaction.name) for transaction in written.new[name].transactions):
             return True
         new = [one for one in written.files if one.fingerprints] if name == "logs" else []
-        known = Fingerprints(snapshot.units if new else {})
+        known = Fingerprints(snapshot.transactions if new else {})
         return any(known.find(one.fingerprints) - one.same for one in new)
 
     def commit(name: TableName) -> frozenset[str]:
@@ -619,17 +619,25 @@ def commit_batch(
         gone = Change()
         if written.replaced and take_out and written.new["logs"].files:
             gone = take_out(name, snapshot, written.replaced)
-        units = {unit.name: unit for unit in (*gone.units, *new.units)}
+        transactions = {
+            transaction.name: transaction for transaction in (*gone.transactions, *new.transactions)
+        }
         for one in written.files if name == "logs" else ():
-            units |= {mark: Unit(mark, number) for mark, number in one.fingerprints.items()}
+            transactions |= {
+                mark: AppTransaction(mark, number) for mark, number in one.fingerprints.items()
+            }
         if new.files or gone.remove:
             add = [*new.files, *gone.add]
             try:
-                snapshot.commit(Change(add, gone.remove, tuple(units.values()), note))
+                snapshot.commit(Change(add, gone.remove, tuple(transactions.values()), note))
             except ConflictError:
                 tables[name].discard(gone.add)
                 raise
-        return frozenset(unit.name for unit in new.units) if new.files else frozenset()
+        return (
+            frozenset(transaction.name for transaction in new.transactions)
+            if new.files
+            else frozenset()
+        )
 
     retry_conflicts(lambda: commit("quarantine"))
     new = retry_conflicts(lambda: commit("logs"))

@@ -20,7 +20,14 @@ from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import cache_folder, keep_json
-from fleet_slip.storage.table import WITHDRAWN, Change, Snapshot, Table, Unit, retry_conflicts
+from fleet_slip.storage.table import (
+    WITHDRAWN,
+    AppTransaction,
+    Change,
+    Snapshot,
+    Table,
+    retry_conflicts,
+)
 from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
@@ -73,7 +80,7 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
 
 
 # Fingerprints recognise a recording: a digest of a file's bytes, or of a drive's counts. Each is a
-# unit of work in the commit of the rows, so that two processes that load one drive are in conflict.
+# transaction in the commit of the rows, so that two processes that load one drive are in conflict.
 # Its number says where it is from, and no name of a car follows from it:
 #
 #     40 bits of the file's digest | 3 bits: 0 of a file | 20 bits of the drive's name
@@ -137,9 +144,9 @@ def is_from(drive_id: str, origins: Collection[Origin]) -> bool:
 class Fingerprints:
     """The fingerprints of what is in the logs."""
 
-    def __init__(self, units: Named[str, int]) -> None:
-        """Take the units of a snapshot of the logs."""
-        there = {name: number for name, number in units.items() if number != WITHDRAWN}
+    def __init__(self, transactions: Named[str, int]) -> None:
+        """Take the transactions of a snapshot of the logs."""
+        there = {name: number for name, number in transactions.items() if number != WITHDRAWN}
         self._numbers = {name: n for name, n in there.items() if name.startswith(PREFIX)}
         self._files = [name for name in there if name.startswith(FILES)]
 
@@ -148,7 +155,9 @@ class Fingerprints:
         numbers = map(self._numbers.get, fingerprints)
         return frozenset(Origin.of_number(number) for number in numbers if number is not None)
 
-    def withdraw(self, origins: Collection[Origin], files: Collection[Origin]) -> list[Unit]:
+    def withdraw(
+        self, origins: Collection[Origin], files: Collection[Origin]
+    ) -> list[AppTransaction]:
         """Return what withdraws fingerprints of origins, and files themselves that are all gone."""
         of_drives = [
             name
@@ -156,7 +165,7 @@ class Fingerprints:
             if (origin := Origin.of_number(number)) in origins or origin.file in files
         ]
         of_files = [n for n in self._files if Origin.of(n.removeprefix(FILES)) in files]
-        return [Unit(name, WITHDRAWN) for name in (*of_drives, *of_files)]
+        return [AppTransaction(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
 def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
@@ -165,9 +174,9 @@ def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
     return {f"{PREFIX}{drive.counts_digest}": origin.number for drive, origin in of if origin}
 
 
-def unit_of(digest: str) -> Unit:
-    """Return the unit of work that a file's content is."""
-    return Unit(f"{FILES}{digest}", 1)
+def file_transaction(digest: str) -> AppTransaction:
+    """Return the transaction that a file's content is."""
+    return AppTransaction(f"{FILES}{digest}", 1)
 
 
 def digest_of(digests: Sequence[str]) -> str:
@@ -277,7 +286,7 @@ class SameRecordings:
                 "of them out."
             )
         if self._logs_have is None:
-            self._logs_have = Fingerprints(self._logs.units)
+            self._logs_have = Fingerprints(self._logs.transactions)
         origins = self._logs_have.find(fingerprints)
         changed = earlier is not None and earlier != digest
         if earlier is not None and changed:
@@ -319,8 +328,8 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
         if _drives_of(warehouse, {Origin.of(digest)}):
             return
         if snapshot.landed(f"{FILES}{digest}") not in {None, WITHDRAWN}:
-            units = (Unit(f"{FILES}{digest}", WITHDRAWN),)
-            snapshot.commit(Change(units=units, note={"job": "undo"}))
+            transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
+            snapshot.commit(Change(transactions=transactions, note={"job": "undo"}))
 
     for table in tables_of(warehouse).values():
         retry_conflicts(partial(attempt, table))

@@ -31,12 +31,12 @@ from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
+    AppTransaction,
     Change,
     Evolution,
     Snapshot,
     Table,
     TableFile,
-    Unit,
     retrying,
     scales_of,
 )
@@ -69,9 +69,11 @@ def rewrite(
     """
     new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
     replaced = [file for one in rewritings for file in one.files]
-    units = rewriting_units(logs, replaced)
+    transactions = rewrite_transactions(logs, replaced)
     logs.commit_or_discard(
-        Change(add=new, remove=replaced, units=units, note=note, data_change=data_change)
+        Change(
+            add=new, remove=replaced, transactions=transactions, note=note, data_change=data_change
+        )
     )
     return new
 
@@ -101,10 +103,10 @@ def write_again(
     return new
 
 
-def rewriting_units(logs: Snapshot, replaced: Sequence[TableFile]) -> list[Unit]:
-    """Return units that make commits conflict which rewrite the same day; Delta lets them pass."""
+def rewrite_transactions(logs: Snapshot, replaced: Sequence[TableFile]) -> list[AppTransaction]:
+    """Return transactions by which rewrites of one day conflict; Delta itself lets them pass."""
     days = sorted({str(file.day) for file in replaced})
-    return [Unit(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
+    return [AppTransaction(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
 
 
 def read_kept_drives(
@@ -201,7 +203,7 @@ def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
 
 # Takes drives out of the logs that others replace, or that somebody withdraws.
 #
-# They may come again: their files' units are withdrawn. Their Gram rows go with the files.
+# They may come again: their files' transactions are withdrawn. Their Gram rows go with the files.
 
 
 def take_out(
@@ -214,12 +216,12 @@ def take_out(
     gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
     left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
     files = {one.file for one in origins} - {one.file for one in left if one}
-    units = Fingerprints(snapshot.units).withdraw(origins, files)
+    transactions = Fingerprints(snapshot.transactions).withdraw(origins, files)
     concerned = [file for file in snapshot.files if gone.get(file.path)]
     if concerned:
-        units += rewriting_units(snapshot, concerned)
+        transactions += rewrite_transactions(snapshot, concerned)
     kept = [Rewriting("kept", [file], gone[file.path]) for file in concerned]
-    return Change(write_again(warehouse, snapshot, kept), concerned, units)
+    return Change(write_again(warehouse, snapshot, kept), concerned, transactions)
 
 
 def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
@@ -230,7 +232,7 @@ def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
 
     add, remove = write_without(snapshot, mine)
     files = {one for one in origins if one == one.file}
-    return Change(add, remove, Fingerprints(snapshot.units).withdraw((), files))
+    return Change(add, remove, Fingerprints(snapshot.transactions).withdraw((), files))
 
 
 def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:

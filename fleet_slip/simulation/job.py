@@ -26,7 +26,7 @@ from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
 from fleet_slip.simulation.receivers import ReceiverLog
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
-from fleet_slip.storage.table import Change, Snapshot, Unit, retry_conflicts, retrying
+from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.forgotten import Audit, skipped_drives
@@ -217,27 +217,27 @@ def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
     return pa.chunked_array(chunks, type=encoded.type)
 
 
-def unit_of(batch: Batch) -> Unit:
-    """Return the unit of work that lands a batch; its version is from the batch's content."""
+def batch_transaction(batch: Batch) -> AppTransaction:
+    """Return the transaction that lands a batch; its version is from the batch's content."""
     name = f"{day_name(batch.campaign, batch.day)}/{batch.index}"
-    return Unit(name, int(batch.digest[:15], base=16))
+    return AppTransaction(name, int(batch.digest[:15], base=16))
 
 
-def unit_of_day(campaign: Campaign, day: date) -> Unit:
-    """Return the unit of work that records that a day is complete."""
-    return Unit(day_name(campaign.name, day), int(campaign.digest[:15], base=16))
+def day_transaction(campaign: Campaign, day: date) -> AppTransaction:
+    """Return the transaction that records that a day is complete."""
+    return AppTransaction(day_name(campaign.name, day), int(campaign.digest[:15], base=16))
 
 
 def day_name(campaign: str, day: date) -> str:
-    """Return what the units of work of a day are called, and its batches' before their number."""
+    """Return the name of the transaction of a day, a prefix of the names of its batches."""
     return f"simulate/{campaign}/{day}"
 
 
-def has_landed(snapshot: Snapshot, unit: Unit) -> bool:
-    """Whether a unit is in the logs. Raises `RefusedError` if another version of it is."""
-    landed = snapshot.landed(unit.name)
-    if landed not in (None, unit.version):
-        _, campaign, day, *_ = unit.name.split("/")
+def has_landed(snapshot: Snapshot, transaction: AppTransaction) -> bool:
+    """Whether a transaction is in the logs. Raises `RefusedError` if another version of it is."""
+    landed = snapshot.landed(transaction.name)
+    if landed not in (None, transaction.version):
+        _, campaign, day, *_ = transaction.name.split("/")
         raise RefusedError(
             f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs "
             "are never replaced. Give the changed campaign another name, or use another data root."
@@ -315,7 +315,7 @@ def simulate_campaign(
     for day in open_days:  # before anything is written, so that a changed campaign is refused
         if snapshot.landed(f"{day_name(campaign.name, day)}/0") is not None:
             for batch in campaign.batches(day):
-                has_landed(snapshot, unit_of(batch))
+                has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
     report.campaign, report.days_present = campaign.name, len(every) - len(open_days)
@@ -326,15 +326,17 @@ def simulate_campaign(
 
 def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> list[date]:
     """Return the days not recorded as complete. Raises `RefusedError` for a changed campaign."""
-    return [day for day in days if not has_landed(snapshot, unit_of_day(campaign, day))]
+    return [day for day in days if not has_landed(snapshot, day_transaction(campaign, day))]
 
 
 @retrying
 def _complete(warehouse: Warehouse, campaign: Campaign, days: Iterable[date]) -> None:
     snapshot = warehouse.logs.snapshot()
-    units = [unit_of_day(campaign, day) for day in _open_days(snapshot, campaign, days)]
-    if units:
-        snapshot.commit(Change(units=units, note={"job": "simulate", "campaign": campaign.name}))
+    transactions = [day_transaction(campaign, day) for day in _open_days(snapshot, campaign, days)]
+    if transactions:
+        snapshot.commit(
+            Change(transactions=transactions, note={"job": "simulate", "campaign": campaign.name})
+        )
 
 
 def simulate_batches(
@@ -351,7 +353,7 @@ def simulate_batches(
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
-        has_landed(snapshot, unit_of(batch))
+        has_landed(snapshot, batch_transaction(batch))
     return _simulate(warehouse, [batches], 1, executor, progress)
 
 
@@ -370,7 +372,9 @@ def _simulate(
         """Yield batches that have not landed, planned day by day as they are asked for."""
         nonlocal days_planned, rows
         for batches in plan:
-            missing = [batch for batch in batches if not has_landed(snapshot, unit_of(batch))]
+            missing = [
+                batch for batch in batches if not has_landed(snapshot, batch_transaction(batch))
+            ]
             report.batches_present += len(batches) - len(missing)
             days_planned += 1
             rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
@@ -423,7 +427,7 @@ def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
     def attempt() -> _Written | None:
         nonlocal written
         snapshot = warehouse.logs.snapshot()
-        landed = has_landed(snapshot, unit_of(written.batch))
+        landed = has_landed(snapshot, batch_transaction(written.batch))
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         while landed or written.drives != _not_forgotten(warehouse, written.drives):
             warehouse.logs.discard(_files(written))
@@ -433,7 +437,7 @@ def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
         snapshot.commit(
             Change(
                 add=_files(written),
-                units=[unit_of(written.batch)],
+                transactions=[batch_transaction(written.batch)],
                 note={
                     "job": "simulate",
                     "campaign": written.batch.campaign,

@@ -39,11 +39,11 @@ _KINDS = _CHECKED_KINDS | {"commitInfo", "metaData", "protocol"}
 def checked_note(
     note: Mapping[str, Any],
     actions: Sequence[AddAction | RemoveAction],
-    units: Mapping[str, int],
+    transactions: Mapping[str, int],
 ) -> str:
-    """Return a commit's note as text, with the checksum of itself, its actions and its units."""
+    """Return a note as text, with the checksum of note, actions and transactions."""
     stated = [*map(_as_logged, actions)]
-    stated += [{"txn": {"appId": name, "version": number}} for name, number in units.items()]
+    stated += [{"txn": {"appId": name, "version": number}} for name, number in transactions.items()]
     return json.dumps({**note, CHECKSUM_KEY: checksum_of_actions(note, stated)})
 
 
@@ -187,7 +187,7 @@ def find_commit_faults(snapshot: "Snapshot") -> Iterator[tuple[str, str]]:
     if faults or len(commits) <= snapshot.version:
         return
     files: set[str] = set()
-    units: dict[str, int] = {}
+    transactions: dict[str, int] = {}
     for action in (action for commit in commits for action in commit.actions):
         match action:
             case {"add": {"path": path}}:
@@ -195,17 +195,19 @@ def find_commit_faults(snapshot: "Snapshot") -> Iterator[tuple[str, str]]:
             case {"remove": {"path": path}}:
                 files.discard(path)
             case {"txn": {"appId": name, "version": number}}:
-                units[name] = number
+                transactions[name] = number
     if files != {file.path for file in snapshot.files}:
         yield LATEST, "the active files are not those that the commits add up to"
-    if wrong := [name for name, number in units.items() if snapshot.units.get(name) != number]:
+    if wrong := [
+        name for name, number in transactions.items() if snapshot.transactions.get(name) != number
+    ]:
         yield LATEST, f"does not know what has landed: {', '.join(wrong[:3])}"
 
 
-def read_landed_units(table: Folder, version: int) -> dict[str, int]:
-    """Return the numbers of all units that have landed in a version. Raises `StorageError`.
+def read_transactions(table: Folder, version: int) -> dict[str, int]:
+    """Return the numbers of all transactions that have landed in a version. Raises `StorageError`.
 
-    Delta answers for one unit at a time, and reads its log for each.
+    Delta answers for one transaction at a time, and reads its log for each.
     """
     return dict(_logged(table, version, "txn", "appId", "version"))
 

@@ -39,6 +39,8 @@ ATTEMPTS = 1000
 T = TypeVar("T")
 
 MAX_DIGITS = 9
+MAX_DEPTH = 100
+"""Levels of a document. Python's own limit for JSON differs between its versions."""
 
 _NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.(json|sha256|lost)")
 
@@ -119,6 +121,7 @@ class DocumentFolder:
         text = self.folder.read(document_file(number))
         try:
             envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
+            _require_depth(envelope)
             content, stated = envelope["content"], envelope["sha256"]
             place = {key: envelope[key] for key in _PLACE if "format" in envelope}
             document = Document(number, content, checksum(content))
@@ -303,6 +306,21 @@ def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(members) < len(pairs):
         raise ValueError("a key appears twice")
     return members
+
+
+def _require_depth(value: Any) -> None:
+    """Raise `ValueError` for JSON that is nested more than `MAX_DEPTH` levels."""
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        level = [
+            child
+            for parent in level
+            if isinstance(parent, dict | list)
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+        ]
+        if not level:
+            return
+    raise ValueError("nested too deeply")
 
 
 def document_file(number: int) -> str:

@@ -26,8 +26,8 @@ from fleet_slip.storage.commits import (
     LOG,
     NOTE,
     checked_note,
-    read_landed_units,
     read_removals,
+    read_transactions,
 )
 from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
 from fleet_slip.storage.folder import Folder
@@ -116,10 +116,10 @@ def _table_files(actions: pa.Table, where: object) -> Iterator[TableFile]:
 
 
 @dataclass(frozen=True)
-class Unit:
-    """A piece of work that lands exactly once: its name, and a number that its content determines.
+class AppTransaction:
+    """A Delta transaction identifier: a commit that has it is made exactly once.
 
-    A Delta transaction identifier: of two processes that land it at once, one is in conflict.
+    Two processes that commit it at once are in conflict. The content determines the version.
     """
 
     name: str
@@ -132,7 +132,7 @@ class Change:
 
     add: Sequence[AddAction] = ()
     remove: Sequence[TableFile] = ()
-    units: Sequence[Unit] = ()
+    transactions: Sequence[AppTransaction] = ()
     note: Mapping[str, Any] = field(default_factory=dict)
     data_change: bool = True
 
@@ -290,11 +290,11 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
     }
 
 
-MANY_UNITS = 8
-"""So many units of work are not asked for one by one."""
+MANY_TRANSACTIONS = 8
+"""From so many names on, all transactions are read at once."""
 
 WITHDRAWN = -1
-"""Number of a unit whose rows were taken out again: it may land anew."""
+"""Version of a transaction whose rows were removed: it may be committed again."""
 
 
 @dataclass(frozen=True)
@@ -375,26 +375,26 @@ class Snapshot:
         newest = _now_ms() - hours * 3.6e6
         return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
 
-    def landed(self, unit_name: str) -> int | None:
-        """Return the version of a unit of work that has landed, or None."""
+    def landed(self, transaction_name: str) -> int | None:
+        """Return the version of a transaction that has landed, or None."""
         if self.delta is None:
             return None
         with storage_errors(self.table.folder):
-            return self.delta.transaction_version(unit_name)
+            return self.delta.transaction_version(transaction_name)
 
     def landed_among(self, number: int) -> Callable[[str], bool]:
-        """Return what tells whether a unit has landed; for many questions it reads the log once."""
-        if self.version is None or number < MANY_UNITS:
+        """Return a lookup `name -> committed?`. Reads the log once if `number` is large."""
+        if self.version is None or number < MANY_TRANSACTIONS:
             return lambda name: self.landed(name) not in {None, WITHDRAWN}
-        return lambda name: self.units.get(name, WITHDRAWN) != WITHDRAWN
+        return lambda name: self.transactions.get(name, WITHDRAWN) != WITHDRAWN
 
     @cached_property
-    def units(self) -> Mapping[str, int]:
-        """The numbers of all units that have landed, `WITHDRAWN` ones among them."""
+    def transactions(self) -> Mapping[str, int]:
+        """The numbers of all transactions that have landed, `WITHDRAWN` ones among them."""
         if self.version is None:
             return {}
         with storage_errors(self.table.folder):
-            return read_landed_units(self.table.folder, self.version)
+            return read_transactions(self.table.folder, self.version)
 
     def commit_or_discard(self, change: Change) -> None:
         """Apply a change like `commit`; after a conflict delete the files that it was to add."""
@@ -407,7 +407,7 @@ class Snapshot:
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit. Raises `ConflictError` and `StorageError`."""
         table, actions = self.table, change.actions()
-        note = checked_note(change.note, actions, {u.name: u.version for u in change.units})
+        note = checked_note(change.note, actions, {u.name: u.version for u in change.transactions})
         with table.committing():
             delta = self.delta or table.create()
             table.require_writable(_columns_of(change.add), delta)
@@ -418,7 +418,7 @@ class Snapshot:
                 partition_by=list(table.partition_by),
                 commit_properties=CommitProperties(
                     custom_metadata={NOTE: note},
-                    app_transactions=[Transaction(u.name, u.version) for u in change.units],
+                    app_transactions=[Transaction(u.name, u.version) for u in change.transactions],
                 ),
             )
             table.folder.settle_commits(self.version)

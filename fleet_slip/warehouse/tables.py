@@ -111,7 +111,12 @@ class Warehouse:
     )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle with the catalog: a worker elsewhere need not have the folder of configs."""
+        """Pickle without connections; with the catalog, unless it is the shipped one.
+
+        A worker elsewhere need not have the folder of configs.
+        """
+        if self.configs == SHIPPED_CONFIGS:
+            return Warehouse, (self.root,)
         return _unpickle, (self.root, self.configs, self.catalog)
 
     def close(self) -> None:

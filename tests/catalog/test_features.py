@@ -39,7 +39,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.models.request import load_model_list
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.counts import nearest
@@ -254,7 +254,7 @@ def test_a_set_costs_one_pass_and_stands_beside_the_others(warehouse: Warehouse)
     assert update_grams(warehouse, feature_set="motion").rows_read == 100
     logs = warehouse.logs.snapshot()
     gone = next(file for file in logs.files if "one" in file.path)
-    logs.commit(Change(remove=[gone], units=[Unit("test/remove", 1)]))
+    logs.commit(Change(remove=[gone], transactions=[AppTransaction("test/remove", 1)]))
     assert update_grams(warehouse).files_dropped == 1
     left = load_cohort(warehouse, "true", "motion")
     assert set(left.drives["drive_id"].to_pylist()) == {"c"}

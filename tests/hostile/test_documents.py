@@ -119,6 +119,7 @@ def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]
     [
         "[" * 100_000,
         '{"content": ' + "[" * 5000 + "]" * 5000 + ', "sha256": ""}',
+        '{"content": ' + "[" * 100 + "]" * 100 + ', "sha256": ""}',
         '{"content": ' + "9" * 5000 + ', "sha256": ""}',
         '{"content": NaN, "sha256": ""}',
         '{"content": {}, "content": {}, "sha256": ""}',  # which of the two would be read?

@@ -10,7 +10,8 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.facts import TRAINING_DRIVES
 from fleet_slip.errors import DataError, RefusedError, UnexaminedError
-from fleet_slip.models import acceptance as champion_rules
+from fleet_slip.models import soundness
+from fleet_slip.models.acceptance import load_floor
 from fleet_slip.operations import examined, quality
 from fleet_slip.operations.quality import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -141,9 +142,6 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
     assert fleet.publish("m", chosen, candidate=True).candidate
 
 
-_LOAD_FLOOR = champion_rules.load_floor
-
-
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,8 +152,8 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
         ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
     ):
-        strict = _LOAD_FLOOR(SHIPPED_CONFIGS).model_copy(update={name: bound})
-        monkeypatch.setattr(champion_rules, "load_floor", lambda _, strict=strict: strict)
+        strict = load_floor(SHIPPED_CONFIGS).model_copy(update={name: bound})
+        monkeypatch.setattr(soundness, "load_floor", lambda _, strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
             fleet.publish("m", asked)
         dry = fleet.would_publish("m", asked)
@@ -163,7 +161,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         assert fleet.would_publish("m", asked, candidate=True).candidate
         said = run_command(*command)
         assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
-        monkeypatch.setattr(champion_rules, "load_floor", _LOAD_FLOOR)
+        monkeypatch.setattr(soundness, "load_floor", load_floor)
     assert not fleet.models().num_rows
     assert "m would be published. " in run_command(*command).stderr
     assert fleet.publish("m", asked).new
@@ -174,8 +172,8 @@ def test_a_champion_of_more_columns_needs_drives_for_them_too(
 ) -> None:
     cohort = fleet.cohort("day = DATE '2026-10-05'")
     assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
-    strict = _LOAD_FLOOR(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
-    monkeypatch.setattr(champion_rules, "load_floor", lambda _: strict)
+    strict = load_floor(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
+    monkeypatch.setattr(soundness, "load_floor", lambda _: strict)
     with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
         fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
     assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.job import update_grams
@@ -41,7 +43,7 @@ NEW_SIGNAL = SHIPPED.replace("[drive.drive_id]", PRESSURE.lstrip(), 1)
 AX = "scale = 0.001\nmin = -30.0\nmax = 30.0"
 WIDER_AX = SHIPPED.replace(AX, "scale = 0.002\nmin = -60\nmax = 60", 1)
 BEFORE, _, REST = SHIPPED.partition("[signals.lateral_offset]")
-WITHOUT_OFFSET = BEFORE + "# What is known" + REST.partition("# What is known")[2]
+WITHOUT_OFFSET = BEFORE + REST[REST.index("[signals.") :]
 
 Use = Callable[[str], Warehouse]
 
@@ -56,9 +58,15 @@ def use(tmp_path: Path, warehouse: Warehouse) -> Use:
     return opened
 
 
-def small_counts(seed: int, rows: int = 40) -> dict[str, Any]:
+def small_counts(seed: int, rows: int = 40, signals: SignalCatalog = SIGNALS) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
-    return {n: rng.integers(-9000, 9000, rows).astype(np.int16) for n in SIGNALS.signals}
+    return {n: rng.integers(-9000, 9000, rows).astype(np.int16) for n in signals.signals}
+
+
+def new_rows(warehouse: Warehouse) -> pa.Table:
+    """Return a drive `new` with all signals of a warehouse."""
+    signals = warehouse.catalog.signals
+    return log_rows("new", small_counts(2, signals=signals), signals=signals)
 
 
 def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> None:
@@ -68,11 +76,11 @@ def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> No
     now = use(NEW_SIGNAL)
     assert ask(now, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
     with pytest.raises(RefusedError, match=r"has not: tyre_pressure.*fleet-slip migrate"):
-        land(now, "new", log_rows("new", small_counts(2)))
+        land(now, "new", new_rows(now))
     report = migrate(now)
     assert (report.added, report.files_without_names) == (("tyre_pressure",), 0)
     assert not migrate(now).changed
-    land(now, "new", log_rows("new", small_counts(2)))
+    land(now, "new", new_rows(now))
     assert update_grams(now).files_read == 1
     signals = dict(ask(now, "SELECT drive_id, signals FROM grams"))
     assert "tyre_pressure" in str(signals["new"])
@@ -100,7 +108,7 @@ def test_a_retired_signal_stays_in_old_files_and_is_not_asked_for(
 ) -> None:
     land(warehouse, "old", log_rows("old", small_counts(1)))
     now = use(WITHOUT_OFFSET)
-    land(now, "new", log_rows("new", small_counts(2)))
+    land(now, "new", new_rows(now))
     assert not migrate(now).changed
     assert ask(now, "SELECT count(*), count(station_m) FROM log") == [(80, 80)]
     assert "lateral_offset_m" not in [row[0] for row in ask(now, "DESCRIBE log")]

@@ -173,7 +173,7 @@ def test_drives_in_order_raise_no_alarm() -> None:
 def choose_limits(monkeypatch: pytest.MonkeyPatch, **changes: int) -> None:
     limits = thresholds(SHIPPED_CONFIGS).quality.model_copy(update=changes)
     chosen = thresholds(SHIPPED_CONFIGS).model_copy(update={"quality": limits})
-    monkeypatch.setattr(quality, "thresholds", lambda: chosen)
+    monkeypatch.setattr(quality, "thresholds", lambda _: chosen)
 
 
 def test_vehicle_models_are_examined_one_after_the_other(

@@ -14,7 +14,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.commits import find_commit_faults
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows
 from tests.support.once import filled_once
@@ -117,8 +117,10 @@ def test_a_commit_that_is_gone_is_told(root: Warehouse) -> None:
 
 def test_units_and_notes_of_any_text_are_sealed_as_they_are(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("x", log_rows("x", COUNTS), DAY)
-    unit = Unit('"\\ é \u2028 1', 2**62)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[unit], note={"job": "ü\n"}))
+    transaction = AppTransaction('"\\ é \u2028 1', 2**62)
+    warehouse.logs.snapshot().commit(
+        Change(add=[action], transactions=[transaction], note={"job": "ü\n"})
+    )
     assert not problems(warehouse)
 
 
@@ -128,14 +130,14 @@ LATEST = "logs/_delta_log/_last_checkpoint"
 @pytest.fixture
 @filled_once
 def later(warehouse: Warehouse) -> None:
-    """A table with a unit that its checkpoint does not know."""
+    """A table with a transaction that its checkpoint does not know."""
     land(warehouse, "one", log_rows("one", COUNTS))
     commit = commits(warehouse)[1]
     content = commit.read_bytes()
     commit.write_bytes(content.replace(b'"appId":"test/one"', b'"appId":"test/ome"'))
     DeltaTable(str(logs_of(warehouse))).create_checkpoint()
     commit.write_bytes(content)
-    warehouse.logs.snapshot().commit(Change(units=[Unit("later", 1)]))
+    warehouse.logs.snapshot().commit(Change(transactions=[AppTransaction("later", 1)]))
 
 
 def damage(warehouse: Warehouse) -> set[str]:

@@ -25,7 +25,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.objects import ObjectFolder, client
 from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
-from fleet_slip.storage.table import Change, Unit, retry_conflicts
+from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts
 from fleet_slip.warehouse.database import database_errors
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, ask, land, log_rows, random_counts
@@ -103,8 +103,10 @@ def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) ->
 
         def attempt() -> None:
             snapshot = logs.snapshot()
-            if snapshot.landed(f"unit-{number}") is None:
-                snapshot.commit(Change(add=[action], units=[Unit(f"unit-{number}", 1)]))
+            if snapshot.landed(f"transaction-{number}") is None:
+                snapshot.commit(
+                    Change(add=[action], transactions=[AppTransaction(f"transaction-{number}", 1)])
+                )
 
         retry_conflicts(attempt)
 

@@ -1,4 +1,4 @@
-"""Delta tables below a data root: whole commits or nothing, and units that land once."""
+"""Delta tables below a data root: whole commits or nothing, and transactions that land once."""
 
 import hashlib
 import json
@@ -23,7 +23,7 @@ from fleet_slip.storage.checksums import CHECKSUM_DIGITS, checksum_in, checksum_
 from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import SCALE, Change, Unit, retry_conflicts
+from fleet_slip.storage.table import SCALE, AppTransaction, Change, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
@@ -41,7 +41,9 @@ def test_a_table_that_nobody_wrote_is_empty_and_touches_nothing(warehouse: Wareh
 def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
     assert warehouse.logs.snapshot().files == ()
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit("u", 7)], note={"job": "t"}))
+    warehouse.logs.snapshot().commit(
+        Change(add=[action], transactions=[AppTransaction("u", 7)], note={"job": "t"})
+    )
     snapshot = warehouse.logs.snapshot()
     (file,) = snapshot.files
     assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
@@ -72,7 +74,7 @@ def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
     def attempt(number: int) -> None:
         extra = warehouse.logs.write_file(f"extra-{number}", rows(f"d{number}", 10), DAY)
         try:
-            stale[number].commit(Change(add=[extra], units=[Unit("same", 3)]))
+            stale[number].commit(Change(add=[extra], transactions=[AppTransaction("same", 3)]))
         except ConflictError:
             outcomes.append("conflict")
         else:
@@ -91,7 +93,7 @@ def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
     warehouse: Warehouse,
 ) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
-    change = Change(add=[action], units=[Unit("u", 1)])
+    change = Change(add=[action], transactions=[AppTransaction("u", 1)])
     before, also_before = (warehouse.logs.snapshot() for _ in range(2))
     before.commit(change)
     with pytest.raises(ConflictError, match="Run the same command again"):
@@ -102,11 +104,11 @@ def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
 def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Warehouse) -> None:
     for number in range(4):
         action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
-        units = [Unit(f"unit-{number}-{i}", 1) for i in range(3)]
-        warehouse.logs.snapshot().commit(Change(add=[action], units=units))
+        transactions = [AppTransaction(f"transaction-{number}-{i}", 1) for i in range(3)]
+        warehouse.logs.snapshot().commit(Change(add=[action], transactions=transactions))
         if number == 1:
             DeltaTable(str(path_of(warehouse.logs.folder))).create_checkpoint()
-    names = [f"unit-{number}-{i}" for number in range(5) for i in range(4)]
+    names = [f"transaction-{number}-{i}" for number in range(5) for i in range(4)]
     commits = sorted((path_of(warehouse.root) / "logs/_delta_log").glob("*.json"))
     commits[1].unlink()  # what the checkpoint sums up, Delta removes in time
     earlier, now = warehouse.logs.snapshot(3), warehouse.logs.snapshot()
@@ -119,10 +121,10 @@ def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Ware
 
 def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
     first = warehouse.logs.write_file("one", rows("a"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[first], units=[Unit("1", 1)]))
+    warehouse.logs.snapshot().commit(Change(add=[first], transactions=[AppTransaction("1", 1)]))
     before = warehouse.logs.snapshot()
     second = warehouse.logs.write_file("two", rows("b"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[second], units=[Unit("2", 1)]))
+    warehouse.logs.snapshot().commit(Change(add=[second], transactions=[AppTransaction("2", 1)]))
     assert (before.rows, warehouse.logs.snapshot().rows) == (1000, 2000)
 
 

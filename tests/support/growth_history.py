@@ -18,10 +18,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.grams.job import unit_name
+from fleet_slip.grams.job import transaction_name
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG
 
@@ -164,8 +164,8 @@ def write_grams(warehouse: Warehouse, paths: Sequence[str], rows: int, weight: i
         table = drives.grams(warehouse, [paths[f] for f in files], [day_of(f) for f in files])
         actions.append(warehouse.grams.write_file(f"growth-{first:09d}", table))
     identity = CATALOG.identity(PLAIN)
-    unit = Unit(unit_name(identity), warehouse.logs.snapshot().version or 0)
-    warehouse.grams.snapshot().commit(Change(add=actions, units=[unit]))
+    transaction = AppTransaction(transaction_name(identity), warehouse.logs.snapshot().version or 0)
+    warehouse.grams.snapshot().commit(Change(add=actions, transactions=[transaction]))
 
 
 def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> None:
@@ -181,8 +181,10 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
             for drives in drawn_for(files)
         ]
         action = warehouse.grams.write_file("growth", pa.concat_tables(parts))
-        unit = Unit(unit_name(CATALOG.identity(PLAIN)), warehouse.logs.snapshot().version or 0)
-        warehouse.grams.snapshot().commit(Change(add=[action], units=[unit]))
+        transaction = AppTransaction(
+            transaction_name(CATALOG.identity(PLAIN)), warehouse.logs.snapshot().version or 0
+        )
+        warehouse.grams.snapshot().commit(Change(add=[action], transactions=[transaction]))
     else:
         write_grams(warehouse, paths, grams, WEIGHT)
 

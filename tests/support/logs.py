@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse, open_warehouse
 from tests.support.catalog import CATALOG, SIGNALS
@@ -52,7 +53,13 @@ def schema_without(optional: Collection[str]) -> pa.Schema:
     return pa.schema([field for field in SIGNALS.log_schema if field.name not in optional])
 
 
-def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata: Any) -> pa.Table:
+def log_rows(
+    drive_id: str,
+    counts: dict[str, Any],
+    day: date = DAY,
+    signals: SignalCatalog = SIGNALS,
+    **metadata: Any,
+) -> pa.Table:
     """Rows of the logs for one drive; a signal that is not given is absent."""
     rows = len(next(iter(counts.values())))
     known: dict[str, Any] = {
@@ -72,7 +79,7 @@ def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata:
         **metadata,
     }
     columns = {"tick": np.arange(rows, dtype=np.int32), **counts}
-    schema = SIGNALS.log_schema
+    schema = signals.log_schema
     every = [
         pa.array(columns[field.name], field.type)
         if field.name in columns
@@ -85,7 +92,9 @@ def log_rows(drive_id: str, counts: dict[str, Any], day: date = DAY, **metadata:
 def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:
     """Commit drives as one file of the logs."""
     action = warehouse.logs.write_file(name, pa.concat_tables(drives), day)
-    warehouse.logs.snapshot().commit(Change(add=[action], units=[Unit(f"test/{name}", 1)]))
+    warehouse.logs.snapshot().commit(
+        Change(add=[action], transactions=[AppTransaction(f"test/{name}", 1)])
+    )
 
 
 def state(root: Path, model: str = "smoke") -> dict[str, Any]:

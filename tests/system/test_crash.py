@@ -22,7 +22,7 @@ from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit, retry_conflicts
+from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import PATIENCE_S, RunCommand, finish, run, start_on
@@ -196,11 +196,11 @@ def write(root: Path, writer: int) -> None:
         name = f"car{writer}-{number}"
         drives = [log_rows(f"{name}-{part}", counts) for part in range(FILES)]
         added = [logs.write_file(name, rows, DAY) for rows in drives]
-        change = Change(add=added, units=[Unit(f"write/{name}", 1)])
+        change = Change(add=added, transactions=[AppTransaction(f"write/{name}", 1)])
 
         def land(change: Change = change) -> None:
             snapshot = logs.snapshot()
-            if snapshot.landed(change.units[0].name) is None:
+            if snapshot.landed(change.transactions[0].name) is None:
                 snapshot.commit(change)
 
         retry_conflicts(land)

@@ -20,7 +20,7 @@ from fleet_slip.grams.gram_files import find_backlog, gram_table, is_of_received
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
@@ -104,7 +104,7 @@ def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> N
     update_grams(warehouse)
     logs = warehouse.logs.snapshot()
     gone = next(file for file in logs.files if "/b-" in file.path)
-    logs.commit(Change(remove=[gone], units=[Unit("test/remove", 1)]))
+    logs.commit(Change(remove=[gone], transactions=[AppTransaction("test/remove", 1)]))
     assert find_backlog(warehouse.logs.snapshot(), warehouse.grams.snapshot()).stale == {gone.path}
     assert update_grams(warehouse).files_dropped == 1
     assert {drive for drive, _ in stored(warehouse)} == {"a", "c"}

@@ -263,10 +263,15 @@ def test_the_order_of_rows_in_a_file_does_not_matter(warehouse: Warehouse) -> No
 
 def test_the_label_is_no_column_to_look_back_on() -> None:
     label = CATALOG.signals.label
+
+    def define(**keys: str) -> Definition:
+        content = {**keys, "over": "mean", "ticks": 4}
+        return Definition.model_validate(content, context=CATALOG.signals)
+
     with pytest.raises(ValueError, match="not an input signal"):
-        Definition(of=label, over="mean", ticks=4)
+        define(of=label)
     with pytest.raises(ValueError, match="not an input signal"):
-        Definition(of="x", sql=f"{label}::BIGINT", over="mean", ticks=4)
+        define(of="x", sql=f"{label}::BIGINT")
 
 
 def test_adhesion_is_no_fact() -> None:

@@ -41,7 +41,7 @@ from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Unit
+from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import one_query
@@ -213,8 +213,8 @@ def _template(temporary: str) -> Path:
     tables = [_drive(f"d{i}", rng.integers(-3000, 3000, (40, 5))) for i in range(6)]
     for number, drives in enumerate((tables[:3], tables[3:])):
         action = warehouse.logs.write_file(f"f{number}", pa.concat_tables(drives), _DAY)
-        unit = Unit(f"fuzz/{number}", 1)
-        warehouse.logs.snapshot().commit(Change(add=[action], units=[unit]))
+        transaction = AppTransaction(f"fuzz/{number}", 1)
+        warehouse.logs.snapshot().commit(Change(add=[action], transactions=[transaction]))
     program = "from fleet_slip.cli.main import main; main()"
     command = [sys.executable, "-c", program, "--root", str(root)]
     for arguments in (["gram"], ["publish", MODEL, "--nested", "ax,ay", "--folds", "2", "--force"]):

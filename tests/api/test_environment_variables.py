@@ -1,0 +1,29 @@
+"""Where the package reads the environment."""
+
+import re
+from pathlib import Path
+
+import fleet_slip
+
+PACKAGE = Path(fleet_slip.__file__).parent
+
+READERS = {
+    "cli/app.py": "the folder for fonts, which matplotlib needs before it is imported",
+    "cli/output.py": "TERM",
+    "cli/progress.py": "CI",
+    "warehouse/tables.py": "open_warehouse: the data root and the folder of configs",
+    "resources.py": "the system's folder for caches, needed when a module is imported",
+    "compiling.py": "numba's folder for caches, needed when a module is imported",
+    "limits.py": "Arrow's allocator, before Arrow is imported",
+    "storage/objects.py": "AWS_ALLOW_HTTP, which stands beside the credentials of the libraries",
+    "ingest/formats/confined.py": "what a child process inherits",
+}
+
+
+def test_no_other_module_reads_the_environment() -> None:
+    found = {
+        file.relative_to(PACKAGE).as_posix()
+        for file in PACKAGE.rglob("*.py")
+        if re.search(r"\benviron\b|\bgetenv\b", file.read_text(encoding="utf-8"))
+    }
+    assert found == {*READERS}

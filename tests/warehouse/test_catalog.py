@@ -1,0 +1,160 @@
+"""Each data root has its own catalog and connection, whatever other roots are open."""
+
+import pickle
+import shutil
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import numpy as np
+import pytest
+
+from fleet_slip.catalog.definitions import Combination
+from fleet_slip.catalog.lines import FittedLine
+from fleet_slip.errors import QuestionError
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.job import update_grams
+from fleet_slip.resources import folder
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.tables import Warehouse
+from tests.support.catalog import CATALOG, configs_with
+from tests.support.logs import ask, land, log_rows, path_of, random_counts
+from tests.support.measured import a_mapping, csv_text, ingest_file
+
+SHIPPED = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
+COARSE = SHIPPED.replace(
+    "scale = 0.001\nmin = -30.0\nmax = 30.0", "scale = 0.002\nmin = -30\nmax = 30", 1
+)
+DOUBLED = """
+[features.ax_doubled]
+counts = "2 * ax"
+scale = 0.001
+unit = "m/s^2"
+column = "ax_doubled_mps2"
+description = "Twice the counts"
+
+[sets.doubled]
+description = "Twice the counts"
+signals = ["ax"]
+features = ["ax_doubled"]
+"""
+ROWS = 50
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Warehouse:
+    """A root whose ax has another scale, and whose catalog has one more feature."""
+    configs = configs_with(tmp_path / "configs", signals=COARSE, features=DOUBLED)
+    return Warehouse(LocalFolder(tmp_path / "other"), configs)
+
+
+def fill(warehouse: Warehouse, file: Path) -> None:
+    """Ingest a log of 50 rows with ax = 0, 0.02, 0.04 ... m/s^2."""
+    rising = [round(0.02 * row, 2) for row in range(ROWS)]
+    columns: dict[str, Any] = {"t": [row / 100 for row in range(ROWS)], "ax": rising}
+    file.write_text(csv_text(columns | {"beta": [0.1] * ROWS}), encoding="utf-8")
+    ingest_file(warehouse, file, a_mapping(catalog=warehouse.catalog))
+
+
+def contents(warehouse: Warehouse) -> dict[str, Any]:
+    """Return what a root says of its columns."""
+    return {
+        "identities": [warehouse.catalog.identity(name) for name in ("motion", "signals")],
+        "sets": warehouse.feature_sets(),
+        "counts": ask(warehouse, "SELECT sum(ax) FROM log_counts"),
+        "values": ask(warehouse, "SELECT round(sum(ax_mps2), 6) FROM log"),
+        "grams": ask(warehouse, "SELECT feature_set, signals, sums FROM grams ORDER BY ALL"),
+        "scale": ask(warehouse, "SELECT unit FROM dictionary WHERE \"column\" = 'ax' LIMIT 1"),
+        "label": load_cohort(warehouse, "true").catalog.input_scales["ax"],
+    }
+
+
+def test_two_roots_in_one_process_have_each_their_own_results(
+    warehouse: Warehouse, other: Warehouse, tmp_path: Path
+) -> None:
+    fill(warehouse, tmp_path / "log.csv")
+    update_grams(warehouse)
+    before = contents(warehouse)
+    fill(other, tmp_path / "log.csv")
+    update_grams(other)
+    update_grams(other, feature_set="doubled")
+    found = contents(other)
+    assert contents(warehouse) == before, "opening another root changed an open one"
+    total = sum(20 * row for row in range(ROWS))
+    assert (before["counts"], found["counts"]) == ([(total,)], [(total // 2,)])
+    assert before["values"] == found["values"] == [(pytest.approx(total / 1000),)]
+    assert before["grams"][0][2][0] == total
+    assert [(signals, sums[:2]) for _, signals, sums in found["grams"]] == [
+        ("ax,ax_doubled,sideslip", [total // 2, total]),
+        ("ax,sideslip", [total // 2, found["grams"][1][2][1]]),
+    ]
+    assert ("doubled" in before["sets"], "doubled" in found["sets"]) == (False, True)
+    assert before["identities"][0] != found["identities"][0]
+    assert (before["scale"], found["scale"]) == ([("0.001 m/s^2",)], [("0.002 m/s^2",)])
+    with pytest.raises(QuestionError, match="no feature set is called 'doubled'"):
+        update_grams(warehouse, feature_set="doubled")
+
+
+def read(warehouse: Warehouse) -> duckdb.DuckDBPyConnection:
+    """Read a cohort; return the connection that waits for the next reader."""
+    load_cohort(warehouse, "true")
+    ((_, idle),) = warehouse.connections._idle
+    return idle.database
+
+
+def test_a_root_that_is_closed_or_collected_closes_its_connection(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("a", random_counts(np.random.default_rng(1), 30)))
+    update_grams(warehouse)
+    another = Warehouse(warehouse.root)
+    connections = [read(warehouse), read(another)]
+    assert connections[0] is read(warehouse), "the second reader opened it anew"
+    warehouse.close()
+    load_cohort(warehouse, "true")
+    assert not warehouse.connections._idle
+    assert connections[1] is read(another), "closing a root closed another's connection"
+    del another
+    for connection in connections:
+        with pytest.raises(duckdb.ConnectionException):
+            connection.execute("SELECT 1")
+
+
+def first_stage_model() -> FittedLine:
+    estimate = next(iter(CATALOG.estimates))
+    return FittedLine(
+        estimate=estimate,
+        fitted=Combination(),
+        folds={},
+        scale=CATALOG.estimates[estimate].scale,
+        models="learning",
+        feature_set="signals",
+        models_sha256="0" * 64,
+        cohort="true",
+        drives=1,
+        drive_hashes="0" * 16,
+    )
+
+
+def test_a_first_stage_model_belongs_to_its_root_until_that_is_closed(
+    warehouse: Warehouse, other: Warehouse
+) -> None:
+    model = first_stage_model()
+    name = f"{next(iter(CATALOG.stacked_sets))}_{model.digest}"
+    warehouse.stacked_models.keep(model)
+    assert warehouse.catalog.identity(name)
+    for elsewhere in (other, Warehouse(other.root)):
+        with pytest.raises(QuestionError, match="not in this data root"):
+            elsewhere.catalog.identity(name)
+    shutil.rmtree(path_of(warehouse.root) / "lines")
+    assert warehouse.stacked_models.find(model.digest) == model, "it is read once"
+    warehouse.close()
+    assert warehouse.stacked_models.find(model.digest) is None
+
+
+def test_a_worker_without_the_folder_of_configs_has_the_catalog(other: Warehouse) -> None:
+    pickled = pickle.dumps(other)
+    assert other.configs.folder is not None
+    shutil.rmtree(other.configs.folder)
+    sent = pickle.loads(pickled)  # noqa: S301 - of this test
+    assert sent.catalog.signals["ax"].exact_scale == 2 * CATALOG.signals["ax"].exact_scale
+    assert sent.catalog.identity("doubled") == other.catalog.identity("doubled")
+    assert sent.catalog.first_stage_models is sent.stacked_models
