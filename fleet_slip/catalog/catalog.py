@@ -8,9 +8,9 @@ from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.course import BESIDE, YAW_RATE, course_units
 from fleet_slip.catalog.definitions import COUNT_BITS, Definition, parity, plain_column
-from fleet_slip.catalog.facts import CALIBRATION, DELAY
 from fleet_slip.catalog.features import (
     PLAIN,
     FeatureFile,

@@ -15,7 +15,7 @@ from pydantic import Field, RootModel, ValidationError
 
 from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.catalog.course import COURSE_LATE
-from fleet_slip.catalog.facts import ALL_DRIVES
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
