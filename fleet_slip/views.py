@@ -5,7 +5,7 @@ from pathlib import Path
 
 import duckdb
 
-from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs

@@ -24,7 +24,7 @@ from typing import (
 from typing_extensions import Doc
 
 from fleet_slip.base import Progress, needed, no_progress
-from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
 from fleet_slip.storage.folder import Folder

@@ -33,7 +33,7 @@ from fleet_slip.api.calls import (
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.operations import HealthAndUpkeep
 from fleet_slip.base import last_day
-from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH

@@ -20,7 +20,7 @@ from fleet_slip.api.calls import (
     record_call,
 )
 from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.program import Target
 from fleet_slip.models.manifest import require_model_name

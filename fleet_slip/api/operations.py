@@ -20,7 +20,7 @@ from fleet_slip.api.calls import (
 )
 from fleet_slip.api.models import JudgedModels
 from fleet_slip.base import date_of, normalize_name, number_of
-from fleet_slip.catalog.facts import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.runs import step

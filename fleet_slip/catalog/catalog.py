@@ -8,16 +8,16 @@ from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.course import BESIDE, YAW_RATE, course_units
 from fleet_slip.catalog.definitions import COUNT_BITS, Definition, parity, plain_column
-from fleet_slip.catalog.facts import CALIBRATION, DELAY
 from fleet_slip.catalog.features import (
     PLAIN,
     FeatureFile,
     FeatureSetEntry,
     load_features,
 )
-from fleet_slip.catalog.lines import FittedLine, Fitting
+from fleet_slip.catalog.first_stage import EstimateSubstitution, FirstStageModel
 from fleet_slip.catalog.signals import (
     SAMPLE_TIME_S,
     Signal,
@@ -97,7 +97,7 @@ class FeatureSet:
 class FirstStageModels(Protocol):
     """Finds first-stage models by digest."""
 
-    def find(self, digest: str) -> FittedLine | None:
+    def find(self, digest: str) -> FirstStageModel | None:
         """Return a model; None if there is none. Raises `StorageError`."""
 
 
@@ -197,10 +197,10 @@ class Catalog:
         definitions = {window: self.time_columns[window].definition for window in windows}
         if model is None:
             return definitions
-        fitting = Fitting(model, fold)
-        return {window: fitting(definition) for window, definition in definitions.items()}
+        substitute = EstimateSubstitution(model, fold)
+        return {window: substitute(definition) for window, definition in definitions.items()}
 
-    def first_stage_model(self, name: str) -> FittedLine | None:
+    def first_stage_model(self, name: str) -> FirstStageModel | None:
         """Return the first-stage model of a set `SET_DIGEST`; None for other sets.
 
         Raises `QuestionError` if it does not exist or its estimate has another scale now.

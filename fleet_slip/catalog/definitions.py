@@ -21,7 +21,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, StringConstraints, ValidationInfo, model_validator
 
 from fleet_slip.catalog.arithmetic import evaluate, parse
-from fleet_slip.catalog.facts import NumberName
+from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
 from fleet_slip.catalog.signals import COUNT_MAX, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
@@ -36,7 +36,7 @@ LONGEST_TICKS = 2**16
 LARGEST_RATIO = 2**14
 """Largest numerator and denominator of a ratio of scales: keeps every quotient below 2^53."""
 
-LARGEST_FACT = 2**16
+MAX_ATTRIBUTE = 2**16
 """Largest size of a number that a car knows of itself."""
 
 COUNT_BITS = 16
@@ -47,12 +47,12 @@ LARGEST_BITS = 20
 
 Bits = Annotated[int, Field(ge=COUNT_BITS, le=LARGEST_BITS)]
 
-FactText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
+AttributeText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
 
 NO_CAR_KNOWS = frozenset({"adhesion", "lost_control_s", "speed_factor", "saturated"})
 """Drive columns that are known to a simulation or afterwards, and to no car while it drives."""
 
-NOT_FACTS = NO_CAR_KNOWS | {
+NOT_ATTRIBUTES = NO_CAR_KNOWS | {
     *("drive_id", "drive_name", "source_file", "trip_id", "started_at", "duration_s", "rows"),
     *("vehicle_id", "source", "campaign", "track"),
 }
@@ -96,7 +96,7 @@ def integer_arithmetic(sql: str, info: ValidationInfo) -> str:
 
 def _not_unknowable(name: str, info: ValidationInfo) -> str:
     signals = _signals_of(info)
-    if name in NOT_FACTS or (signals and name not in signals.drive):
+    if name in NOT_ATTRIBUTES or (signals and name not in signals.drive):
         raise ValueError(f"{name} is not a property of the car that the catalog has")
     return name
 
@@ -119,20 +119,20 @@ LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
 _LEFT_OUT = Field(exclude_if=lambda one: one is None)
 
 
-class Fact(Config):
-    """What a car knows of itself, as a whole number: a factor of a column.
+class AttributeFactor(Config):
+    """A vehicle attribute, as a whole number, as a factor of a column.
 
     The number is `name` rounded, less `less`; or with `equals` 1 for cars of that value, 0 for
     others. The column's count times that number times `ratio` is rounded and clipped again.
     """
 
     name: Annotated[Identifier, AfterValidator(_not_unknowable)]
-    less: Annotated[int, Field(ge=-LARGEST_FACT, le=LARGEST_FACT)] = 0
-    equals: FactText | None = None
+    less: Annotated[int, Field(ge=-MAX_ATTRIBUTE, le=MAX_ATTRIBUTE)] = 0
+    equals: AttributeText | None = None
     ratio: Ratio = Fraction(1)
 
     @model_validator(mode="after")
-    def _fits_its_type(self, info: ValidationInfo) -> "Fact":
+    def _fits_its_type(self, info: ValidationInfo) -> "AttributeFactor":
         signals = _signals_of(info)
         if signals is None:
             return self
@@ -173,8 +173,8 @@ class Gate(Config):
         return self
 
 
-class Number(Config):
-    """What a car's drives tell of it (`fleet_slip.catalog.facts`): a factor of a column.
+class ParameterFactor(Config):
+    """A calibration parameter of the car as a factor of a column.
 
     The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
     number is not known takes the mean since its drive began, `running`, of the same grain; without
@@ -188,14 +188,14 @@ class Number(Config):
         running: column that takes its place.
     """
 
-    name: NumberName
+    name: CalibrationParameterName
     grain: Annotated[Decimal, Field(gt=0)]
     less: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX)] = 0
     alone: bool = False
     running: "Definition | None" = None
 
     @model_validator(mode="after")
-    def _runs_plainly(self) -> "Number":
+    def _runs_plainly(self) -> "ParameterFactor":
         one = self.running
         if one and (one.over != "running_mean" or one.fact or one.number or self.less):
             raise ValueError("running is a mean since the drive began, without factors")
@@ -318,9 +318,9 @@ class Definition(Config):
     ticks: int = Field(default=0, ge=0, le=LONGEST_TICKS)
     ratio: Ratio = Fraction(1)
     bits: Bits = 20
-    fact: Fact | None = None
+    fact: AttributeFactor | None = None
     gate: Annotated[Gate | None, _LEFT_OUT] = None
-    number: Annotated[Number | None, _LEFT_OUT] = None
+    number: Annotated[ParameterFactor | None, _LEFT_OUT] = None
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Definition":
@@ -384,7 +384,7 @@ class Definition(Config):
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
 
-for one in (Gate, Number, Combination, Product, Equation, Slope):
+for one in (Gate, ParameterFactor, Combination, Product, Equation, Slope):
     one.model_rebuild()
 
 

@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from fleet_slip.catalog.course import BESIDE, LONGEST_TICKS
-from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, Identifier, SignalCatalog
 from fleet_slip.catalog.time_columns import (
     Calibrated,

@@ -16,25 +16,29 @@ from typing import Any, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from fleet_slip.catalog.arithmetic import nearest_sql, parse
+from fleet_slip.catalog.calibration_parameters import (
+    CALIBRATION_PARAMETERS,
+    CalibrationParameterName,
+    ColumnUnit,
+)
 from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     LARGEST_BITS,
     LONGEST_TICKS,
+    AttributeFactor,
+    AttributeText,
     Bits,
     Combination,
     Definition,
     Equation,
-    Fact,
-    FactText,
     Gate,
     Made,
-    Number,
     Over,
+    ParameterFactor,
     Product,
     Slope,
     integer_arithmetic,
 )
-from fleet_slip.catalog.facts import CAR_NUMBERS, ColumnUnit, NumberName
 from fleet_slip.catalog.signals import Identifier, Scaled, Signal, SignalCatalog, SIUnit
 from fleet_slip.config import Config
 
@@ -239,7 +243,7 @@ class Factor(ColumnFamily):
     of: Identifier
     fact: Identifier
     less: int = 0
-    equals: FactText | None = None
+    equals: AttributeText | None = None
     scale: Decimal = Field(gt=0)
     unit: SIUnit
     column: Identifier
@@ -250,7 +254,7 @@ class Factor(ColumnFamily):
         if base.fact is not None:
             raise ValueError(f"{self.of} has a factor already")
         ratio = known.of(self.of).exact_scale / Fraction(self.scale)
-        fact = Fact.model_validate(
+        fact = AttributeFactor.model_validate(
             {"name": self.fact, "less": self.less, "equals": self.equals, "ratio": ratio},
             context=known.signals,
         )
@@ -261,7 +265,7 @@ class Calibrated(ColumnFamily):
     """A column times a number that the car's own drives tell; `alone`, the number by itself."""
 
     of: Identifier
-    number: NumberName
+    number: CalibrationParameterName
     less: Decimal = Decimal(0)
     alone: bool = False
     running: Identifier | None = None
@@ -273,7 +277,11 @@ class Calibrated(ColumnFamily):
         Raises `ValueError` if `running` has another grain than the number, or `less` is between
         counts.
         """
-        base, of, number = known.definition(self.of), known.of(self.of), CAR_NUMBERS[self.number]
+        base, of, number = (
+            known.definition(self.of),
+            known.of(self.of),
+            CALIBRATION_PARAMETERS[self.number],
+        )
         if isinstance(of, Feature):  # the count itself, as it stands in the rows
             base = base.model_copy(update={"bits": base.of_bits})
         if base.number is not None:
@@ -286,7 +294,7 @@ class Calibrated(ColumnFamily):
         less = Fraction(self.less) / Fraction(number.grain)
         if less.denominator != 1:
             raise ValueError(f"less is no multiple of {number.grain}")
-        factor = Number(
+        factor = ParameterFactor(
             name=self.number,
             grain=number.grain,
             less=int(less),

@@ -15,7 +15,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.definitions import limit_of
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.kernel import GAPS, run
-from fleet_slip.columns.operations import CarFact
+from fleet_slip.columns.operations import VehicleAttribute
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region
 from fleet_slip.errors import DataError
 
@@ -117,7 +117,7 @@ class Workspace:
         for number, one in enumerate(code.of_car):
             known = (
                 one.count(drive.facts[one.name])
-                if isinstance(one, CarFact)
+                if isinstance(one, VehicleAttribute)
                 else drive.numbers.get(one.name)
             )
             self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known

@@ -13,21 +13,21 @@ from itertools import combinations_with_replacement
 from typing import Any, Literal, TypeVar
 
 from fleet_slip.catalog.arithmetic import nearest, parse, truncated
+from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.catalog.definitions import (
     COUNT_BITS,
-    LARGEST_FACT,
+    MAX_ATTRIBUTE,
     WEIGHT,
+    AttributeFactor,
     Definition,
     Equation,
-    Fact,
     Gate,
     Made,
-    Number,
+    ParameterFactor,
     Product,
     Slope,
     limit_of,
 )
-from fleet_slip.catalog.facts import CAR_NUMBERS
 from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.errors import QuestionError
 
@@ -222,7 +222,7 @@ MOST_VALUES = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class CarFact:
+class VehicleAttribute:
     """What a car knows of itself: a number, rounded; or, with `equals`, 1 if it is that, else 0."""
 
     name: str
@@ -234,7 +234,7 @@ class CarFact:
             return None
         if self.equals is not None:
             return int(value == self.equals)
-        if isinstance(value, str) or not abs(value) <= LARGEST_FACT:
+        if isinstance(value, str) or not abs(value) <= MAX_ATTRIBUTE:
             return None
         return nearest(*value.as_integer_ratio())
 
@@ -247,7 +247,7 @@ class CarFact:
 
 
 @dataclass(frozen=True)
-class CarCount:
+class ParameterCount:
     """What a car's own drives tell of it: a count of so many `grain`."""
 
     name: str
@@ -261,8 +261,8 @@ class Lowering:
 
     signals: Mapping[str, int]
     steps: dict[Step, int] = field(default_factory=dict)
-    facts: dict[CarFact, int] = field(default_factory=dict)
-    numbers: dict[CarCount, int] = field(default_factory=dict)
+    facts: dict[VehicleAttribute, int] = field(default_factory=dict)
+    numbers: dict[ParameterCount, int] = field(default_factory=dict)
     _made: dict[int, int] = field(default_factory=dict)
 
     @classmethod
@@ -376,8 +376,8 @@ class Lowering:
             self.clip(found, limit) if total == now else self.clip_where(found, limit, lambda: now)
         )
 
-    def _factor(self, one: Definition, fact: Fact) -> int:
-        place = _place(self.facts, CarFact(fact.name, fact.equals))
+    def _factor(self, one: Definition, fact: AttributeFactor) -> int:
+        place = _place(self.facts, VehicleAttribute(fact.name, fact.equals))
         of = self.column(one.model_copy(update={"fact": None}))
         less = 0 if fact.equals is not None else fact.less
         times = self.do("*", of, self.less(self.do("fact", place), less))
@@ -403,11 +403,11 @@ class Lowering:
         times = self.do("*", self.less(by, low), self.constant(WEIGHT))
         return self.do("//", times, self.constant(high - low))
 
-    def _numbered(self, one: Definition, number: Number) -> int:
+    def _numbered(self, one: Definition, number: ParameterFactor) -> int:
         of = self.column(one.model_copy(update={"number": None}))
         running = None if number.running is None else self.column(number.running)
-        unit = CAR_NUMBERS[number.name].unit
-        place = _place(self.numbers, CarCount(number.name, unit, number.grain))
+        unit = CALIBRATION_PARAMETERS[number.name].unit
+        place = _place(self.numbers, ParameterCount(number.name, unit, number.grain))
         stand_in = self.constant(0) if running is None else running
         factor = self.do("else", self.less(self.do("number", place), number.less), stand_in)
         return self.do("where", factor, of) if number.alone else self.do("*", of, factor)
@@ -508,10 +508,10 @@ def most_products(equations: int) -> int:
 
 
 def given_ranges(
-    signals: Sequence[Range], facts: Iterable[CarFact], numbers: Collection[CarCount]
+    signals: Sequence[Range], facts: Iterable[VehicleAttribute], numbers: Collection[ParameterCount]
 ) -> dict[str, list[Range]]:
     """Return the valid ranges of signals, facts and numbers: what is beyond is missing."""
-    fact = (-LARGEST_FACT, LARGEST_FACT)
+    fact = (-MAX_ATTRIBUTE, MAX_ATTRIBUTE)
     return {
         "signal": list(signals),
         "fact": [fact if one.equals is None else (0, 1) for one in facts],

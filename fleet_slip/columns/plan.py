@@ -26,8 +26,8 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
-    CarCount,
-    CarFact,
+    ParameterCount,
+    VehicleAttribute,
     largest_in,
     most_products,
     operands_of,
@@ -131,7 +131,7 @@ class Code:
 
     operations: list[VectorOperation] = field(default_factory=list)
     signals: dict[str, int] = field(default_factory=dict)
-    of_car: dict[CarFact | CarCount, int] = field(default_factory=dict)
+    of_car: dict[VehicleAttribute | ParameterCount, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
     kept: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)

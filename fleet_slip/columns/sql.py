@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 from fleet_slip.catalog.arithmetic import nearest_sql
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.definitions import LARGEST_FACT, Definition, rows_behind
+from fleet_slip.catalog.definitions import MAX_ATTRIBUTE, Definition, rows_behind
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
     GIVEN,
     OPERATIONS,
     POWERS,
-    CarFact,
     Lowering,
     Range,
     Step,
+    VehicleAttribute,
     operands_of,
     operation_of,
     plain_of,
@@ -72,10 +72,10 @@ def sql_constant(value: int) -> str:
     return str(value) if value >= 0 else f"({value})"
 
 
-def fact_sql(one: CarFact) -> str:
+def attribute_sql(one: VehicleAttribute) -> str:
     """Return the whole number of a fact, given the column of the drive; null if not known."""
     if one.equals is None:
-        known = f"ABS({one.name}) <= {LARGEST_FACT}"
+        known = f"ABS({one.name}) <= {MAX_ATTRIBUTE}"
         return f"CASE WHEN {known} THEN CAST(ROUND({one.name}) AS BIGINT) END"
     is_it = f"{one.name} = '{one.equals}'"
     return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
@@ -280,7 +280,7 @@ def with_columns(
         counted.ranges,
         DUCKDB_SQL,
         lambda name, place: (
-            f"{signals[place]}::BIGINT" if name == "signal" else f"({fact_sql(facts[place])})"
+            f"{signals[place]}::BIGINT" if name == "signal" else f"({attribute_sql(facts[place])})"
         ),
     )
     columns, clips = [], []

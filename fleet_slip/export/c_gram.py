@@ -29,6 +29,7 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import number_of
+from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
     BESIDE,
@@ -42,7 +43,6 @@ from fleet_slip.catalog.course import (
     course_units,
 )
 from fleet_slip.catalog.definitions import plain_column
-from fleet_slip.catalog.facts import CALIBRATION, DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.operations import Lowering

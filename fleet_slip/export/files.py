@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, sha256_of
-from fleet_slip.catalog.definitions import LARGEST_FACT
+from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
-from fleet_slip.columns.operations import CarFact
+from fleet_slip.columns.operations import VehicleAttribute
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
@@ -100,10 +100,10 @@ def _signal(one: Input) -> dict[str, Any]:
     }
 
 
-def _fact(one: CarFact) -> dict[str, Any]:
+def _fact(one: VehicleAttribute) -> dict[str, Any]:
     if one.equals is not None:
         return {"name": one.name, "equals": one.equals}
-    return {"name": one.name, "largest": LARGEST_FACT}
+    return {"name": one.name, "largest": MAX_ATTRIBUTE}
 
 
 def _angle(angle: Angle) -> dict[str, Any]:

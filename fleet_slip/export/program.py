@@ -18,11 +18,11 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import plain_column
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.operations import (
-    CarCount,
-    CarFact,
     Lowering,
+    ParameterCount,
     Range,
     Step,
+    VehicleAttribute,
     given_ranges,
     operands_of,
     plain_of,
@@ -178,8 +178,8 @@ class Steps:
     """What columns are computed by at each tick: steps, and what they are given."""
 
     signals: tuple[Input, ...]
-    facts: tuple[CarFact, ...]
-    numbers: tuple[CarCount, ...]
+    facts: tuple[VehicleAttribute, ...]
+    numbers: tuple[ParameterCount, ...]
     steps: tuple[Step, ...]
 
     @cached_property

@@ -4,7 +4,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 """
 
 from fleet_slip.catalog.signals import COUNT_MAX
-from fleet_slip.columns.sql import PLAIN_SQL, SqlLayers, fact_sql
+from fleet_slip.columns.sql import PLAIN_SQL, SqlLayers, attribute_sql
 from fleet_slip.export.program import Program
 from fleet_slip.export.templating import fill_in_version
 from fleet_slip.models.registry import ModelVersion
@@ -44,7 +44,7 @@ def _given(program: Program) -> list[list[str]]:
     for place, number in enumerate(program.numbers):
         counts.append(f"ROUND({number.name} / {number.grain:f}) AS told_{place}")
         valid.append(f"{_within(f'told_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
-    facts = [f"{fact_sql(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
+    facts = [f"{attribute_sql(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
     return [[*counts, *facts], rounded, valid]
 
 

@@ -22,9 +22,15 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
+from fleet_slip.catalog.calibration_parameters import (
+    CALIBRATION,
+    CALIBRATION_PARAMETERS,
+    DELAY,
+    CalibrationParameterName,
+)
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import COLUMNS, TURNED, turned_scale
-from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION, CAR_NUMBERS, DELAY, NumberName
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import (
     KINDS,
@@ -139,7 +145,7 @@ LEAST_PART = 1e-9
 PAIRS = 300
 """Cars of which two drives are compared: enough to determine a variance to a tenth."""
 
-LASTING: Mapping[bool, Mapping[NumberName, float]] = {
+LASTING: Mapping[bool, Mapping[CalibrationParameterName, float]] = {
     False: {
         "steering_offset": 0.00004,
         "speed_ratio": 0.0015,
@@ -222,7 +228,7 @@ class CarEvidence:
             if at.stop > at.start
         }
 
-    def estimate(self, slices: Mapping[str, slice]) -> dict[NumberName, CarEstimate]:
+    def estimate(self, slices: Mapping[str, slice]) -> dict[CalibrationParameterName, CarEstimate]:
         """Return the numbers that some drives determine, with the lean of their roads."""
         return _known(self._estimate(slices))
 
@@ -235,14 +241,14 @@ class CarEvidence:
         sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
         return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
 
-    def _variances(self) -> dict[NumberName, float]:
+    def _variances(self) -> dict[CalibrationParameterName, float]:
         """Return the variance of residuals, as drives differ, of each number's plane.
 
         A drive's shift, about the number of its car, has the variance times its share times one
         less the part of the share in the car's. Every drive counts the same: errors do not grow
         with shares as noise does, and uninformative drives would decide for informative ones.
         """
-        ratios: dict[NumberName, list[float]] = {}
+        ratios: dict[CalibrationParameterName, list[float]] = {}
         for car in self.cars:
             slices = self.slices(car)
             for name, estimate in self.estimates[car].items():
@@ -257,13 +263,13 @@ class CarEvidence:
                 )
         return {name: sum(some) / len(some) for name, some in ratios.items() if some}
 
-    def _variances_of_one(self) -> dict[NumberName, float]:
+    def _variances_of_one(self) -> dict[CalibrationParameterName, float]:
         """Return the same of the numbers of one drive: how far a car's first two differ.
 
         What makes roads differ, such as the bank of their bends, moves a number that several roads
         determine at once; one road alone explains its own.
         """
-        ratios: dict[NumberName, list[float]] = {}
+        ratios: dict[CalibrationParameterName, list[float]] = {}
         pairs = [
             car for car in self.cars if all(s.stop - s.start > 1 for s in self.slices(car).values())
         ]
@@ -274,7 +280,9 @@ class CarEvidence:
                 ratios.setdefault(name, []).append(apart**2 / (one[name][1] + other[name][1]))
         return {name: sum(some) / len(some) for name, some in ratios.items()}
 
-    def _of_drive(self, car: str, drive: int) -> dict[NumberName, tuple[float, float]]:
+    def _of_drive(
+        self, car: str, drive: int
+    ) -> dict[CalibrationParameterName, tuple[float, float]]:
         """Return the numbers that a drive alone determines, and their shares."""
         at = self.slices(car, drive, drive + 1)
         found = {}
@@ -284,10 +292,10 @@ class CarEvidence:
         return found
 
     def uncertainties(
-        self, estimates: Mapping[NumberName, CarEstimate], slices: Mapping[str, slice]
-    ) -> dict[NumberName, float]:
+        self, estimates: Mapping[CalibrationParameterName, CarEstimate], slices: Mapping[str, slice]
+    ) -> dict[CalibrationParameterName, float]:
         """Return the standard errors of what some drives determine."""
-        own: dict[NumberName, float] = {}
+        own: dict[CalibrationParameterName, float] = {}
         for name, estimate in estimates.items():
             found = self.influence(estimate, slices[estimate.kind])
             if found is None or name not in self.variances:
@@ -297,7 +305,7 @@ class CarEvidence:
             variance = of_one.get(name, self.variances[name]) * share
             lasting = {**LASTING[self._banked], **LASTING_BY_SATELLITE.get(estimate.kind, {})}
             own[name] = variance * (1 + drives / ROADS) + lasting.get(name, 0.0) ** 2
-        found_of: dict[NumberName, float] = {}
+        found_of: dict[CalibrationParameterName, float] = {}
         for name, variance in own.items():
             one = estimates[name]
             others = sum(d**2 * own.get(other, 0.0) for other, d in one.also.items())
@@ -305,15 +313,15 @@ class CarEvidence:
             found_of[name] = sqrt(variance + others + lean**2)
         return found_of
 
-    def stated(self, car: str) -> dict[NumberName, "CalibratedNumber | str"]:
+    def stated(self, car: str) -> dict[CalibrationParameterName, "CalibratedNumber | str"]:
         """Return the numbers of a car, by all of its drives; why, in the place of a missing one.
 
         `ay_offset` is missing where it cannot be separated from the lean of the roads.
         """
         slices = self.slices(car)
         sure = self.uncertainties(self.estimates[car], slices)
-        found: dict[NumberName, CalibratedNumber | str] = {}
-        for name, about in CAR_NUMBERS.items():
+        found: dict[CalibrationParameterName, CalibratedNumber | str] = {}
+        for name, about in CALIBRATION_PARAMETERS.items():
             one = self._whole[car][name]
             if isinstance(one, str):
                 found[name] = one
@@ -335,7 +343,7 @@ class CarEvidence:
         return found
 
 
-def _known(estimates: Estimates) -> dict[NumberName, CarEstimate]:
+def _known(estimates: Estimates) -> dict[CalibrationParameterName, CarEstimate]:
     return {name: one for name, one in estimates.items() if isinstance(one, CarEstimate)}
 
 
@@ -357,14 +365,14 @@ class Calibration(Answer):
         receivers: how late satellite receivers are, by the Gram rows of `delay` that there are.
     """
 
-    cars: Mapping[str, Mapping[NumberName, CalibratedNumber]]
-    missing: Mapping[str, Mapping[NumberName, str]]
+    cars: Mapping[str, Mapping[CalibrationParameterName, CalibratedNumber]]
+    missing: Mapping[str, Mapping[CalibrationParameterName, str]]
     logs_version: int
     grams_version: int
     evidence: CarEvidence
     receivers: ReceiverDelays = NO_RECEIVERS
 
-    def car(self, vehicle_id: str) -> Mapping[NumberName, CalibratedNumber]:
+    def car(self, vehicle_id: str) -> Mapping[CalibrationParameterName, CalibratedNumber]:
         """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
         if vehicle_id not in self.cars:
             raise QuestionError(
@@ -390,7 +398,7 @@ class Calibration(Answer):
 
     def _of_all(self) -> Iterator[Part]:
         rows = []
-        for name, about in CAR_NUMBERS.items():
+        for name, about in CALIBRATION_PARAMETERS.items():
             cars = [numbers[name] for numbers in self.cars.values() if name in numbers]
             known = [one.uncertainty for one in cars if one.uncertainty is not None]
             if cars:
@@ -420,7 +428,10 @@ class Calibration(Answer):
         yield TextTable(
             f"{car}, by its own drives",
             "number|unit|value|+-|drives|count on board|of",
-            ({"name": k, "of": CAR_NUMBERS[k], "one": one} for k, one in self.car(car).items()),
+            (
+                {"name": k, "of": CALIBRATION_PARAMETERS[k], "one": one}
+                for k, one in self.car(car).items()
+            ),
             "{name}|{of.unit}|{one.value:.6g}|{one.uncertainty:.2g}|{one.drives}|{one.count}|"
             "{of.grain}",
             left=2,
@@ -461,7 +472,9 @@ class Calibration(Answer):
         return {
             "logs_version": self.logs_version,
             "grams_version": self.grams_version,
-            "numbers": {name: one.model_dump(mode="json") for name, one in CAR_NUMBERS.items()},
+            "numbers": {
+                name: one.model_dump(mode="json") for name, one in CALIBRATION_PARAMETERS.items()
+            },
             "cars": {
                 car: {name: vars(one) for name, one in numbers.items()}
                 for car, numbers in self.cars.items()
@@ -501,8 +514,8 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
             satellite = replace(opened, identity=catalog.identity(name))
             sums |= collect_sums(satellite.batches(condition), kinds)
     evidence = CarEvidence(catalog, sums)
-    cars: dict[str, dict[NumberName, CalibratedNumber]] = {}
-    missing: dict[str, dict[NumberName, str]] = {}
+    cars: dict[str, dict[CalibrationParameterName, CalibratedNumber]] = {}
+    missing: dict[str, dict[CalibrationParameterName, str]] = {}
     for car in evidence.cars:
         stated = evidence.stated(car)
         missing[car] = {name: one for name, one in stated.items() if isinstance(one, str)}

@@ -14,6 +14,11 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 
+from fleet_slip.catalog.calibration_parameters import (
+    BY_COURSE,
+    BY_SATELLITE,
+    CalibrationParameterName,
+)
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
     FEWEST_CHANGES,
@@ -22,7 +27,6 @@ from fleet_slip.catalog.course import (
     TURNED,
     turned_scale,
 )
-from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, NumberName
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
 
@@ -53,11 +57,11 @@ class CarEstimate:
     noise: Fraction
     value: Fraction
     gradient: tuple[float, ...]
-    also: Mapping[NumberName, float] = field(default_factory=dict)
+    also: Mapping[CalibrationParameterName, float] = field(default_factory=dict)
     by_lean: Fraction = Fraction(0)
 
 
-Estimates = dict[NumberName, "CarEstimate | str"]
+Estimates = dict[CalibrationParameterName, "CarEstimate | str"]
 """The numbers that sums determine; in the place of one that they do not determine: why."""
 
 LEAST_TURNING_RAD_S = Fraction(2, 100)
@@ -72,9 +76,13 @@ TIGHT_1PM = Fraction(1, 50)
 """Standard deviation of curvature beyond which bends are mostly so tight that their bank does not
 grow with curvature any more: it looks like speed."""
 
-OF_COURSE: tuple[NumberName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
-OF_STEERING: tuple[NumberName, ...] = ("steering_offset", "steer_per_curvature", "understeer")
-OF_SLIP: tuple[NumberName, ...] = ("slip_lever", "slip_compliance")
+OF_COURSE: tuple[CalibrationParameterName, ...] = ("yaw_rate_offset", "ay_offset", "speed_ratio")
+OF_STEERING: tuple[CalibrationParameterName, ...] = (
+    "steering_offset",
+    "steer_per_curvature",
+    "understeer",
+)
+OF_SLIP: tuple[CalibrationParameterName, ...] = ("slip_lever", "slip_compliance")
 """The numbers of each relation."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
@@ -208,13 +216,13 @@ def gyroscope_noise(terms: CarTerms, course: Gram, steering: Gram | None) -> Fra
 
 def _estimate_course(
     terms: CarTerms, sums: ExactSums, noise: Fraction | None
-) -> dict[NumberName, CarEstimate] | str:
+) -> dict[CalibrationParameterName, CarEstimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
     solution = solve(relation.system(sums, noise))
     if solution is None or not solution[1]:
         return ALIKE
-    gradients: dict[NumberName, tuple[float, ...]]
+    gradients: dict[CalibrationParameterName, tuple[float, ...]]
     if relation is FLAT:
         yaw_rate_offset, slope, of_slowness = solution
         ay_offset, ratio = -of_slowness / slope, 1 / slope
@@ -243,7 +251,10 @@ def _estimate_course(
 
 
 def _estimate_steering(
-    terms: CarTerms, course: Mapping[NumberName, CarEstimate], gram: Gram, noise: Fraction
+    terms: CarTerms,
+    course: Mapping[CalibrationParameterName, CarEstimate],
+    gram: Gram,
+    noise: Fraction,
 ) -> Estimates:
     yaw_rate_offset, ay_offset = course["yaw_rate_offset"].value, course["ay_offset"].value
     columns = terms.steering(yaw_rate_offset)
@@ -253,7 +264,7 @@ def _estimate_steering(
         return dict.fromkeys(OF_STEERING, STRAIGHT)
     straight, by_bend, understeer = solution
 
-    also: dict[NumberName, float] = {
+    also: dict[CalibrationParameterName, float] = {
         "yaw_rate_offset": float(by_bend * sums.mean("slowness")),
         "ay_offset": float(understeer),
     }
@@ -308,7 +319,7 @@ SATELLITE = "satellite_speed"
 SLIP = "slip"
 """The kind of sums that determines how a car slips: changes over some seconds."""
 
-LASTING_BY_SATELLITE: Mapping[str, Mapping[NumberName, float]] = {
+LASTING_BY_SATELLITE: Mapping[str, Mapping[CalibrationParameterName, float]] = {
     STANDSTILL: {"yaw_rate_offset": 0.0003},
     SATELLITE: {"speed_ratio": 0.0012},
     SLIP: {"yaw_rate_offset": 0.0001, "slip_lever": 0.1, "slip_compliance": 0.0003},

@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import number_of
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.facts import RECEIVED, SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
 from fleet_slip.grams.expansion import expansion_of

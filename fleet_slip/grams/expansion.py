@@ -13,9 +13,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
+from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.course import BESIDE, TURNED
-from fleet_slip.catalog.definitions import Number
-from fleet_slip.catalog.facts import ALL_DRIVES, CALIBRATION
+from fleet_slip.catalog.definitions import ParameterFactor
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.grams.calibration import calibration_of
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import OpenedGrams
@@ -65,7 +66,7 @@ class Expansion:
     `sweep`: rows are of changes, swept of the gyroscope's bias and scale.
     """
 
-    columns: Mapping[str, tuple[str, Number]]
+    columns: Mapping[str, tuple[str, ParameterFactor]]
     cars: CarCounts
     sweep: bool = False
 

@@ -16,7 +16,7 @@ from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.drive_sources import RECEIVED_FILES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import ConflictError
 from fleet_slip.regression.gram import GramTable, packed_size

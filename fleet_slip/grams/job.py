@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Progress, no_progress, number_of
-from fleet_slip.catalog.facts import DELAY
+from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams

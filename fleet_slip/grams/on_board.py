@@ -41,7 +41,7 @@ from fleet_slip.catalog.course import (
     course_units,
 )
 from fleet_slip.catalog.definitions import limit_of
-from fleet_slip.catalog.facts import RECEIVED_FILES
+from fleet_slip.catalog.drive_sources import RECEIVED_FILES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
 from fleet_slip.catalog.time_columns import Feature

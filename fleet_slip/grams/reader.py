@@ -14,15 +14,10 @@ import duckdb
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import TURNED
-from fleet_slip.catalog.facts import (
-    ALL_DRIVES,
-    CALIBRATION,
-    LONGEST_PAUSE_S,
-    RECEIVER,
-    TRAINING_DRIVES,
-)
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, LONGEST_PAUSE_S, RECEIVER, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table

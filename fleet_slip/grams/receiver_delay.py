@@ -19,8 +19,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
-from fleet_slip.catalog.facts import DELAY, RECEIVED_FILES, RECEIVER
+from fleet_slip.catalog.drive_sources import RECEIVED_FILES, RECEIVER
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable

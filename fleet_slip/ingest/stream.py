@@ -18,7 +18,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.base import canonical_ascii, number_of, shown
-from fleet_slip.catalog.facts import LONGEST_PAUSE_S
+from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
 from fleet_slip.catalog.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError

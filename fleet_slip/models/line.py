@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalog.definitions import Combination, Definition
-from fleet_slip.catalog.lines import FittedLine, whole_line
+from fleet_slip.catalog.first_stage import FirstStageModel, integer_combination
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
@@ -25,7 +25,7 @@ from fleet_slip.warehouse.tables import Warehouse
 FOLDS = 8
 
 About = dict[str, Any]
-"""What a `FittedLine` is of: its `estimate`, `scale`, `models`, their checksum, set and cohort."""
+"""Of a `FirstStageModel`: its `estimate`, `scale`, `models`, their checksum, set and cohort."""
 
 KEPT_UNTIL = 2
 """A line is fitted again where a cohort has so many times the drives that it was fitted to."""
@@ -69,7 +69,7 @@ def with_line_fitted(
     return request
 
 
-def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine | None:
+def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageModel | None:
     """Return the line that was fitted to the most drives, all of which are there.
 
     None if there is none, or the cohort has outgrown it.
@@ -78,7 +78,7 @@ def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine
     stored = [model for digest in models.digests() if (model := models.find(digest))]
     there = load_cohort(warehouse, condition).hash_drives_with(())
 
-    def fits(line: FittedLine) -> bool:
+    def fits(line: FirstStageModel) -> bool:
         drives = np.frombuffer(bytes.fromhex(line.drive_hashes), dtype=">u8").astype(np.uint64)
         return about.items() <= vars(line).items() and bool(np.isin(drives, there).all())
 
@@ -86,7 +86,7 @@ def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine
     return best if best and len(there) < KEPT_UNTIL * best.drives else None
 
 
-def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
+def fit_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageModel:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
     Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
@@ -110,9 +110,9 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FittedLine:
 
     def whole(model: LinearModel) -> Combination:
         slopes = [slope * unit for slope in model.coefficients]
-        return whole_line(model.intercept * unit, slopes, columns)
+        return integer_combination(model.intercept * unit, slopes, columns)
 
-    return FittedLine(
+    return FirstStageModel(
         **about,
         fitted=whole(fit(folds.total, signals, label).model),
         folds={

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalog.facts import round_number
+from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks, valid_values
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.columns.plan import ColumnPlan

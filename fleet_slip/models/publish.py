@@ -10,7 +10,7 @@ from typing import Any
 
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
-from fleet_slip.catalog.facts import MEASURED, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.calibration import three_digits
 from fleet_slip.grams.reader import open_grams

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import number_of
-from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError

@@ -10,7 +10,7 @@ import numpy as np
 
 from fleet_slip.base import canonical_json, document_of, sha256_of
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, load_cohort

@@ -11,8 +11,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.base import number_of
+from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import relate
-from fleet_slip.catalog.facts import ALL_DRIVES, DELAY, MEASURED
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
 from fleet_slip.catalog.faults import Fault
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError

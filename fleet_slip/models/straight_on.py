@@ -16,8 +16,8 @@ from fractions import Fraction
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.facts import NumberName
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import Calibration, calibrate
 from fleet_slip.grams.reader import DriveSums, collect_sums, open_grams
@@ -29,7 +29,7 @@ from fleet_slip.warehouse.tables import Warehouse
 
 PLANE = ("curvature_mean_16", "yaw_rate_speed_mean_16")
 """What the columns of a model are planes in, beside a constant."""
-COLUMNS: Mapping[str, NumberName] = {
+COLUMNS: Mapping[str, CalibrationParameterName] = {
     "ay_offset_alone": "ay_offset",
     "yaw_rate_offset_alone": "yaw_rate_offset",
 }

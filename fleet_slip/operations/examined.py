@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
-from fleet_slip.catalog.facts import MEASURED, RECEIVED
+from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
 from fleet_slip.catalog.faults import Fault
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog

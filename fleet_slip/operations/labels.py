@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.facts import RECEIVED
+from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.faults import DriveBatches, Fault
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve

@@ -12,7 +12,7 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, number_of
 from fleet_slip.catalog.course import relate
-from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError

@@ -26,7 +26,7 @@ MANY_INPUTS = 40
 """From so many on, lifting is faster than elimination; both give the same fractions."""
 
 Scales = Mapping[str, Fraction]
-"""Physical value of one count of each signal: `signal_catalog()[name].exact_scale`."""
+"""Physical value of one count of each signal: `Catalog.input_scales`."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationInfo, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import canonical_ascii, sha256_of
-from fleet_slip.catalog.facts import SCENARIO
+from fleet_slip.catalog.drive_sources import SCENARIO
 from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError

@@ -20,7 +20,7 @@ from typing import Any
 import duckdb
 
 from fleet_slip.base import number_of
-from fleet_slip.catalog.facts import SCENARIO, TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (

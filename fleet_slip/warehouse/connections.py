@@ -2,11 +2,12 @@
 
 import ctypes
 import os
-from typing import NamedTuple
-
-import duckdb
+from typing import TYPE_CHECKING, NamedTuple
 
 from fleet_slip.storage.table import Snapshot
+
+if TYPE_CHECKING:  # a class that refers to DuckDB's is reported as a leak at the end of a process
+    import duckdb
 
 
 class IdleConnection(NamedTuple):
@@ -14,7 +15,7 @@ class IdleConnection(NamedTuple):
 
     grams: Snapshot
     logs: Snapshot
-    database: duckdb.DuckDBPyConnection
+    database: "duckdb.DuckDBPyConnection"
     uses: int
 
 

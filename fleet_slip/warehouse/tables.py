@@ -15,9 +15,9 @@ from pydantic import Field, RootModel, ValidationError
 
 from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.catalog.course import COURSE_LATE
-from fleet_slip.catalog.facts import ALL_DRIVES
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.lines import FittedLine
+from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.sql import with_absent
 from fleet_slip.config import Config, load_toml
@@ -57,13 +57,13 @@ class StackedModels:
 
     def __init__(self, root: Folder) -> None:
         self.root = root
-        self._models: dict[str, FittedLine] = {}
+        self._models: dict[str, FirstStageModel] = {}
 
     def digests(self) -> list[str]:
         """Return the digests of all models, sorted."""
         return sorted((self.root / LINES).names())
 
-    def find(self, digest: str) -> FittedLine | None:
+    def find(self, digest: str) -> FirstStageModel | None:
         """Return a model by its digest; None if there is none. Raises `StorageError`."""
         if digest not in self._models:
             documents = DocumentFolder(self.root, f"{LINES}/{digest}")
@@ -71,7 +71,7 @@ class StackedModels:
                 return None
             try:
                 content = documents.read(1).content["line"]
-                model = FittedLine.model_validate_json(json.dumps(content))
+                model = FirstStageModel.model_validate_json(json.dumps(content))
             except (ValidationError, KeyError):
                 model = None
             if model is None or model.digest != digest:
@@ -80,7 +80,7 @@ class StackedModels:
             self._models[digest] = model
         return self._models[digest]
 
-    def keep(self, model: FittedLine) -> None:
+    def keep(self, model: FirstStageModel) -> None:
         """Write a model durably, unless it exists."""
         documents = DocumentFolder(self.root, f"{LINES}/{model.digest}")
         documents.create(1, {"line": model.model_dump(mode="json")})

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.catalog.course import CourseRelation, relate
 from fleet_slip.catalog.definitions import (
@@ -27,7 +28,6 @@ from fleet_slip.catalog.definitions import (
     limit_of,
     parity,
 )
-from fleet_slip.catalog.facts import CAR_NUMBERS
 from fleet_slip.catalog.features import FeatureFile, load_features_over
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
@@ -329,7 +329,9 @@ def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> 
     plan = ColumnPlan.of(names, known.rows(names), windows)
 
     def columns(counts: dict[str, np.ndarray], offset: int) -> np.ndarray:
-        numbers: dict[str, int] = {name: offset if name in OFFSETS else 500 for name in CAR_NUMBERS}
+        numbers: dict[str, int] = {
+            name: offset if name in OFFSETS else 500 for name in CALIBRATION_PARAMETERS
+        }
         whole = {name: values.astype(np.int16) for name, values in counts.items()}
         facts = {"mass_kg": 1400.0, "vehicle_model": "suv"}
         return compute_columns(

@@ -8,12 +8,12 @@ import numpy as np
 from hypothesis import strategies as st
 
 from fleet_slip.catalog.definitions import (
+    AttributeFactor,
     Combination,
     Definition,
     Equation,
-    Fact,
     Gate,
-    Number,
+    ParameterFactor,
     Product,
     Slope,
 )
@@ -49,10 +49,10 @@ DEFINITIONS = {
         of="ay",
         over="mean",
         ticks=2,
-        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        fact=AttributeFactor(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
         bits=18,
     ),
-    "of_suv": Definition(of="ax", fact=Fact(name="vehicle_model", equals="suv")),
+    "of_suv": Definition(of="ax", fact=AttributeFactor(name="vehicle_model", equals="suv")),
     "below": Definition(
         of="ay",
         over="mean",
@@ -64,7 +64,7 @@ DEFINITIONS = {
         of="ay",
         over="mean",
         ticks=2,
-        fact=Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+        fact=AttributeFactor(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
         bits=18,
         gate=Gate(by=Definition(of="change", sql=COURSE.sql, of_bits=18), low=-2000, peak=3),
     ),
@@ -72,13 +72,14 @@ DEFINITIONS = {
         of="wheel_rl",
         over="mean",
         ticks=2,
-        number=Number(name="yaw_rate_offset", grain=Decimal("0.00000625"), running=EVER),
+        number=ParameterFactor(name="yaw_rate_offset", grain=Decimal("0.00000625"), running=EVER),
     ),
     "radius": Definition(
-        of="ay", number=Number(name="speed_ratio", grain=Decimal("0.0005"), less=2000)
+        of="ay", number=ParameterFactor(name="speed_ratio", grain=Decimal("0.0005"), less=2000)
     ),
     "tyres": Definition(
-        of="ay", number=Number(name="understeer", grain=Decimal("0.00002"), less=-7, alone=True)
+        of="ay",
+        number=ParameterFactor(name="understeer", grain=Decimal("0.00002"), less=-7, alone=True),
     ),
 }
 
@@ -194,7 +195,10 @@ TEXTS = ("a-b", "a.b", "a_b_2", "A_B", "-" * 60, "." * 60)
 def hostile_version() -> ModelVersion:
     plain_model = model_of({"ay": Fraction(1, 3), "of_suv": Fraction(1, 700)}, name=LONGEST)
     signal, suv = plain_model.terms
-    facts = [Definition(of="ax", fact=Fact(name="vehicle_model", equals=text)) for text in TEXTS]
+    facts = [
+        Definition(of="ax", fact=AttributeFactor(name="vehicle_model", equals=text))
+        for text in TEXTS
+    ]
     terms = [
         suv.model_copy(update={"signal": f"f{i}", "column": f"f{i}", "definition": one})
         for i, one in enumerate(facts)

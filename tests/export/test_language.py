@@ -17,18 +17,18 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
 from fleet_slip.catalog.definitions import (
+    AttributeFactor,
     Combination,
     Definition,
     Equation,
-    Fact,
     Gate,
-    Number,
     Over,
+    ParameterFactor,
     Product,
     Slope,
 )
-from fleet_slip.catalog.facts import NumberName
 from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.columns.sql import with_columns
 from fleet_slip.export.compile import (
@@ -50,7 +50,10 @@ from tests.support.catalog import CATALOG
 from tests.support.manifests import manifest
 
 SIGNALS = ("ay", "yaw_rate", "wheel_fl")
-NUMBERS: dict[NumberName, str] = {"yaw_rate_offset": "0.00000625", "speed_ratio": "0.0005"}
+NUMBERS: dict[CalibrationParameterName, str] = {
+    "yaw_rate_offset": "0.00000625",
+    "speed_ratio": "0.0005",
+}
 
 
 def expressions(*, declared: bool) -> st.SearchStrategy[str]:
@@ -95,8 +98,8 @@ def definitions(draw: st.DrawFn) -> Definition:
     update: dict[str, Any] = {}
     if kind == "fact":
         update["fact"] = draw(st.sampled_from([
-            Fact(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
-            Fact(name="vehicle_model", equals="suv"),
+            AttributeFactor(name="mass_kg", less=1320, ratio=Fraction(1, 100)),
+            AttributeFactor(name="vehicle_model", equals="suv"),
         ]))  # fmt: skip
     if kind == "gate":
         low, rises, falls = draw(st.tuples(st.integers(-9000, 9000), *[st.integers(1, 3000)] * 2))
@@ -110,7 +113,7 @@ def definitions(draw: st.DrawFn) -> Definition:
         less = 0 if running_or_none else draw(st.sampled_from([0, 2000]))
         alone = draw(st.booleans())
         grain = Decimal(NUMBERS[name])
-        update["number"] = Number(
+        update["number"] = ParameterFactor(
             name=name, grain=grain, less=less, alone=alone, running=running_or_none
         )
     return found.model_copy(update=update)

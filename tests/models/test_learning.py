@@ -10,7 +10,7 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.definitions import Combination
-from fleet_slip.catalog.lines import FittedLine, whole_line
+from fleet_slip.catalog.first_stage import FirstStageModel, integer_combination
 from fleet_slip.columns.drive_columns import compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, StorageError
@@ -79,7 +79,7 @@ def published(fleet: Fleet) -> ModelVersion:
     return fleet.publish("tiny", fleet.cohort().select(models="outer")).version
 
 
-def the_line(fleet: Fleet) -> FittedLine:
+def the_line(fleet: Fleet) -> FirstStageModel:
     (digest,) = fleet.warehouse.stacked_models.digests()
     line = fleet.warehouse.stacked_models.find(digest)
     assert line is not None
@@ -208,8 +208,9 @@ def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
 
 def test_a_line_whose_estimate_would_not_be_exact_is_refused() -> None:
     column = CATALOG.time_columns["ay_mean_16"].definition
+    scale = CATALOG.input_scales["ay"]
     with pytest.raises(QuestionError, match="exact"):
-        whole_line(CATALOG.input_scales["ay"], [CATALOG.input_scales["ay"] * 2**40], [column])
+        integer_combination(scale, [scale * 2**40], [column])
 
 
 def test_a_root_is_not_asked_for_the_lines_of_another(

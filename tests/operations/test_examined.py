@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalog.facts import TRAINING_DRIVES
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError, RefusedError, UnexaminedError
 from fleet_slip.models import soundness
 from fleet_slip.models.acceptance import load_floor

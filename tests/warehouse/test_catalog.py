@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.catalog.definitions import Combination
-from fleet_slip.catalog.lines import FittedLine
+from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
@@ -118,9 +118,9 @@ def test_a_root_that_is_closed_or_collected_closes_its_connection(warehouse: War
             connection.execute("SELECT 1")
 
 
-def first_stage_model() -> FittedLine:
+def first_stage_model() -> FirstStageModel:
     estimate = next(iter(CATALOG.estimates))
-    return FittedLine(
+    return FirstStageModel(
         estimate=estimate,
         fitted=Combination(),
         folds={},

@@ -11,8 +11,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from fleet_slip.catalog.calibration_parameters import (
+    BY_COURSE,
+    BY_SATELLITE,
+    CALIBRATION_PARAMETERS,
+)
 from fleet_slip.catalog.course import TURNED, turned_scale
-from fleet_slip.catalog.facts import BY_COURSE, BY_SATELLITE, CAR_NUMBERS
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence, calibrate, roads_of
 from fleet_slip.grams.car_estimates import (
@@ -265,7 +269,7 @@ def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
 
 
 def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
-    one = CAR_NUMBERS["speed_ratio"]
+    one = CALIBRATION_PARAMETERS["speed_ratio"]
     grain = Fraction(one.grain)
     assert [one.count(grain * Fraction(n, 2)) for n in (3, -3, 2, 1, -1, 0)] == [2, -2, 1, 1, -1, 0]
     assert one.count(grain * (2**15 - 1)) == 2**15 - 1
@@ -322,7 +326,7 @@ def test_no_gram_rows_tell_nothing() -> None:
         for sums in ({}, {kind: Gram.zero(c) for kind, c in KINDS.items()}):
             told = estimate_numbers(CarTerms(CATALOG), sums, banked)
             assert {*told.values()} == {NO_COURSE, NO_RECEIVER}
-            assert told.keys() == CAR_NUMBERS.keys()
+            assert told.keys() == CALIBRATION_PARAMETERS.keys()
 
 
 def filled(warehouse: Warehouse, *names: str) -> None:
@@ -361,7 +365,7 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
         c: found.cars[c]["ay_offset"].value for c in after.cars
     }
     for numbers in after.cars.values():
-        one, grain = numbers["ay_offset"], float(CAR_NUMBERS["ay_offset"].grain)
+        one, grain = numbers["ay_offset"], float(CALIBRATION_PARAMETERS["ay_offset"].grain)
         assert abs(one.value - one.count * grain) <= grain / 2
 
 

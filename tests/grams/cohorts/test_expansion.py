@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.catalog.facts import CAR_NUMBERS
+from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError
@@ -136,7 +136,7 @@ def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
     assert not rows[3].any()
     usual = CATALOG.time_columns["understeer_ay"].definition.number
     assert usual is not None
-    assert usual.less * float(CAR_NUMBERS["understeer"].grain) == pytest.approx(0.003)
+    assert usual.less * float(CALIBRATION_PARAMETERS["understeer"].grain) == pytest.approx(0.003)
 
 
 def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalog.facts import DELAY
+from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.grams.receiver_delay import (

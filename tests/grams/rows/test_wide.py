@@ -12,7 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalog.definitions import LARGEST_BITS, WEIGHT, Definition, Fact, Gate, limit_of
+from fleet_slip.catalog.definitions import (
+    LARGEST_BITS,
+    WEIGHT,
+    AttributeFactor,
+    Definition,
+    Gate,
+    limit_of,
+)
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
 from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.sql import with_columns
@@ -276,7 +283,7 @@ def test_the_label_is_no_column_to_look_back_on() -> None:
 
 def test_adhesion_is_no_fact() -> None:
     with pytest.raises(ValueError, match="adhesion is not a property of the car"):
-        Fact(name="adhesion")
+        AttributeFactor(name="adhesion")
 
 
 def test_products_of_a_block_are_exact_in_binary64() -> None:

@@ -1,30 +1,30 @@
-"""What a car's own drives tell of it without a label: its numbers, by name.
+"""Calibration parameters: properties of a car that its own drives determine without a label.
 
-Each is a physical value; models and boards use it as an integer count of its grain, rounded to the
-nearest, halves away from zero. A number that 16 bits cannot count is not known.
+Each has a physical value. Models and cars use it as an integer count of its grain. A value beyond
+16 bits is unknown.
 """
 
 from decimal import Decimal
 from fractions import Fraction
-from typing import Final, Literal
+from typing import Literal
 
 from fleet_slip.catalog.arithmetic import nearest
 from fleet_slip.catalog.signals import COUNT_MAX, SIUnit
 from fleet_slip.config import Config
 
 CALIBRATION = "calibration"
-"""The feature set whose Gram rows tell the numbers."""
+"""Feature set whose Gram rows determine the parameters."""
 
 BY_SATELLITE = "calibration_satellite"
-"""The feature set that tells the speed ratio of cars whose receivers log the speed."""
+"""Feature set that determines `speed_ratio` where the receiver logs the speed."""
 
 BY_COURSE = "calibration_course"
-"""The feature set that tells how cars slip whose receivers log the course."""
+"""Feature set that determines the slip parameters where the receiver logs the course."""
 
 DELAY = "delay"
-"""The feature set whose Gram rows tell how late a satellite receiver is."""
+"""Feature set whose Gram rows determine the delay of a satellite receiver."""
 
-NumberName = Literal[
+CalibrationParameterName = Literal[
     "yaw_rate_offset",
     "ay_offset",
     "steering_offset",
@@ -35,13 +35,12 @@ NumberName = Literal[
     "slip_compliance",
 ]
 
-
 ColumnUnit = SIUnit | Literal["1"]
-"""A unit, or none."""
+"""An SI unit, or "1"."""
 
 
-class CarNumber(Config):
-    """One number of a car: its unit, its grain and what it means."""
+class CalibrationParameter(Config):
+    """One calibration parameter: its unit, grain and meaning."""
 
     unit: ColumnUnit
     grain: Decimal
@@ -59,7 +58,7 @@ def round_number(value: Fraction, grain: Fraction) -> int | None:
     return count if abs(count) <= COUNT_MAX else None
 
 
-_NUMBERS: tuple[tuple[NumberName, ColumnUnit, str, str], ...] = (
+_PARAMETERS: tuple[tuple[CalibrationParameterName, ColumnUnit, str, str], ...] = (
     ("yaw_rate_offset", "rad/s", "0.00000625",
      "What the gyroscope says when the car does not turn, by ay over speed"),
     ("ay_offset", "m/s^2", "0.0000625",
@@ -78,32 +77,8 @@ _NUMBERS: tuple[tuple[NumberName, ColumnUnit, str, str], ...] = (
      "Slip that each lateral acceleration adds: the rear tyres and the load"),
 )  # fmt: skip
 
-CAR_NUMBERS: dict[NumberName, CarNumber] = {
-    name: CarNumber(unit=unit, grain=Decimal(grain), description=description)
-    for name, unit, grain, description in _NUMBERS
+CALIBRATION_PARAMETERS: dict[CalibrationParameterName, CalibrationParameter] = {
+    name: CalibrationParameter(unit=unit, grain=Decimal(grain), description=description)
+    for name, unit, grain, description in _PARAMETERS
 }
-"""The numbers, in the order in which they are shown."""
-
-
-# Where a drive comes from, as the column `source` says it, and which drives may train a model.
-
-SCENARIO: Final = "scenario"
-"""Source of the drives that models are evaluated on, and must never be trained on."""
-
-MEASURED: Final = "measured"
-"""Source of the drives that logs of real cars hold."""
-
-RECEIVED: Final = "received"
-"""Source of the drives whose cars sent Gram rows, and no log."""
-
-RECEIVED_FILES: Final = "received/"
-"""What stands before a digest in the column `file` of Gram rows without a log file."""
-
-RECEIVER: Final = "receiver"
-"""The drive column that says of which type a satellite receiver is."""
-
-LONGEST_PAUSE_S: Final = 600
-"""A pause that is longer begins another trip: road, load and warmth of the tyres may be others."""
-
-ALL_DRIVES: Final = "true"
-TRAINING_DRIVES: Final = f"source <> '{SCENARIO}'"
+"""All parameters, in the order of display."""
