@@ -6,15 +6,11 @@ its own coefficients, not its signals fitted anew. It is compared on the same he
 that the error that counts is that of the difference, over what is independent in the data: cars
 where there are several, else drives. And so that many small steps do not lead downhill, the best of
 the champions so far is compared as well.
-
-Rows do not decide alone: a car that sends its rows may say that they are many. Where cars are held
-out, the median group of them must not be worse off either, each group having one vote.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import zip_longest
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +27,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
-from fleet_slip.regression.choice import Shortfall, Worth, compare_paired, compare_typical
+from fleet_slip.regression.choice import Shortfall, Worth, compare_paired
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -92,7 +88,6 @@ class Comparison:
             there if a search found them.
         incumbents: the champion, and the best of the champions so far if that is another one.
         shortfalls: of the challenger, from each of them, over all rows.
-        typical: the same in the median group, where cars are held out.
         unseen: whether all these rows are of drives that made no incumbent.
     """
 
@@ -100,17 +95,15 @@ class Comparison:
     challenger: CrossValidation
     incumbents: tuple[CrossValidation, ...]
     shortfalls: tuple[Shortfall, ...]
-    typical: tuple[Shortfall, ...] = ()
     unseen: bool = False
 
     @property
     def better(self) -> tuple[CrossValidation, ...]:
-        """Those that the challenger is worse than, over all rows or in the median group."""
-        both = zip_longest(self.shortfalls, self.typical)
+        """The incumbents that the challenger is worse than."""
         return tuple(
             incumbent
-            for incumbent, shortfalls in zip(self.incumbents, both, strict=True)
-            if not all(one is None or one.negligible for one in shortfalls)
+            for incumbent, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
+            if not shortfall.negligible
         )
 
     @property
@@ -136,10 +129,7 @@ class Comparison:
         others = "; ".join(
             f"{one.name} as published has {one.pooled.rmse_deg:.4f} deg and "
             f"{one.pooled.correlation:.4f}, difference {shortfall}"
-            + (f", in the median group {typical}" if typical else "")
-            for one, shortfall, typical in zip_longest(
-                self.incumbents, self.shortfalls, self.typical
-            )
+            for one, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
         )
         return (
             f"on the same {number_of(challenger.rows, 'row')} of "
@@ -199,9 +189,7 @@ class Contest:
             as_it_is(self.catalog, *incumbent, tested) for incumbent in self.incumbents.items()
         )
         shortfalls = tuple(compare_paired(challenger, one, self.worth) for one in incumbents)
-        typical = tuple(compare_typical(challenger, one, self.worth) for one in incumbents)
-        by_car = self.by == "vehicle"
-        return Comparison(self.by, challenger, incumbents, shortfalls, typical if by_car else ())
+        return Comparison(self.by, challenger, incumbents, shortfalls)
 
 
 def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:

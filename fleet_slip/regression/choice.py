@@ -6,7 +6,6 @@ A choice flatters its winner, so that it is made again inside every training fol
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -214,22 +213,6 @@ def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth)
     rmse, lacking = _differences(model, other)
     worthless = lacking < worth.squared(other.pooled.rmse)
     return Shortfall(model, rmse, error / both if both else 0.0, lacking, worthless)
-
-
-def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
-    """Return how much larger a model's RMSE is than another's in the median group, a vote each.
-
-    After the median of means (Lugosi and Mendelson 2019); the standard error is that of a median of
-    normals, their deviation from the median absolute one. Raises `ValueError` for other rows.
-    """
-    _common_rows(model, other)
-    differences = [one.rmse - two.rmse for one, two in zip(model.folds, other.folds, strict=True)]
-    middle = median(differences)
-    deviation = 1.4826 * median(abs(one - middle) for one in differences)
-    error = math.sqrt(math.pi / 2 / len(differences)) * deviation
-    square = middle * (2 * other.pooled.rmse + middle)
-    worthless = square < worth.squared(other.pooled.rmse)
-    return Shortfall(model, middle, error, square, worthless)
 
 
 def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:

@@ -14,7 +14,7 @@ from scipy import stats
 
 from fleet_slip.base import hash_fold
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice import Shortfall, Worth, choose, compare_paired, compare_typical
+from fleet_slip.regression.choice import Shortfall, Worth, choose, compare_paired
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -284,33 +284,10 @@ def test_rows_of_a_group_are_not_taken_for_independent() -> None:
     assert compare(again).standard_error == pytest.approx(compare(groups).standard_error)
 
 
-def test_the_error_in_the_median_group_is_the_spread_of_many_repetitions() -> None:
-    rng = np.random.default_rng(5)
-    made = []
-    for _ in range(80):
-        groups = draw(rng, 20)
-        made.append(compare_typical(predict((2, 0), groups), predict((2, 1), groups), Worth(0.0)))
-    spread = np.std([one.rmse for one in made])
-    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.25)
-
-
-def test_groups_that_lie_do_not_decide_whatever_their_rows() -> None:
-    groups = draw(np.random.default_rng(6), 21)
-    for group in groups:
-        group[:, -1] = 2 * group[:, 0] + 10 * group[:, 1]
-    for liar in range(10):
-        groups[liar] = np.concatenate([groups[liar]] * 50)
-        groups[liar][:, -1] = 0
-    wrong, right = predict((0, 0), groups), predict((2, 10), groups)
-    assert compare_paired(wrong, right, Worth(0.0)).negligible
-    assert not compare_typical(wrong, right, Worth(0.0)).negligible
-
-
 def test_the_same_model_falls_short_of_itself_by_nothing() -> None:
     one = predict((1, 1), draw(np.random.default_rng(3), 5))
-    for compared in (compare_paired, compare_typical):
-        shortfall = compared(one, one, Worth(0.0))
-        assert (shortfall.rmse, shortfall.standard_error) == (0.0, 0.0)
+    shortfall = compare_paired(one, one, Worth(0.0))
+    assert (shortfall.rmse, shortfall.standard_error) == (0.0, 0.0)
 
 
 def test_other_rows_cannot_be_paired() -> None:
