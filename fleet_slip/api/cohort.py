@@ -35,6 +35,9 @@ SIGNALS = Doc(
 )
 OF_SIGNALS = Doc("Feature set that `signals` are of. Default: the logged signals.")
 
+WINDOW_ROWS = 4_000_000
+"""Maximum number of log rows whose window columns `select` computes: they take seconds."""
+
 
 class FleetCohort(Rooted):
     """The drives that satisfy an SQL condition on the view `drives`; `Fleet.cohort` makes one.
@@ -55,9 +58,9 @@ class FleetCohort(Rooted):
     def examine(self) -> "Examined":
         """Return the drives that may train a model; raises as `Fleet.quality`.
 
-        Simulated drives are passed over; what was found is kept while the data stay. Gram rows of
-        `signals` that are missing are made. Raises `UnexaminedError` if that takes more than
-        seconds.
+        Simulated drives are passed over; what was found is kept while the data stay. Missing Gram
+        rows of `signals` are computed first, as in `select`. Raises `UnexaminedError` if that takes
+        more than seconds.
         """
         from fleet_slip.operations.examined import Examined, find_trainable
 
@@ -69,12 +72,13 @@ class FleetCohort(Rooted):
     def select(self, request: SelectionRequest) -> "Selection":
         """Compare models by cross-validation and choose one; `Fleet.publish` takes the answer.
 
-        Drives with faulty sensors are left out: see `examine`, and `examined` of the answer. Gram
-        rows that the usual list needs are made, where they are missing and that takes seconds.
+        Drives with faulty sensors are left out: see `examine`, and `examined` of the answer. The
+        comparison only reads. Missing Gram rows that the default list needs are computed first, if
+        that takes seconds: the view `runs` records this as `ensure_grams`, and a remark reports it.
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
-        from fleet_slip.grams.job import update_if_quick
+        from fleet_slip.grams.job import ensure_grams
         from fleet_slip.models.line import with_line_fitted
         from fleet_slip.models.select import SelectionPlan, answer_request
 
@@ -83,7 +87,13 @@ class FleetCohort(Rooted):
             request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
             plan = SelectionPlan.of(self.warehouse.catalog, request)
             if plan.request.models == DEFAULT_MODELS:
-                update_if_quick(self.warehouse, plan.feature_set, examined.cohort)
+                ensure_grams(
+                    self.warehouse,
+                    plan.feature_set,
+                    examined.cohort,
+                    reason=f"model list {DEFAULT_MODELS} needs them",
+                    max_rows=WINDOW_ROWS,
+                )
             found = answer_request(self.warehouse, request, examined.cohort)
         return replace(found, examined=str(examined))
 

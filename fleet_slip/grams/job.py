@@ -5,9 +5,9 @@ interrupted and repeated runs, deletions and compaction.
 """
 
 import json
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 
 import pyarrow as pa
@@ -31,13 +31,13 @@ from fleet_slip.grams.gram_files import (
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.reader import open_grams
+from fleet_slip.grams.reader import cohort_files
 from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.storage.runs import LOGGER
+from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
 from fleet_slip.warehouse.condition import parse_cohort
-from fleet_slip.warehouse.tables import Warehouse, gram_snapshots
+from fleet_slip.warehouse.tables import Warehouse
 
 
 @dataclass(frozen=True)
@@ -90,29 +90,101 @@ def update_grams(
     receivers' delays bring `delay` up to date first, and are computed again where these moved.
     Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
     """
+    *auxiliary, last = _needed_sets(warehouse, feature_set)
+    for name in auxiliary:
+        _update_once(warehouse, progress, name, executor, among)
+    return _update_once(warehouse, progress, last, executor, among)
+
+
+def ensure_grams(
+    warehouse: Warehouse,
+    feature_set: str,
+    cohort: str | None = None,
+    *,
+    reason: str,
+    max_rows: int | None = None,
+) -> GramReport | None:
+    """Compute the Gram rows of a feature set that the log files of a cohort, or all, lack.
+
+    Changes nothing and returns None if no Gram row is missing or outdated, or if more than
+    `max_rows` rows of logs would be read. Otherwise logs a line with the `reason`, and records a
+    step of the run under way, or a run `ensure_grams`. Raises as `update_grams`.
+    """
+    pending = [_find_work(warehouse, name) for name in _needed_sets(warehouse, feature_set)]
+    missing = {file.path: file.rows for work in pending for file in work.files}
+    files = None
+    if missing and cohort is not None:
+        files = cohort_files(warehouse, parse_cohort(warehouse.catalog.signals, cohort))
+        missing = {path: rows for path, rows in missing.items() if path in files}
+    if not missing or (max_rows is not None and sum(missing.values()) > max_rows):
+        return None
+    LOGGER.info(
+        "computing Gram rows of %s from %s (%s): %s",
+        feature_set,
+        number_of(len(missing), "log file"),
+        number_of(sum(missing.values()), "row"),
+        reason,
+    )
+    arguments = [f"--features={feature_set}", *([f"--cohort={cohort}"] if cohort else [])]
+    with recorded_step(warehouse.root, "ensure_grams", arguments) as figures:
+        report = update_grams(warehouse, feature_set=feature_set, among=files)
+        figures.rows = report.rows_read
+    return report
+
+
+def _needed_sets(warehouse: Warehouse, feature_set: str) -> tuple[str, ...]:
+    """Return a feature set, after the set of receiver delays if it is corrected for them."""
     catalog = warehouse.catalog
     if catalog.feature_set(feature_set).in_time and DELAY in catalog.sets:
-        update_grams(warehouse, progress, DELAY, executor, among)
-    return _update_once(warehouse, progress, feature_set, executor, among)
+        return (DELAY, feature_set)
+    return (feature_set,)
 
 
-ROWS_ON_THE_WAY = 4_000_000
-"""Rows of logs whose columns over time are computed before models are compared: seconds."""
+@dataclass(frozen=True)
+class _Work:
+    """What separates the Gram rows of a feature set from the log files.
+
+    Attributes:
+        grams, logs: the snapshots that were compared.
+        identity: of the feature set.
+        files: log files to read: those without Gram rows, and the outdated ones.
+        outdated: paths of log files whose Gram rows have another course delay than their cars.
+        stale: paths in `grams` that are no active log file.
+        delays: course delay of each car, for feature sets that are corrected for it.
+    """
+
+    grams: Snapshot
+    logs: Snapshot
+    identity: str
+    files: tuple[TableFile, ...]
+    outdated: frozenset[str]
+    stale: frozenset[str]
+    delays: Mapping[str, int] | None
+
+    def __bool__(self) -> bool:
+        return bool(self.files or self.stale)
+
+    def limited_to(self, paths: Collection[str]) -> "_Work":
+        """Return the work without the log files that are not among `paths`."""
+        files = tuple(file for file in self.files if file.path in paths)
+        return replace(self, files=files, outdated=self.outdated & frozenset(paths))
 
 
-def update_if_quick(warehouse: Warehouse, feature_set: str, cohort: str) -> None:
-    """Make the Gram rows of a feature set that a cohort's logs lack, if that takes seconds."""
-    grams, logs = gram_snapshots(warehouse)
-    missing = find_backlog(logs, grams, warehouse.catalog.identity(feature_set)).missing
-    if not missing:
-        return
-    condition = parse_cohort(warehouse.catalog.signals, cohort)
-    with open_grams(warehouse, PLAIN, condition) as opened:
-        files = opened.files(condition)
-    rows = sum(file.rows for file in missing if file.path in files)
-    if 0 < rows <= ROWS_ON_THE_WAY:
-        LOGGER.info("making the Gram rows of %s that are missing", feature_set)
-        update_grams(warehouse, feature_set=feature_set, among=files)
+def _find_work(warehouse: Warehouse, feature_set: str) -> _Work:
+    """Compare the Gram rows of a feature set with the log files; change nothing."""
+    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
+    # Gram rows after this snapshot of them, and a commit on it is a conflict.
+    grams = warehouse.grams.snapshot()
+    logs = warehouse.logs.snapshot()
+    identity = warehouse.catalog.identity(feature_set)
+    backlog = find_backlog(logs, grams, identity)
+    files, delays, outdated = backlog.missing, None, frozenset[str]()
+    if warehouse.catalog.feature_set(feature_set).in_time:
+        active = {file.path: file for file in logs.files}
+        delays = course_delays(warehouse, grams, frozenset(active))
+        outdated = frozenset(files_of_other_delay(grams, identity, delays) & active.keys())
+        files += tuple(active[path] for path in sorted(outdated))
+    return _Work(grams, logs, identity, files, outdated, backlog.stale, delays)
 
 
 def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
@@ -160,45 +232,36 @@ def _update_once(
     executor: Executor | None,
     among: Collection[str] | None,
 ) -> GramReport:
-    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
-    # Gram rows after this snapshot of them, and this job's commit is a conflict.
-    grams = warehouse.grams.snapshot()
-    logs = warehouse.logs.snapshot()
-    identity = warehouse.catalog.identity(feature_set)
-    backlog = find_backlog(logs, grams, identity)
-    missing, stale = backlog.missing, backlog.stale
-    if logs.version is None and stale:
+    work = _find_work(warehouse, feature_set)
+    if work.logs.version is None and work.stale:
         raise StorageError(
             f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
-            f"{number_of(len(stale), 'file')}. Nothing is changed: restore the folder from "
+            f"{number_of(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
             "a backup."
         )
-    late, again = None, frozenset[str]()
-    if warehouse.catalog.feature_set(feature_set).in_time:
-        active = {file.path: file for file in logs.files}
-        late = course_delays(warehouse, grams, frozenset(active))
-        again = frozenset(files_of_other_delay(grams, identity, late) & active.keys())
-        missing += tuple(active[path] for path in sorted(again))
     if among is not None:
-        again &= frozenset(among)
-        missing = tuple(file for file in missing if file.path in among)
-    after, dropped = grams, 0
-    if missing or stale:
-        new_rows = compute_grams(warehouse, missing, progress, feature_set, executor, late)
-        add, replaced, dropped = _write_merged(warehouse, grams, new_rows, stale, identity, again)
-        _land(grams, logs, identity, add, replaced)
+        work = work.limited_to(among)
+    grams, dropped = work.grams, 0
+    if work:
+        new_rows = compute_grams(
+            warehouse, work.files, progress, feature_set, executor, work.delays
+        )
+        add, replaced, dropped = _write_merged(
+            warehouse, work.grams, new_rows, work.stale, work.identity, work.outdated
+        )
+        _land(work.grams, work.logs, work.identity, add, replaced)
         # Who removed a file may have found no Gram row of its drives, and so have changed none; the
         # next attempt drops those that landed.
-        require_active(logs.renewed(), missing)
-        after = warehouse.grams.snapshot()
+        require_active(work.logs.renewed(), work.files)
+        grams = warehouse.grams.snapshot()
     return GramReport(
-        feature_set=identity,
-        files_read=len(missing),
-        rows_read=sum(file.rows for file in missing),
-        files_dropped=len(stale),
-        gram_rows=after.rows,
-        logs_version=logs.version,
-        grams_version=after.version,
+        feature_set=work.identity,
+        files_read=len(work.files),
+        rows_read=sum(file.rows for file in work.files),
+        files_dropped=len(work.stale),
+        gram_rows=grams.rows,
+        logs_version=work.logs.version,
+        grams_version=grams.version,
         received_dropped=dropped,
     )
 

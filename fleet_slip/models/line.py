@@ -13,13 +13,12 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import cohort_files
+from fleet_slip.grams.job import ensure_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.least_squares import LinearModel, fit
-from fleet_slip.warehouse.condition import parse_cohort
+from fleet_slip.storage.runs import recorded_step
 from fleet_slip.warehouse.tables import Warehouse
 
 FOLDS = 8
@@ -59,13 +58,13 @@ def with_line_fitted(
         }
         line = _kept_line(warehouse, about, condition)
         if line is None:
-            line = fit_line(warehouse, about, condition)
-            warehouse.stacked_models.keep(line)
+            with recorded_step(warehouse.root, "fit_first_stage_model", [str(about["models"])]):
+                line = fit_line(warehouse, about, condition)
+                warehouse.stacked_models.keep(line)
         named = f"{named}_{line.digest}"
         request = replace(request, features=named)
     if catalog.first_stage_model(named):
-        files = cohort_files(warehouse, parse_cohort(catalog.signals, condition))
-        update_grams(warehouse, feature_set=named, among=files)
+        ensure_grams(warehouse, named, condition, reason="they contain the first-stage estimate")
     return request
 
 
@@ -93,8 +92,8 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageMo
     """
     catalog = warehouse.catalog
     plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], by="drive"))
-    files = cohort_files(warehouse, parse_cohort(catalog.signals, condition))
-    update_grams(warehouse, feature_set=plan.feature_set, among=files)
+    reason = f"model list {about['models']} fits the first-stage model on them"
+    ensure_grams(warehouse, plan.feature_set, condition, reason=reason)
     cohort = load_cohort(warehouse, condition, plan.feature_set)
     signals, label = plan.choose(cohort).winner.model.signals, catalog.signals.label
     served = cohort.serving(signals)

@@ -23,7 +23,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
 from fleet_slip.grams.gram_files import find_backlog
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.job import ensure_grams
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.operations.peers import thresholds
 from fleet_slip.operations.quality import SensorFault, examine_drives
@@ -56,8 +56,8 @@ PIECE = 100_000
 FEW_FILES = 20
 """Gram files of which each is asked by itself whether it has measured drives: milliseconds."""
 
-READ_ON_THE_WAY = 20_000_000
-"""Rows of logs that are read for their Gram rows before drives are examined: seconds."""
+CHECK_ROWS = 20_000_000
+"""Maximum number of log rows that are reduced to check drives: they take seconds."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,12 @@ class Examined:
         drives: how many were long enough to be examined.
         found: the fault of each faulty drive, by its hash.
         missing: how many measured drives were not, since they have no Gram rows.
-        missing_rows: how many rows of the logs are to be read for these.
-        made: how many drives' Gram rows were made to examine them.
     """
 
     cohort: str
     drives: int = 0
     found: Mapping[str, Fault] = field(default_factory=dict)
     missing: int = 0
-    missing_rows: int = 0
-    made: int = 0
 
     @property
     def faults(self) -> Mapping[str, int]:
@@ -98,9 +94,6 @@ class Examined:
     def __str__(self) -> str:
         """Return what is left out, and what was not examined; nothing if none is faulty."""
         said = []
-        if self.made:
-            drives = number_of(self.made, "measured drive")
-            said.append(f"computed missing Gram rows of {drives} for the sensor check.")
         if self.found:
             out = number_of(len(self.found), "drive")
             said.append(
@@ -171,7 +164,7 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     asked = parse_condition(signals, cohort, row_columns(signals))
     condition = measured if asked.columns - set(drive_columns(signals)) else asked & measured
     grams, logs = gram_snapshots(warehouse)
-    missing, missing_rows = _lacking(warehouse, grams, logs, condition)
+    missing = _count_unreduced(warehouse, grams, logs, condition)
     parts: list[Mapping[str, Any]] = []
     for piece in _pieces(warehouse, condition) if _has_measured(grams) else []:
         about = {"cohort": condition.text, "from": piece.first, "root": warehouse.root.uri}
@@ -191,7 +184,7 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     }
     kept_cohort = without_drives(cohort, NAME, found)
     examined = sum(one["examined"] for one in parts)
-    return Examined(kept_cohort, examined, found, missing, missing_rows)
+    return Examined(kept_cohort, examined, found, missing)
 
 
 def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
@@ -200,15 +193,12 @@ def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
     Raises `UnexaminedError` if that takes more than seconds.
     """
     examined = leave_out_faulty(warehouse, cohort)
-    if not examined.missing:
-        return examined
-    made = examined.missing
-    if examined.missing_rows <= READ_ON_THE_WAY:
-        update_grams(warehouse)
+    if examined.missing:
+        ensure_grams(warehouse, PLAIN, reason="the sensor check needs them", max_rows=CHECK_ROWS)
         examined = leave_out_faulty(warehouse, cohort)
     if examined.missing:
         raise UnexaminedError(f"{examined.lacking}, or use them unchecked: --unexamined")
-    return replace(examined, made=made)
+    return examined
 
 
 def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
@@ -256,13 +246,13 @@ def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
     return pieces
 
 
-def _lacking(
+def _count_unreduced(
     warehouse: Warehouse, grams: Snapshot, logs: Snapshot, condition: Condition
-) -> tuple[int, int]:
-    """Return how many drives of a cohort's logs lack Gram rows, and the rows to read for them."""
+) -> int:
+    """Return the number of a cohort's drives in log files without Gram rows."""
     missing = find_backlog(logs, grams).missing
     if not missing:
-        return 0, 0
+        return 0
     query = f"SELECT count(*) FROM drives WHERE {condition.sql} AND source <> '{RECEIVED}'"
     others = frozenset(f.path for f in logs.files) - frozenset(f.path for f in missing)
     only = [grams, replace(logs, without=others)]
@@ -270,4 +260,4 @@ def _lacking(
         lock(database, [path for one in only for path in one.paths])
         with asking(database, condition):
             [(drives,)] = database.execute(query).fetchall()
-    return int(drives), sum(file.rows for file in missing)
+    return int(drives)

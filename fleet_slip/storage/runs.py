@@ -239,6 +239,14 @@ def step(name: str) -> Iterator[MeasuredStep]:
             run.steps.append(one)
 
 
+@contextlib.contextmanager
+def recorded_step(root: Folder, name: str, arguments: Sequence[str]) -> Iterator[MeasuredStep]:
+    """Time a step of the run under way; without one, record the step as a run of its own."""
+    run = contextlib.nullcontext() if _current.get() else recording(root, name, arguments)
+    with run, step(name) as measured:
+        yield measured
+
+
 def publishable(arguments: Sequence[str]) -> list[str]:
     """Return command line arguments without what the history must not keep.
 
