@@ -19,7 +19,7 @@ from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.vehicle.dynamics import Brakes, derivative
+from fleet_slip.vehicle.dynamics import Wheels, derivative
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
 
@@ -38,7 +38,7 @@ def move(
     x: State,
     slopes: Slopes,
     u: Controls,
-    brakes: Brakes,
+    brakes: Wheels[float],
     c: Constants,
     step_s: float,
     count: int,
@@ -168,7 +168,7 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
             self._state,
             self._slopes,
             Controls(self.trial.steering_at(self._time_s), 0.0),
-            Brakes(*(float(STRONGEST_BRAKE_N * share) for share in self._brakes)),
+            Wheels(*(float(STRONGEST_BRAKE_N * share) for share in self._brakes)),
             self._constants,
             STEP_S,
             round(TICK_S / STEP_S),

@@ -1,7 +1,8 @@
-"""The compiled loop over time and lanes, each of which carries one drive after the other.
+"""The compiled loop over time and lanes; each lane carries one drive after the other.
 
-At every sample the scalar part looks up the road and records; driver and physics are loops over all
-lanes, vector instructions. When a block is full or its drive ends, the caller takes it.
+At every sample a scalar part reads the road and records the truth. Driver and physics are loops
+over all lanes, which compile to vector instructions. The loop returns when a block is full or a
+drive ends.
 """
 
 import math
@@ -24,9 +25,9 @@ from fleet_slip.vehicle.driver import (
 )
 from fleet_slip.vehicle.dynamics import (
     NO_BRAKES,
-    Around,
-    Give,
-    GiveRates,
+    Compliance,
+    ComplianceRates,
+    Environment,
     front_wheels,
     imperfect_derivative,
 )
@@ -37,24 +38,22 @@ from fleet_slip.vehicle.integration import (
     PoseSlopes,
     Slopes,
     advance,
-    advance_give,
+    advance_compliance,
     advance_pose,
     pose_slopes,
 )
-from fleet_slip.vehicle.parameters import Constants, Controls, State, Traits
+from fleet_slip.vehicle.parameters import Constants, Controls, ImperfectionConstants, State
 from fleet_slip.vehicle.tyre import arctan2
 
-# Lanes in memory: what each carries, how a drive enters and leaves it, and the blocks it records.
-#
-# Every quantity is a row of `LANES` numbers in one flat array, at offsets known when compiling:
-# loops over lanes become vector instructions. Blocks are measured from the processor's cache.
+# Lanes in memory. Every quantity is a row of `LANES` numbers in one flat array, at an offset that
+# is constant at compile time, so that loops over lanes become vector instructions.
 
 LANES = 8
-"""Lanes of the kernel: one or two of a processor's vectors."""
+"""Lanes of the kernel: one or two vectors of a processor."""
 
 
 def _address(context: Any, builder: Any, array_type: Any, args: Any, index: int) -> Any:
-    """Emit the address of the `index`-th row after a first row, at a lane."""
+    """Emit the address of a lane in the `index`-th row after a first row."""
     memory, first_row, lane = args[:3]
     integer = first_row.type
     row = builder.add(first_row, ir.Constant(integer, index))
@@ -93,7 +92,7 @@ def _write(_typing_context: Any, memory: Any, _first_row: Any, _lane: Any, value
 
 
 read: Callable[..., Any] = _read
-"""Return one lane of successive rows as a named tuple: `read(memory, ROW, lane, State)`."""
+"""Read one lane of successive rows as a named tuple: `read(memory, ROW, lane, State)`."""
 
 write: Callable[..., None] = _write
 """Write a tuple of floats to one lane of successive rows: `write(memory, ROW, lane, values)`."""
@@ -102,33 +101,32 @@ write: Callable[..., None] = _write
 ROUTE = np.dtype(
     [
         ("first", np.int64),  # index of the road's first entry in the table of all roads
-        ("last", np.int64),
+        ("last", np.int64),  # index of its last entry
         ("inverse_spacing", np.float64),
         ("length_m", np.float64),
         ("closed", np.bool_),
         ("distance_m", np.float64),
-        ("samples", np.int64),  # most that the drive may take
+        ("samples", np.int64),  # limit of the number of samples
     ]
 )
 
 
 @equation
-def place(route: Any, station: float) -> tuple[int, float]:
-    """Return the entry at or before a station, and how far the next is; closed roads go on."""
+def locate(route: Any, station: float) -> tuple[int, float]:
+    """Return the entry at or before a station, and the fraction of the interval behind it."""
     entries = station * route.inverse_spacing
     entry = min(max(math.floor(entries), 0), route.last - route.first - 1)
     return route.first + entry, min(max(entries - entry, 0.0), 1.0)
 
 
-NOBODY = -1
-"""Drive of a lane that has none, and tick of a loss that has not happened."""
+ABSENT = -1
+"""Drive of a vacant lane, and tick of a loss that has not happened."""
 
 DRIVE, TICK, LAP, FIRST = range(4)
-"""Rows of the book of lanes: which drive a lane carries, its next sample, its lap, and the tick of
-the first sample of its block."""
+"""Rows of the lane table: drive, tick of the next sample, lap, and first tick of the block."""
 
 STATE = 0
-"""First row of a named tuple in the memory; the next follow."""
+"""First row of the state in memory. The constants below are the first rows of other tuples."""
 SLOPES = STATE + len(State._fields)
 POSE = SLOPES + len(Slopes._fields)
 POSE_SLOPES = POSE + len(Pose._fields)
@@ -137,43 +135,50 @@ PATH = CONTROLS + len(Controls._fields)
 FORCE = PATH + len(Path._fields)
 """Specific force ax, ay at the sample."""
 ANGLES = FORCE + 2
-"""Angles of the front wheels, and the side-slip angle, at the sample."""
+"""Angles of the front wheels, and side-slip angle, at the sample."""
 ORDER = ANGLES + 3
-"""Extrapolation of the integration: 0 in a drive's first step."""
+"""Order of the integration: `FIRST_ORDER` in a drive's first step."""
 CAR = ORDER + 1
 HANDLING = CAR + len(Constants._fields)
-TRAITS = HANDLING + len(Handling._fields)
-AROUND = TRAITS + len(Traits._fields)
-GIVE = AROUND + len(Around._fields)
-GIVE_SLOPES = GIVE + len(Give._fields)
-ROWS = GIVE_SLOPES + len(GiveRates._fields)
+IMPERFECTION_CONSTANTS = HANDLING + len(Handling._fields)
+ENVIRONMENT = IMPERFECTION_CONSTANTS + len(ImperfectionConstants._fields)
+COMPLIANCE = ENVIRONMENT + len(Environment._fields)
+COMPLIANCE_RATES = COMPLIANCE + len(Compliance._fields)
+ROWS = COMPLIANCE_RATES + len(ComplianceRates._fields)
 
 INVERSE_RADIUS = Constants._fields.index("inverse_radius")
 
 
 def empty_lanes() -> tuple[FloatArray, IntArray]:
-    """Return the memory and the book of lanes without a drive: cars at rest."""
-    return np.zeros(ROWS * LANES), np.full((4, LANES), NOBODY)
+    """Return the memory and the lane table of vacant lanes: cars at rest."""
+    return np.zeros(ROWS * LANES), np.full((4, LANES), ABSENT)
 
 
-def begin(
-    memory: FloatArray, book: IntArray, lane: int, drive: int, car: FloatArray, speed_mps: float
+def start_drive(
+    memory: FloatArray,
+    lane_table: IntArray,
+    lane: int,
+    drive: int,
+    car: FloatArray,
+    speed_mps: float,
 ) -> None:
-    """Put a drive on a lane: rolling straight along the line at a speed, on cold tyres."""
-    book[:, lane] = drive, 0, 0, 0
+    """Start a drive on a lane: the car rolls straight along the line, on cold tyres."""
+    lane_table[:, lane] = drive, 0, 0, 0
     spin = speed_mps * car[INVERSE_RADIUS]
     column = memory.reshape(ROWS, LANES)[:, lane]
     column[:] = 0.0
     column[CAR : CAR + len(car)] = car
     column[STATE : STATE + len(State._fields)] = State(speed_mps, *6 * (0.0,), *4 * (spin,))
     column[POSE : POSE + len(Pose._fields)] = Pose(0.0, 0.0, 1.0, 0.0)
-    cold = column[TRAITS + Traits._fields.index("cold_stiffness")]
-    column[AROUND : AROUND + len(Around._fields)] = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0 + cold)
+    cold = column[IMPERFECTION_CONSTANTS + ImperfectionConstants._fields.index("cold_stiffness")]
+    column[ENVIRONMENT : ENVIRONMENT + len(Environment._fields)] = Environment(
+        0.0, 0.0, 1.0, 1.0, 0.0, 1.0 + cold
+    )
 
 
-def clear(memory: FloatArray, book: IntArray, lane: int) -> None:
-    """Let nothing stand on a lane: a car at rest."""
-    book[DRIVE, lane] = NOBODY
+def vacate(memory: FloatArray, lane_table: IntArray, lane: int) -> None:
+    """Remove the drive of a lane; a car at rest remains."""
+    lane_table[DRIVE, lane] = ABSENT
     memory.reshape(ROWS, LANES)[:, lane] = 0.0
 
 
@@ -197,77 +202,77 @@ CHANNELS = (
     "leaning_ax_mps2",
     "leaning_ay_mps2",
 )
-"""What a lane records; the last three for sensors: how the body begins to turn, and the
-accelerations as its pitch and roll have followed them."""
+"""Channels that a lane records. Sensors need the last three: the yaw acceleration, and the
+accelerations behind the lags of pitch and roll."""
 
 BLOCK = 2**16
-"""Samples of a block: 11 minutes of a drive."""
+"""Samples of a block: 11 minutes of a drive. Its channels fit into the processor's cache."""
 
 STRIDE = BLOCK + 8
-"""Distance between two channels of a block: with a power of two all channels would share the same
-few lines of the processor's cache."""
+"""Distance between two channels of a block. With a power of two, all channels would compete for
+the same lines of the processor's cache."""
 
 
 def empty_blocks() -> tuple[FloatArray, FloatArray]:
-    """Return memory for the blocks of all lanes, flat, and in its shape (lane, channel, sample)."""
+    """Return memory for the blocks of all lanes, flat and in shape (lane, channel, sample)."""
     memory = np.empty(LANES * len(CHANNELS) * STRIDE)
     return memory, memory.reshape(LANES, len(CHANNELS), STRIDE)
 
 
 @equation
-def at(lane: int, channel: int, sample: int) -> int:
-    """Return where a sample of a channel stands in the blocks."""
+def block_index(lane: int, channel: int, sample: int) -> int:
+    """Return the index of a sample of a channel in the blocks."""
     return (lane * len(CHANNELS) + channel) * STRIDE + sample
 
 
-AFTER_LOSS = 500
-"""Samples that a drive goes on after the driver lost the car: 5 s."""
+SAMPLES_AFTER_LOSS = 500
+"""Samples of a drive after the driver lost the car: 5 s."""
 LOST_OFFSET_M = 10.0
 LOST_SLIP_TANGENT = math.sqrt(3.0)
-"""Side-slip of 60°."""
+"""Tangent of a side-slip angle of 60°."""
 LOST_SPEED_MPS = 0.5
 
 CURVATURE, SPEED, ACCELERATION = range(3)
 """Columns of the table of all roads: curvature, target speed, target acceleration."""
 
 SAMPLES, LOST = range(2)
-"""Columns of the result: number of samples of a drive, and the tick of its loss or `NOBODY`."""
+"""Columns of the results: number of samples of a drive, and the tick of its loss or `ABSENT`."""
 
 
 @equation
-def _look_up(
-    roads: Any, route: Any, x: State, station: float, here: int, share: float, lost: bool
+def _preview(
+    roads: Any, route: Any, x: State, station: float, entry: int, fraction: float, lost: bool
 ) -> Path:
-    """Return what the driver sees of the road from a station, `share` of the way after `here`."""
-    curvature = roads[here, CURVATURE]
-    change = roads[here + 1, CURVATURE] - curvature
-    ahead, part = place(route, station + STEERING_PREVIEW_S * x.vx)
-    soon, bit = place(route, station + SPEED_PREVIEW_S * x.vx)
+    """Return the road as the driver sees it from a station, `fraction` of an interval on."""
+    curvature = roads[entry, CURVATURE]
+    change = roads[entry + 1, CURVATURE] - curvature
+    i, p = locate(route, station + STEERING_PREVIEW_S * x.vx)
+    j, q = locate(route, station + SPEED_PREVIEW_S * x.vx)
     return Path(
         station,
-        curvature + share * change,
+        curvature + fraction * change,
         change * route.inverse_spacing,
-        (1.0 - part) * roads[ahead, CURVATURE] + part * roads[ahead + 1, CURVATURE],
-        (1.0 - bit) * roads[soon, SPEED] + bit * roads[soon + 1, SPEED],
-        (1.0 - bit) * roads[soon, ACCELERATION] + bit * roads[soon + 1, ACCELERATION],
+        (1.0 - p) * roads[i, CURVATURE] + p * roads[i + 1, CURVATURE],
+        (1.0 - q) * roads[j, SPEED] + q * roads[j + 1, SPEED],
+        (1.0 - q) * roads[j, ACCELERATION] + q * roads[j + 1, ACCELERATION],
         1.0 if lost else 0.0,
     )
 
 
 @equation
-def _look_around(memory: Any, lane: int, surfaces: Any, here: int, share: float) -> None:
-    """Look up road and air where a car is, and warm its tyres."""
+def _update_environment(memory: Any, lane: int, surfaces: Any, entry: int, fraction: float) -> None:
+    """Read road and air at the car, and warm its tyres."""
     for column in range(5):
-        before, after = surfaces[here, column], surfaces[here + 1, column]
-        memory[(AROUND + column) * LANES + lane] = before + share * (after - before)
-    cooling = read(memory, TRAITS, lane, Traits).cooling
-    stiffness = (AROUND + 5) * LANES + lane
+        before, after = surfaces[entry, column], surfaces[entry + 1, column]
+        memory[(ENVIRONMENT + column) * LANES + lane] = before + fraction * (after - before)
+    cooling = read(memory, IMPERFECTION_CONSTANTS, lane, ImperfectionConstants).cooling
+    stiffness = (ENVIRONMENT + 5) * LANES + lane
     memory[stiffness] = 1.0 + (memory[stiffness] - 1.0) * cooling
 
 
 @equation
 def _has_lost(x: State, pose: Pose) -> bool:
-    """Whether the car has left the road, spun or stopped."""
+    """Return True if the car has left the road, spun or stopped."""
     return (
         abs(pose.offset) > LOST_OFFSET_M
         or abs(x.vy) > LOST_SLIP_TANGENT * x.vx
@@ -276,111 +281,115 @@ def _has_lost(x: State, pose: Pose) -> bool:
 
 
 @equation
-def _look(
-    memory: Any, book: Any, routes: Any, roads: Any, surfaces: Any, truth: Any, ended: Any
+def _record(
+    memory: Any, lane_table: Any, routes: Any, roads: Any, surfaces: Any, truth: Any, results: Any
 ) -> None:
-    """Record where all cars are, but for what the next step gives, and look up their roads."""
+    """Record the state of all cars and read their roads; `_finish_sample` records the forces."""
     for lane in range(LANES):
-        drive, tick = book[DRIVE, lane], book[TICK, lane]
-        if drive != NOBODY:
+        drive, tick = lane_table[DRIVE, lane], lane_table[TICK, lane]
+        if drive != ABSENT:
             x = read(memory, STATE, lane, State)
             pose = read(memory, POSE, lane, Pose)
-            if ended[drive, LOST] == NOBODY and _has_lost(x, pose):
-                ended[drive, LOST] = tick
-            sample = tick - book[FIRST, lane]
-            truth[at(lane, 2, sample)] = x.yaw_rate
-            truth[at(lane, 3, sample)] = x.steering_wheel
-            truth[at(lane, 4, sample)] = x.wheel_fl
-            truth[at(lane, 5, sample)] = x.wheel_fr
-            truth[at(lane, 6, sample)] = x.wheel_rl
-            truth[at(lane, 7, sample)] = x.wheel_rr
-            truth[at(lane, 11, sample)] = x.vx
-            truth[at(lane, 12, sample)] = x.vy
-            truth[at(lane, 13, sample)] = pose.station
-            truth[at(lane, 14, sample)] = pose.offset
-            truth[at(lane, 15, sample)] = read(memory, SLOPES, lane, Slopes).yaw_rate
-            truth[at(lane, 16, sample)] = x.ax_lag
-            truth[at(lane, 17, sample)] = x.ay_lag
-            route, lost = routes[drive], ended[drive, LOST] != NOBODY
-            here, share = place(route, pose.station)
-            path = _look_up(roads, route, x, pose.station, here, share, lost)
+            if results[drive, LOST] == ABSENT and _has_lost(x, pose):
+                results[drive, LOST] = tick
+            sample = tick - lane_table[FIRST, lane]
+            truth[block_index(lane, 2, sample)] = x.yaw_rate
+            truth[block_index(lane, 3, sample)] = x.steering_wheel
+            truth[block_index(lane, 4, sample)] = x.wheel_fl
+            truth[block_index(lane, 5, sample)] = x.wheel_fr
+            truth[block_index(lane, 6, sample)] = x.wheel_rl
+            truth[block_index(lane, 7, sample)] = x.wheel_rr
+            truth[block_index(lane, 11, sample)] = x.vx
+            truth[block_index(lane, 12, sample)] = x.vy
+            truth[block_index(lane, 13, sample)] = pose.station
+            truth[block_index(lane, 14, sample)] = pose.offset
+            truth[block_index(lane, 15, sample)] = read(memory, SLOPES, lane, Slopes).yaw_rate
+            truth[block_index(lane, 16, sample)] = x.ax_lag
+            truth[block_index(lane, 17, sample)] = x.ay_lag
+            route, lost = routes[drive], results[drive, LOST] != ABSENT
+            entry, fraction = locate(route, pose.station)
+            path = _preview(roads, route, x, pose.station, entry, fraction, lost)
             write(memory, PATH, lane, path)
-            _look_around(memory, lane, surfaces, here, share)
+            _update_environment(memory, lane, surfaces, entry, fraction)
 
 
 @equation
-def decide_all(memory: Any) -> None:
-    """Let all drivers decide, and note the angles at the sample."""
+def decide_lanes(memory: Any) -> None:
+    """Compute the demands of all drivers, and the angles at the sample."""
     for lane in range(LANES):
         x = read(memory, STATE, lane, State)
         pose = read(memory, POSE, lane, Pose)
         path = read(memory, PATH, lane, Path)
-        before = read(memory, CONTROLS, lane, Controls)
+        previous = read(memory, CONTROLS, lane, Controls)
         h = read(memory, HANDLING, lane, Handling)
         c = read(memory, CAR, lane, Constants)
-        t = read(memory, TRAITS, lane, Traits)
-        give = read(memory, GIVE, lane, Give)
-        (along_l, across_l), (along_r, across_r) = front_wheels(give, c, t)
+        t = read(memory, IMPERFECTION_CONSTANTS, lane, ImperfectionConstants)
+        compliance = read(memory, COMPLIANCE, lane, Compliance)
+        (along_l, across_l), (along_r, across_r) = front_wheels(compliance, c, t)
         angles = arctan2(across_l, along_l), arctan2(across_r, along_r), arctan2(x.vy, x.vx)
         write(memory, ANGLES, lane, angles)
-        write(memory, CONTROLS, lane, decide(x, pose, path, before, h, c))
+        write(memory, CONTROLS, lane, decide(x, pose, path, previous, h, c))
 
 
 @equation
-def integrate(memory: Any, step_s: float, first_step: bool) -> None:
-    """Move all cars on; keep the specific force at the first step of a sample."""
+def integrate_lanes(memory: Any, step_s: float, first_step: bool) -> None:
+    """Advance all cars by one step; keep the specific force of a sample's first step."""
     for lane in range(LANES):
         x = read(memory, STATE, lane, State)
         u = read(memory, CONTROLS, lane, Controls)
         c = read(memory, CAR, lane, Constants)
-        t = read(memory, TRAITS, lane, Traits)
+        t = read(memory, IMPERFECTION_CONSTANTS, lane, ImperfectionConstants)
         pose = read(memory, POSE, lane, Pose)
         path = read(memory, PATH, lane, Path)
-        around = read(memory, AROUND, lane, Around)
-        give = read(memory, GIVE, lane, Give)
+        environment = read(memory, ENVIRONMENT, lane, Environment)
+        compliance = read(memory, COMPLIANCE, lane, Compliance)
         order = memory[ORDER * LANES + lane]
-        d, rates = imperfect_derivative(x, u, give, around, NO_BRAKES, c, t)
+        d, rates = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
         after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
-        before = read(memory, GIVE_SLOPES, lane, GiveRates)
-        given = advance_give(give, rates, before, after.steering_wheel, t, step_s, order)
-        pose_before = read(memory, POSE_SLOPES, lane, PoseSlopes)
+        previous = read(memory, COMPLIANCE_RATES, lane, ComplianceRates)
+        yielded = advance_compliance(
+            compliance, rates, previous, after.steering_wheel, t, step_s, order
+        )
+        previous_travel = read(memory, POSE_SLOPES, lane, PoseSlopes)
         travel = pose_slopes(x, pose, path)
         ax = d.ax if first_step else memory[FORCE * LANES + lane]
         ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
         write(memory, STATE, lane, after)
         write(memory, SLOPES, lane, slopes)
-        write(memory, GIVE, lane, given)
-        write(memory, GIVE_SLOPES, lane, rates)
-        write(memory, POSE, lane, advance_pose(pose, travel, pose_before, step_s, order))
+        write(memory, COMPLIANCE, lane, yielded)
+        write(memory, COMPLIANCE_RATES, lane, rates)
+        write(memory, POSE, lane, advance_pose(pose, travel, previous_travel, step_s, order))
         write(memory, POSE_SLOPES, lane, travel)
         write(memory, FORCE, lane, (ax, ay))
         memory[ORDER * LANES + lane] = SECOND_ORDER
 
 
 @equation
-def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int:
-    """Count the sample and the laps of all cars; return how many blocks are complete."""
+def _finish_sample(memory: Any, lane_table: Any, routes: Any, truth: Any, results: Any) -> int:
+    """Record forces and angles, count samples and laps; return the number of complete blocks."""
     complete = 0
     for lane in range(LANES):
-        drive, tick = book[DRIVE, lane], book[TICK, lane]
-        if drive != NOBODY:
+        drive, tick = lane_table[DRIVE, lane], lane_table[TICK, lane]
+        if drive != ABSENT:
             route = routes[drive]
-            sample = tick - book[FIRST, lane]
-            truth[at(lane, 0, sample)] = memory[FORCE * LANES + lane]
-            truth[at(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
+            sample = tick - lane_table[FIRST, lane]
+            truth[block_index(lane, 0, sample)] = memory[FORCE * LANES + lane]
+            truth[block_index(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
             for angle in range(3):
-                truth[at(lane, 8 + angle, sample)] = memory[(ANGLES + angle) * LANES + lane]
+                truth[block_index(lane, 8 + angle, sample)] = memory[
+                    (ANGLES + angle) * LANES + lane
+                ]
             station = memory[POSE * LANES + lane]
-            gone = book[LAP, lane] * route.length_m + station
+            distance_m = lane_table[LAP, lane] * route.length_m + station
             if route.closed:
                 lap = 1 if station >= route.length_m else -1 if station < 0.0 else 0
-                book[LAP, lane] += lap
+                lane_table[LAP, lane] += lap
                 memory[POSE * LANES + lane] = station - lap * route.length_m
-            book[TICK, lane] = tick + 1
-            lost = ended[drive, LOST]
-            given_up = lost != NOBODY and tick >= lost + AFTER_LOSS
-            if given_up or gone >= route.distance_m or tick + 1 == route.samples:
-                ended[drive, SAMPLES] = tick + 1
+            lane_table[TICK, lane] = tick + 1
+            lost = results[drive, LOST]
+            given_up = lost != ABSENT and tick >= lost + SAMPLES_AFTER_LOSS
+            if given_up or distance_m >= route.distance_m or tick + 1 == route.samples:
+                results[drive, SAMPLES] = tick + 1
                 complete += 1
             elif sample + 1 == BLOCK:
                 complete += 1
@@ -388,25 +397,41 @@ def _move_on(memory: Any, book: Any, routes: Any, truth: Any, ended: Any) -> int
 
 
 @kernel
-def simulate(
+def simulate_lanes(
     routes: Any,
     roads: Any,
     surfaces: Any,
     steps: int,
     memory: Any,
-    book: Any,
+    lane_table: Any,
     truth: Any,
-    ended: Any,
+    results: Any,
 ) -> None:
-    """Drive on, from sample to sample, until a lane's block is complete; some lane has a drive.
+    """Simulate sample by sample until the block of a lane is complete.
 
-    `routes` (`ROUTE`) point into `roads` and `surfaces`; a sample takes `steps` steps; `truth` is
-    of `empty_blocks`; `ended` gets each drive's number of samples and tick of loss.
+    At least one lane must carry a drive.
+
+    Parameters
+    ----------
+    routes
+        One `ROUTE` for each drive: its rows in `roads` and `surfaces`, and its limits.
+    roads
+        Curvature, target speed and target acceleration, shape (entries, 3).
+    surfaces
+        Fields of `Surface`, shape (entries, 5).
+    steps
+        Integration steps for each sample.
+    memory, lane_table
+        Lanes, as `empty_lanes` returns them; updated.
+    truth
+        Blocks, as `empty_blocks` returns them; written.
+    results
+        Number of samples and tick of the loss of each drive, shape (drives, 2); written.
     """
     complete = 0
     while complete == 0:
-        _look(memory, book, routes, roads, surfaces, truth, ended)
-        decide_all(memory)
+        _record(memory, lane_table, routes, roads, surfaces, truth, results)
+        decide_lanes(memory)
         for step in range(steps):
-            integrate(memory, SAMPLE_S / steps, step == 0)
-        complete = _move_on(memory, book, routes, truth, ended)
+            integrate_lanes(memory, SAMPLE_S / steps, step == 0)
+        complete = _finish_sample(memory, lane_table, routes, truth, results)

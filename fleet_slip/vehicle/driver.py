@@ -1,8 +1,13 @@
 """The driver: follows a line by preview and feedback, and a speed profile by feed-forward.
 
-Steering is a demand for curvature, as in pure pursuit (Coulter 1992), with the road's own fed
-forward, turned into an angle by the car's handling on a dry road (Kapania and Gerdes 2015, "Design
-of a feedback-feedforward steering controller ..."): on a slippery one he is wrong.
+Steering is a demand for curvature, as in pure pursuit, with the curvature of the road fed forward.
+The car's handling on a dry road turns it into an angle; on a slippery road the driver is wrong.
+
+References
+----------
+R. C. Coulter, "Implementation of the pure pursuit path tracking algorithm" (1992).
+N. R. Kapania, J. C. Gerdes, "Design of a feedback-feedforward steering controller for accurate path
+tracking and stability at the limits of handling" (2015).
 """
 
 import math
@@ -21,48 +26,61 @@ from fleet_slip.vehicle.parameters import (
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
 SAMPLE_S = 0.01
-"""Time between two decisions of the driver, and between two samples."""
+"""Time between two decisions of the driver, and between two samples, in s."""
 
 STEERING_PREVIEW_S = 0.15
-"""How far ahead the curvature is taken: what steering and yaw take to follow."""
+"""Preview of the curvature, in s: the response time of steering and yaw."""
 
 SPEED_PREVIEW_S = 0.1
-"""How far ahead the target speed is taken: the drivetrain's lag."""
+"""Preview of the target speed, in s: the lag of the drivetrain."""
 
 PURSUIT_TIME_S = 0.55
-"""An offset from the line is steered away towards a point so far ahead."""
+"""Time ahead of the point that an offset is steered towards, in s."""
 
-SHORTEST_PURSUIT_M = 6.0
-LARGEST_CURVATURE_1PM = 0.15
-STEERING_RATE_RAD_S = 12.0
-"""Fastest turn of the steering wheel: what test drivers reach."""
+MIN_PURSUIT_M = 6.0
+MAX_CURVATURE_1PM = 0.15
+MAX_STEERING_RATE_RAD_S = 12.0
+"""Fastest turn of the steering wheel, in rad/s: the rate that test drivers reach."""
 
 SPEED_GAIN_1PS = 1.2
-STRONGEST_DRIVE_MPS2 = 6.0
-STRONGEST_BRAKE_MPS2 = 10.0
+MAX_DRIVE_MPS2 = 6.0
+MAX_BRAKE_MPS2 = 10.0
 LOST_BRAKE_MPS2 = 5.0
-"""Braking of a driver who has lost the car."""
+"""Braking of a driver who has lost the car, in m/s²."""
 
-LARGEST_GRIP_USE = 0.9
-"""Share of the friction beyond which the handling curve is not followed further."""
+MAX_GRIP_USE = 0.9
+"""Share of the friction at which the handling curve ends: it is steep beyond."""
 
 
 class Handling(NamedTuple):
-    """What the driver knows of his car on a dry road."""
+    """Handling of the car on a dry road, as the driver assumes it."""
 
     wheelbase: float
     rear: float
     understeer: float
-    """Understeer gradient: further steering per lateral acceleration, in rad s²/m."""
+    """Understeer gradient: steering angle per lateral acceleration, in rad s²/m."""
     rear_slip: float
     """Slip angle of the rear axle per lateral acceleration, in rad s²/m."""
     inverse_grip: float
-    """One over the lateral acceleration at the limit."""
+    """Inverse of the lateral acceleration at the limit, in s²/m."""
     steering_ratio: float
 
 
 def handling(vehicle: VehicleParameters, compliance_rad_per_n: float = 0.0) -> Handling:
-    """Return the linear handling on a dry road; `compliance_rad_per_n` is of the front wheels."""
+    """Compute the linear handling of a car on a dry road.
+
+    Parameters
+    ----------
+    vehicle
+        The car.
+    compliance_rad_per_n
+        Angle that the front wheels yield per lateral force of their axle, in rad/N.
+
+    Returns
+    -------
+    Handling
+        Understeer gradient and related constants.
+    """
     c = constants(vehicle, adhesion=1.0)
     front = c.static_front / cornering_stiffness(c.static_front, c.stiffness_front, c)
     rear = c.static_rear / cornering_stiffness(c.static_rear, c.stiffness_rear, c)
@@ -78,52 +96,81 @@ def handling(vehicle: VehicleParameters, compliance_rad_per_n: float = 0.0) -> H
 
 @equation
 def clip(value: float, limit: float) -> float:
-    """Return the value within ±limit."""
+    """Limit a value to ±limit."""
     return min(max(value, -limit), limit)
 
 
 @equation
 def slip_growth(ax: float, ay: float, h: Handling) -> float:
-    """Return how much more a brush tyre slips than a linear one, at an acceleration.
+    """Compute the slip of a brush tyre over that of a linear tyre, at an acceleration.
 
-    With the share f of friction in use, 3 (1 − ∛(1 − f)) / f; 3 / (3 − f) has its slope, no root.
+    With the share f of friction in use it is 3 (1 − ∛(1 − f)) / f. The approximation 3 / (3 − f)
+    has the same slope at 0 and needs no root.
+
+    Parameters
+    ----------
+    ax, ay
+        Accelerations of the car, in m/s².
+    h
+        Handling of the car.
     """
-    use = min(math.sqrt(ax * ax + ay * ay) * h.inverse_grip, LARGEST_GRIP_USE)
+    use = min(math.sqrt(ax * ax + ay * ay) * h.inverse_grip, MAX_GRIP_USE)
     return 3.0 / (3.0 - use)
 
 
 @equation
-def wanted_steering(x: State, pose: Pose, path: Path, h: Handling) -> float:
-    """Return the steering wheel angle back to the line, headed as a slipping rear axle asks."""
+def demanded_steering(x: State, pose: Pose, path: Path, h: Handling) -> float:
+    """Compute the steering wheel angle that leads back to the line, in rad.
+
+    The heading that the driver aims for includes the slip of the rear axle in the bend.
+    """
     v2 = x.vx * x.vx
     ay = path.curvature * v2
     steady_slip = h.rear * path.curvature - h.rear_slip * ay * slip_growth(x.traction, ay, h)
-    distance = max(PURSUIT_TIME_S * abs(x.vx), SHORTEST_PURSUIT_M)
+    distance = max(PURSUIT_TIME_S * abs(x.vx), MIN_PURSUIT_M)
     miss = pose.offset + distance * (pose.sine + steady_slip * pose.cosine)
     curvature = path.curvature_ahead - 2.0 * miss / (distance * distance)
-    curvature = clip(curvature, LARGEST_CURVATURE_1PM)
-    ay = clip(curvature * v2, LARGEST_GRIP_USE / h.inverse_grip)
+    curvature = clip(curvature, MAX_CURVATURE_1PM)
+    ay = clip(curvature * v2, MAX_GRIP_USE / h.inverse_grip)
     tangent = h.wheelbase * curvature + h.understeer * ay * slip_growth(x.traction, ay, h)
     return h.steering_ratio * tangent
 
 
 @equation
-def wanted_traction(x: State, path: Path, c: Constants) -> float:
-    """Return the tractive force per mass that keeps to the speed profile against resistance."""
+def demanded_traction(x: State, path: Path, c: Constants) -> float:
+    """Compute the tractive force per mass that follows the speed profile, in m/s²."""
     resistance = c.drag_per_mass * x.vx * x.vx + c.rolling_resistance * GRAVITY_MPS2
-    wanted = path.target_acceleration + SPEED_GAIN_1PS * (path.target_speed - x.vx) + resistance
-    wanted = min(max(wanted, -STRONGEST_BRAKE_MPS2), STRONGEST_DRIVE_MPS2)
-    return -LOST_BRAKE_MPS2 if path.lost > 0.0 else wanted
+    demand = path.target_acceleration + SPEED_GAIN_1PS * (path.target_speed - x.vx) + resistance
+    demand = min(max(demand, -MAX_BRAKE_MPS2), MAX_DRIVE_MPS2)
+    return -LOST_BRAKE_MPS2 if path.lost > 0.0 else demand
 
 
 @equation
 def decide(
-    x: State, pose: Pose, path: Path, before: Controls, h: Handling, c: Constants
+    x: State, pose: Pose, path: Path, previous: Controls, h: Handling, c: Constants
 ) -> Controls:
-    """Return the driver's demands for the next sample time."""
+    """Compute the driver's demands for the next sample time.
+
+    Parameters
+    ----------
+    x, pose
+        State of the car, and its position on the road.
+    path
+        The road as the driver sees it.
+    previous
+        Demands at the previous sample.
+    h, c
+        Handling and constants of the car.
+
+    Returns
+    -------
+    Controls
+        Steering wheel angle in rad, and traction in m/s².
+    """
     turn = clip(
-        wanted_steering(x, pose, path, h) - before.steering_wheel, STEERING_RATE_RAD_S * SAMPLE_S
+        demanded_steering(x, pose, path, h) - previous.steering_wheel,
+        MAX_STEERING_RATE_RAD_S * SAMPLE_S,
     )
     return Controls(
-        clip(before.steering_wheel + turn, c.steering_limit), wanted_traction(x, path, c)
+        clip(previous.steering_wheel + turn, c.steering_limit), demanded_traction(x, path, c)
     )

@@ -1,120 +1,102 @@
-"""Equations of motion of a car with four wheels, on a road that need not be flat, even and calm.
+"""Equations of motion of a planar car on four wheels.
 
-Steering may give way, wheels differ and tyres lag; weight and wind act along the road. Symbols,
-sources and limits: `docs/vehicle.md`; of what a real car has beyond the textbook's,
-`docs/simulator.md`.
+The road may slope, its adhesion may vary and wind may blow. Steering may yield, wheels may differ
+and tyres may lag. The textbook's car is the special case without imperfections (`derivative`).
+Symbols, sources and limits are in `docs/vehicle.md`; imperfections are in `docs/simulator.md`.
 """
 
 import math
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.parameters import Constants, Controls, State, Traits
-from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, TyreForce, brush_force
+from fleet_slip.vehicle.parameters import Constants, Controls, ImperfectionConstants, State
+from fleet_slip.vehicle.tyre import CREEP_SPEED_MPS, brush_force
 
-SMALLEST_LOAD_N = 1.0
-"""Load of a wheel that has lifted: it gives no force and divides nothing by zero."""
+MIN_LOAD_N = 1.0
+"""Load of a lifted wheel, in N: it transmits no force, and no division by zero occurs."""
 
 STICTION_RAD_S = 0.1
 """Wheel speed below which brakes and rolling resistance fade, so that a wheel comes to rest."""
 
-SLOWEST_DRIVE_MPS = 1.0
-"""Speed below which the engine's power no longer limits its force."""
+MIN_DRIVE_SPEED_MPS = 1.0
+"""Lower bound of the speed that the engine's power is divided by, in m/s."""
+
+T = TypeVar("T")
 
 
-class Around(NamedTuple):
-    """The road and the air where the car is, and how warm its tyres are."""
+class Wheels(NamedTuple, Generic[T]):
+    """One value for each wheel: front left, front right, rear left, rear right."""
+
+    fl: T
+    fr: T
+    rl: T
+    rr: T
+
+
+NO_BRAKES = Wheels(0.0, 0.0, 0.0, 0.0)
+
+
+class Environment(NamedTuple):
+    """Road and air at the car, and the temperature of its tyres."""
 
     gravity_x: float
-    """Weight per mass along the road, in m/s²; negative uphill."""
+    """Component of gravity along the road, in m/s²; negative uphill."""
     gravity_y: float
-    """Weight per mass across the road to the left, in m/s²."""
+    """Component of gravity across the road to the left, in m/s²."""
     grip_left: float
-    """Adhesion under the left wheels over that of the drive."""
+    """Adhesion under the left wheels over the adhesion of the drive."""
     grip_right: float
+    """Adhesion under the right wheels over the adhesion of the drive."""
     wind: float
     """Speed of the air across the car to the left, in m/s."""
     stiffness: float
     """Cornering stiffness over that of warm tyres."""
 
 
-class Give(NamedTuple):
-    """What follows the car with a delay of its own."""
+class Compliance(NamedTuple):
+    """Elastic states of steering and tyres, which follow the car with a lag."""
 
     rack: float
-    """Angle of the steering wheel that the rack has followed, in rad."""
+    """Position of the steering rack, as an angle of the steering wheel in rad."""
     rack_force: float
-    """Lateral force of the front axle as the steering has given way to it, in N."""
+    """Lateral force of the front axle that the steering has yielded to, in N."""
     side_fl: float
-    """Lateral velocity of a wheel as its tyre has followed it, in m/s."""
+    """Lateral velocity of a wheel that its tyre has relaxed to, in m/s."""
     side_fr: float
     side_rl: float
     side_rr: float
 
 
-class GiveRates(NamedTuple):
-    """Rates of `Give`; the rack has none, its play is taken up at once."""
+class ComplianceRates(NamedTuple):
+    """Rates of `Compliance`. The rack has none: its play is taken up at once."""
 
     rack_force: float
     side_fl: float
     side_fr: float
     side_rl: float
     side_rr: float
-
-
-class Loads(NamedTuple):
-    """Vertical load of each wheel in N."""
-
-    fl: float
-    fr: float
-    rl: float
-    rr: float
-
-
-Brakes = Loads
-"""Brake force at the rim of each wheel in N, beside the driver's, before anti-lock control."""
-
-NO_BRAKES = Brakes(0.0, 0.0, 0.0, 0.0)
 
 
 class WheelForce(NamedTuple):
-    """Force of one wheel on the car in the car's frame, in N, and what turns the wheel."""
+    """Force of one wheel on the car in the car's frame, in N, and its reaction on the wheel."""
 
     x: float
     y: float
     along: float
-    """Component along the wheel."""
+    """Component along the wheel, in N."""
     damping: float
-    """How stiffly the tyre holds the wheel's spin, in N s/m."""
+    """Damping of the wheel's spin by the tyre, in N s/m."""
     slip: float
     slip_per_speed: float
 
 
-class WheelForces(NamedTuple):
-    """Forces of all wheels."""
-
-    fl: WheelForce
-    fr: WheelForce
-    rl: WheelForce
-    rr: WheelForce
-
-
 class WheelRate(NamedTuple):
-    """How one wheel's speed ω changes."""
+    """Rate of one wheel's speed ω."""
 
     rate: float
     """dω/dt in rad/s²."""
     stiffness: float
-    """−∂(dω/dt)/∂ω in 1/s, or somewhat more."""
-
-
-class WheelRates(NamedTuple):
-    """Rates of all wheels."""
-
-    fl: WheelRate
-    fr: WheelRate
-    rl: WheelRate
-    rr: WheelRate
+    """Upper bound of −∂(dω/dt)/∂ω, in 1/s."""
 
 
 class Acceleration(NamedTuple):
@@ -128,162 +110,14 @@ class Acceleration(NamedTuple):
 
 
 class Direction(NamedTuple):
-    """Where a wheel points: the unit vector of its steering angle."""
+    """Unit vector of a wheel's steering angle."""
 
     cosine: float
     sine: float
 
 
-@equation
-def direction_of(along: float, across: float) -> Direction:
-    """Return the direction of a vector with `along` > 0."""
-    inverse = 1.0 / math.sqrt(along * along + across * across)
-    return Direction(along * inverse, across * inverse)
-
-
-@equation
-def front_wheels(
-    give: Give, c: Constants, t: Traits
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return (along, across) of the left and right front wheel: tangents t / (1 ∓ t w / (2 L)).
-
-    t is the tangent of the rack's angle over the ratio, less where the steering gives way; without
-    their toe both stand square to one centre.
-    """
-    tangent = c.steer_per_wheel * give.rack - t.compliance * give.rack_force
-    nearer = c.ackermann * tangent
-    left, right = 1.0 - nearer, 1.0 + nearer
-    return (
-        (left + t.toe * tangent, tangent - t.toe * left),
-        (right - t.toe * tangent, tangent + t.toe * right),
-    )
-
-
-@equation
-def transferred_loads(x: State, c: Constants) -> Loads:
-    """Return the wheel loads under the lagged accelerations: a car leans back and outwards."""
-    pitch = c.pitch_transfer * x.ax_lag
-    roll_front = c.roll_transfer_front * x.ay_lag
-    roll_rear = c.roll_transfer_rear * x.ay_lag
-    return Loads(
-        max(c.static_front - pitch - roll_front, SMALLEST_LOAD_N),
-        max(c.static_front - pitch + roll_front, SMALLEST_LOAD_N),
-        max(c.static_rear + pitch - roll_rear, SMALLEST_LOAD_N),
-        max(c.static_rear + pitch + roll_rear, SMALLEST_LOAD_N),
-    )
-
-
-@equation
-def in_car_frame(force: TyreForce, to: Direction) -> WheelForce:
-    """Return a tyre's force as it acts on the car."""
-    cosine, sine = to
-    return WheelForce(
-        cosine * force.x - sine * force.y,
-        sine * force.x + cosine * force.y,
-        force.x,
-        force.damping,
-        force.slip,
-        force.slip_per_speed,
-    )
-
-
-@equation
-def _wheel_force(
-    vx: float,
-    vy: float,
-    followed_side: float,
-    to: Direction,
-    rolling: float,
-    load: float,
-    peak: float,
-    grip: float,
-    c: Constants,
-    t: Traits,
-) -> tuple[WheelForce, float]:
-    """Return the force of a wheel, and how its tyre follows by its relaxation length.
-
-    Pacejka 2012, 7.2.
-    """
-    cosine, sine = to
-    along = cosine * vx + sine * vy
-    across = cosine * vy - sine * vx
-    felt = across + t.relaxes * (followed_side - across)
-    force = brush_force(along, felt, rolling, load, peak, c, grip)
-    speed = max(abs(rolling), CREEP_SPEED_MPS)
-    return in_car_frame(force, to), speed * t.inverse_relaxation * (across - followed_side)
-
-
-@equation
-def wheel_forces(
-    x: State, give: Give, around: Around, load: Loads, c: Constants, t: Traits
-) -> tuple[WheelForces, GiveRates]:
-    """Return the forces of the wheels, brush tyres in the frame of each, and how the car gives."""
-    to_left, to_right = front_wheels(give, c, t)
-    left, right = direction_of(*to_left), direction_of(*to_right)
-    rear_left, rear_right = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
-    front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
-    turn_f, turn_r = c.half_track_front * x.yaw_rate, c.half_track_rear * x.yaw_rate
-    peak_f, peak_r = around.stiffness * c.stiffness_front, around.stiffness * c.stiffness_rear
-    roll_fl = (t.radius_fl - t.radius_loss * (load.fl - c.static_front)) * x.wheel_fl
-    roll_fr = (t.radius_fr - t.radius_loss * (load.fr - c.static_front)) * x.wheel_fr
-    roll_rl = (t.radius_rl - t.radius_loss * (load.rl - c.static_rear)) * x.wheel_rl
-    roll_rr = (t.radius_rr - t.radius_loss * (load.rr - c.static_rear)) * x.wheel_rr
-    grip_l, grip_r = around.grip_left, around.grip_right
-    fl, side_fl = _wheel_force(
-        x.vx - turn_f, front, give.side_fl, left, roll_fl, load.fl, peak_f, grip_l, c, t
-    )
-    fr, side_fr = _wheel_force(
-        x.vx + turn_f, front, give.side_fr, right, roll_fr, load.fr, peak_f, grip_r, c, t
-    )
-    rl, side_rl = _wheel_force(
-        x.vx - turn_r, rear, give.side_rl, rear_left, roll_rl, load.rl, peak_r, grip_l, c, t
-    )
-    rr, side_rr = _wheel_force(
-        x.vx + turn_r, rear, give.side_rr, rear_right, roll_rr, load.rr, peak_r, grip_r, c, t
-    )
-    yielding = (fl.y + fr.y - give.rack_force) * c.inverse_steering_lag
-    return WheelForces(fl, fr, rl, rr), GiveRates(yielding, side_fl, side_fr, side_rl, side_rr)
-
-
-@equation
-def spin_rate(
-    force: WheelForce, spin: float, load: float, drive: float, brake: float, c: Constants
-) -> WheelRate:
-    """Return the rate of a wheel under drive and brake forces at its rim, I dω/dt = Σ torques.
-
-    Brake and rolling resistance fade below `STICTION_RAD_S`. Slip control takes torque off as slip
-    grows from `slip_control` to three times that.
-    """
-    left = min(max(1.5 - abs(force.slip) * c.inverse_slip_band, 0.0), 1.0)
-    fading = c.inverse_slip_band * force.slip_per_speed if 0.0 < left < 1.0 else 0.0
-    friction = (left * brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
-    gain = c.radius * c.inverse_spin_inertia
-    held = force.damping + fading * (drive + brake)
-    return WheelRate(
-        gain * (left * drive - force.along - friction * spin), gain * (c.radius * held + friction)
-    )
-
-
-@equation
-def spin_rates(
-    x: State, force: WheelForces, load: Loads, brakes: Brakes, c: Constants
-) -> WheelRates:
-    """Return the rates of the wheels under the drivetrain's torque and all brakes."""
-    strongest = c.power_per_mass / max(abs(x.vx), SLOWEST_DRIVE_MPS)
-    drive = c.mass * min(max(x.traction, 0.0), strongest)
-    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
-    brake = c.mass * max(-x.traction, 0.0)
-    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
-    return WheelRates(
-        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f + brakes.fl, c),
-        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f + brakes.fr, c),
-        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r + brakes.rl, c),
-        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r + brakes.rr, c),
-    )
-
-
 class Derivative(NamedTuple):
-    """Rates of the state, and what an accelerometer at the centre of gravity reads."""
+    """Rates of the state, and the specific force at the centre of gravity."""
 
     vx: float
     vy: float
@@ -297,14 +131,228 @@ class Derivative(NamedTuple):
     wheel_rl: WheelRate
     wheel_rr: WheelRate
     ax: float
-    """Longitudinal specific force v̇x − r vy."""
+    """Longitudinal specific force v̇x − r vy, in m/s²."""
     ay: float
-    """Lateral specific force v̇y + r vx."""
+    """Lateral specific force v̇y + r vx, in m/s²."""
 
 
 @equation
-def driven_body(x: State, force: WheelForces, c: Constants) -> Acceleration:
-    """Newton and Euler in the car's frame: m (v̇ + ω × v) = ΣF, I ṙ = ΣM."""
+def direction_of(along: float, across: float) -> Direction:
+    """Normalise a vector with `along` > 0."""
+    inverse = 1.0 / math.sqrt(along * along + across * across)
+    return Direction(along * inverse, across * inverse)
+
+
+@equation
+def front_wheels(
+    compliance: Compliance, c: Constants, t: ImperfectionConstants
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Compute the directions of the front wheels.
+
+    The tangent of a wheel's angle is t / (1 ∓ t w / (2 L)). Here t is the tangent of the rack's
+    angle over the steering ratio, less the compliance; w is the track width and L the wheelbase.
+    Without toe, both wheels point at right angles to one centre of the turn (Ackermann).
+
+    Parameters
+    ----------
+    compliance
+        State of the steering.
+    c, t
+        Constants of the car and of its imperfections.
+
+    Returns
+    -------
+    tuple
+        Vectors (along, across) of the left and of the right wheel, not normalised.
+    """
+    tangent = c.steer_per_wheel * compliance.rack - t.steering_compliance * compliance.rack_force
+    nearer = c.ackermann * tangent
+    left_along, right_along = 1.0 - nearer, 1.0 + nearer
+    return (
+        (left_along + t.toe * tangent, tangent - t.toe * left_along),
+        (right_along - t.toe * tangent, tangent + t.toe * right_along),
+    )
+
+
+@equation
+def transferred_loads(x: State, c: Constants) -> Wheels[float]:
+    """Compute the vertical loads of the wheels under the lagged accelerations, in N.
+
+    A car pitches backwards when it accelerates, and rolls outwards in a turn.
+    """
+    pitch = c.pitch_transfer * x.ax_lag
+    roll_front = c.roll_transfer_front * x.ay_lag
+    roll_rear = c.roll_transfer_rear * x.ay_lag
+    return Wheels(
+        max(c.static_front - pitch - roll_front, MIN_LOAD_N),
+        max(c.static_front - pitch + roll_front, MIN_LOAD_N),
+        max(c.static_rear + pitch - roll_rear, MIN_LOAD_N),
+        max(c.static_rear + pitch + roll_rear, MIN_LOAD_N),
+    )
+
+
+@equation
+def _wheel_force(
+    vx: float,
+    vy: float,
+    relaxed_side: float,
+    direction: Direction,
+    rolling: float,
+    load: float,
+    peak: float,
+    grip: float,
+    c: Constants,
+    t: ImperfectionConstants,
+) -> tuple[WheelForce, float]:
+    """Compute the force of a wheel, and the rate of its tyre's relaxation (Pacejka 2012, 7.2)."""
+    cosine, sine = direction
+    along = cosine * vx + sine * vy
+    across = cosine * vy - sine * vx
+    relaxed = across + t.relaxes * (relaxed_side - across)
+    force = brush_force(along, relaxed, rolling, load, peak, c, grip)
+    speed = max(abs(rolling), CREEP_SPEED_MPS)
+    in_car_frame = WheelForce(
+        cosine * force.x - sine * force.y,
+        sine * force.x + cosine * force.y,
+        force.x,
+        force.damping,
+        force.slip,
+        force.slip_per_speed,
+    )
+    return in_car_frame, speed * t.inverse_relaxation * (across - relaxed_side)
+
+
+@equation
+def wheel_forces(
+    x: State,
+    compliance: Compliance,
+    environment: Environment,
+    load: Wheels[float],
+    c: Constants,
+    t: ImperfectionConstants,
+) -> tuple[Wheels[WheelForce], ComplianceRates]:
+    """Compute the forces of the wheels and the rates of compliance.
+
+    Parameters
+    ----------
+    x
+        State of the car.
+    compliance
+        Elastic states of steering and tyres.
+    environment
+        Road and air at the car.
+    load
+        Vertical loads of the wheels, in N.
+    c, t
+        Constants of the car and of its imperfections.
+
+    Returns
+    -------
+    Wheels[WheelForce]
+        Forces in the car's frame, in N.
+    ComplianceRates
+        Rates of the elastic states.
+    """
+    vector_l, vector_r = front_wheels(compliance, c, t)
+    front_l, front_r = direction_of(*vector_l), direction_of(*vector_r)
+    rear_l, rear_r = direction_of(1.0, t.rear_left), direction_of(1.0, t.rear_right)
+    front, rear = x.vy + c.front * x.yaw_rate, x.vy - c.rear * x.yaw_rate
+    turn_f, turn_r = c.half_track_width_front * x.yaw_rate, c.half_track_width_rear * x.yaw_rate
+    peak_f = environment.stiffness * c.stiffness_front
+    peak_r = environment.stiffness * c.stiffness_rear
+    roll_fl = (t.radius_fl - t.radius_loss * (load.fl - c.static_front)) * x.wheel_fl
+    roll_fr = (t.radius_fr - t.radius_loss * (load.fr - c.static_front)) * x.wheel_fr
+    roll_rl = (t.radius_rl - t.radius_loss * (load.rl - c.static_rear)) * x.wheel_rl
+    roll_rr = (t.radius_rr - t.radius_loss * (load.rr - c.static_rear)) * x.wheel_rr
+    grip_l, grip_r = environment.grip_left, environment.grip_right
+    fl, side_fl = _wheel_force(
+        x.vx - turn_f, front, compliance.side_fl, front_l, roll_fl, load.fl, peak_f, grip_l, c, t
+    )
+    fr, side_fr = _wheel_force(
+        x.vx + turn_f, front, compliance.side_fr, front_r, roll_fr, load.fr, peak_f, grip_r, c, t
+    )
+    rl, side_rl = _wheel_force(
+        x.vx - turn_r, rear, compliance.side_rl, rear_l, roll_rl, load.rl, peak_r, grip_l, c, t
+    )
+    rr, side_rr = _wheel_force(
+        x.vx + turn_r, rear, compliance.side_rr, rear_r, roll_rr, load.rr, peak_r, grip_r, c, t
+    )
+    yielding = (fl.y + fr.y - compliance.rack_force) * c.inverse_steering_lag
+    return Wheels(fl, fr, rl, rr), ComplianceRates(yielding, side_fl, side_fr, side_rl, side_rr)
+
+
+@equation
+def spin_rate(
+    force: WheelForce, spin: float, load: float, drive: float, brake: float, c: Constants
+) -> WheelRate:
+    """Compute the rate of a wheel's speed, I dω/dt = Σ torques.
+
+    Brake and rolling resistance fade below `STICTION_RAD_S`. Slip control reduces the torque to
+    zero as slip grows from `slip_control` to three times that.
+
+    Parameters
+    ----------
+    force
+        Force of the wheel.
+    spin
+        Speed of the wheel ω, in rad/s.
+    load, drive, brake
+        Vertical load, drive force and brake force at the rim, in N.
+    c
+        Constants of the car.
+
+    Returns
+    -------
+    WheelRate
+        dω/dt, and a bound of its derivative by ω for implicit steps.
+    """
+    passed = min(max(1.5 - abs(force.slip) * c.inverse_slip_band, 0.0), 1.0)
+    fading = c.inverse_slip_band * force.slip_per_speed if 0.0 < passed < 1.0 else 0.0
+    friction = (passed * brake + c.rolling_resistance * load) / max(abs(spin), STICTION_RAD_S)
+    gain = c.radius * c.inverse_spin_inertia
+    damping = force.damping + fading * (drive + brake)
+    return WheelRate(
+        gain * (passed * drive - force.along - friction * spin),
+        gain * (c.radius * damping + friction),
+    )
+
+
+@equation
+def spin_rates(
+    x: State, force: Wheels[WheelForce], load: Wheels[float], brakes: Wheels[float], c: Constants
+) -> Wheels[WheelRate]:
+    """Compute the rates of the wheels under the drivetrain's torque and all brakes."""
+    max_drive = c.power_per_mass / max(abs(x.vx), MIN_DRIVE_SPEED_MPS)
+    drive = c.mass * min(max(x.traction, 0.0), max_drive)
+    drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
+    brake = c.mass * max(-x.traction, 0.0)
+    brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
+    return Wheels(
+        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f + brakes.fl, c),
+        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f + brakes.fr, c),
+        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r + brakes.rl, c),
+        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r + brakes.rr, c),
+    )
+
+
+@equation
+def body_acceleration(x: State, force: Wheels[WheelForce], c: Constants) -> Acceleration:
+    """Compute the motion of the body by Newton and Euler: m (v̇ + ω × v) = ΣF, I ṙ = ΣM.
+
+    Parameters
+    ----------
+    x
+        State of the car.
+    force
+        Forces of the wheels in the car's frame, in N.
+    c
+        Constants of the car.
+
+    Returns
+    -------
+    Acceleration
+        Specific force in m/s², and the rates of vx, vy and yaw rate.
+    """
     air = c.drag_per_mass * abs(x.vx) * x.vx
     x_front, x_rear = force.fl.x + force.fr.x, force.rl.x + force.rr.x
     ax = (x_front + x_rear) * c.inverse_mass - air
@@ -313,8 +361,8 @@ def driven_body(x: State, force: WheelForces, c: Constants) -> Acceleration:
     moment = (
         c.front * y_front
         - c.rear * y_rear
-        + c.half_track_front * (force.fr.x - force.fl.x)
-        + c.half_track_rear * (force.rr.x - force.rl.x)
+        + c.half_track_width_front * (force.fr.x - force.fl.x)
+        + c.half_track_width_rear * (force.rr.x - force.rl.x)
     )
     return Acceleration(
         ax, ay, ax + x.yaw_rate * x.vy, ay - x.yaw_rate * x.vx, moment * c.inverse_yaw_inertia
@@ -322,57 +370,82 @@ def driven_body(x: State, force: WheelForces, c: Constants) -> Acceleration:
 
 
 @equation
-def rates_of(
-    x: State, u: Controls, motion: Acceleration, spin: WheelRates, c: Constants
-) -> Derivative:
-    """Return the rates of the whole state from those of body and wheels."""
-    return Derivative(
-        motion.vx,
-        motion.vy,
-        motion.yaw_rate,
+def imperfect_derivative(
+    x: State,
+    u: Controls,
+    compliance: Compliance,
+    environment: Environment,
+    brakes: Wheels[float],
+    c: Constants,
+    t: ImperfectionConstants,
+) -> tuple[Derivative, ComplianceRates]:
+    """Compute the rates of the whole state: the equations of motion, a pure function.
+
+    Gravity on a slope accelerates the car but not the accelerometer's mass against it, so that it
+    is not part of the specific force; wind is.
+
+    Parameters
+    ----------
+    x
+        State of the car.
+    u
+        Demands of the driver.
+    compliance
+        Elastic states of steering and tyres.
+    environment
+        Road and air at the car.
+    brakes
+        Brake force at the rim of each wheel in N, in addition to the driver's, before anti-lock
+        control.
+    c, t
+        Constants of the car and of its imperfections.
+
+    Returns
+    -------
+    Derivative
+        Rates of the state, and the specific force.
+    ComplianceRates
+        Rates of the elastic states.
+
+    References
+    ----------
+    R. Rajamani, "Vehicle Dynamics and Control" (2012); Milliken and Milliken, "Race Car Vehicle
+    Dynamics" (1995), chapter 18 (load transfer); Pacejka (2012) (tyres).
+    """
+    load = transferred_loads(x, c)
+    force, compliance_rates = wheel_forces(x, compliance, environment, load, c, t)
+    calm = body_acceleration(x, force, c)
+    spin = spin_rates(x, force, load, brakes, c)
+    push = x.vx * environment.wind
+    ay = calm.ay + t.wind_force * push
+    rates = Derivative(
+        calm.vx + environment.gravity_x,
+        calm.vy + t.wind_force * push + environment.gravity_y,
+        calm.yaw_rate + t.wind_moment * push,
         (u.steering_wheel - x.steering_wheel) * c.inverse_steering_lag,
         (u.traction - x.traction) * c.inverse_drive_lag,
-        (motion.ax - x.ax_lag) * c.inverse_pitch_lag,
-        (motion.ay - x.ay_lag) * c.inverse_roll_lag,
+        (calm.ax - x.ax_lag) * c.inverse_pitch_lag,
+        (ay - x.ay_lag) * c.inverse_roll_lag,
         spin.fl,
         spin.fr,
         spin.rl,
         spin.rr,
-        motion.ax,
-        motion.ay,
+        calm.ax,
+        ay,
     )
+    return rates, compliance_rates
 
 
 @equation
-def imperfect_derivative(
-    x: State,
-    u: Controls,
-    give: Give,
-    around: Around,
-    brakes: Brakes,
-    c: Constants,
-    t: Traits,
-) -> tuple[Derivative, GiveRates]:
-    """Return the equations of motion, a pure function; accelerometers feel wind, not weight."""
-    load = transferred_loads(x, c)
-    force, give_rates = wheel_forces(x, give, around, load, c, t)
-    still = driven_body(x, force, c)
-    push = x.vx * around.wind
-    motion = Acceleration(
-        still.ax,
-        still.ay + t.wind_force * push,
-        still.vx + around.gravity_x,
-        still.vy + t.wind_force * push + around.gravity_y,
-        still.yaw_rate + t.wind_moment * push,
+def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> Derivative:
+    """Compute the rates of the textbook's car on a flat, even and calm road.
+
+    Parameters and result are as those of `imperfect_derivative`.
+    """
+    rigid, r = Compliance(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0), c.radius
+    ideal = ImperfectionConstants(
+        0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     )
-    return rates_of(x, u, motion, spin_rates(x, force, load, brakes, c), c), give_rates
-
-
-@equation
-def derivative(x: State, u: Controls, brakes: Brakes, c: Constants) -> Derivative:
-    """Return the same of the textbook's car on a flat, even and calm road."""
-    rigid, r = Give(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0), c.radius
-    ideal = Traits(0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    calm = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+    calm = Environment(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
     rates, _ = imperfect_derivative(x, u, rigid, calm, brakes, c, ideal)
     return rates

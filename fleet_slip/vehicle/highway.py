@@ -1,7 +1,7 @@
 """The car as a highway-env vehicle, for any of its roads and environments.
 
-y is drawn downwards and headings count from x to y: "left" is the direction of growing y, and a
-positive steering angle turns to the right of the picture.
+highway-env draws y downwards and counts headings from x to y. "Left" is the direction of growing y,
+so that a positive steering angle turns the car to the right of the picture.
 """
 
 import math
@@ -23,9 +23,9 @@ from fleet_slip.vehicle.dynamics import (
     Acceleration,
     Derivative,
     WheelForce,
-    WheelForces,
+    Wheels,
+    body_acceleration,
     derivative,
-    driven_body,
 )
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
@@ -49,15 +49,15 @@ NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
 
 CHECKED_SAMPLES = 150
-"""So much of a drive is compared with highway-env: 1.5 s."""
-LEAST_SCALE = 1e-3
-"""Of a quantity that stays near zero, in SI units: a yaw rate on a straight is rounding."""
+"""Samples of a drive that are compared with highway-env: 1.5 s."""
+MIN_SCALE = 1e-3
+"""Lower bound of the scale of a quantity, in SI units: a yaw rate on a straight is rounding."""
 AXLES = ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR")
 BICYCLE_STATE = ("x", "y", "heading", "speed", "lateral speed", "yaw rate")
 
 
-class Place(NamedTuple):
-    """Where the car stands in highway-env's plane, or how fast that changes."""
+class PlanePose(NamedTuple):
+    """Position and heading in highway-env's plane, or their rates."""
 
     x: float
     y: float
@@ -65,12 +65,12 @@ class Place(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """All that moves: the car, its place, and what the next step needs of the last one."""
+    """State and pose of the car, and the slopes of the previous step."""
 
     state: State
-    place: Place
+    pose: PlanePose
     slopes: Slopes
-    drift: Place
+    pose_rates: PlanePose
 
 
 @kernel
@@ -82,42 +82,57 @@ def _rates(x: State, u: Controls, c: Constants) -> Derivative:
 def _rates_on_axles(
     x: State, along: float, front: float, rear: float, c: Constants
 ) -> Acceleration:
-    """Return how the body moves under a force along it and lateral forces of its axles."""
+    """Return the motion of the body under a longitudinal force and lateral forces of its axles."""
     half_front = WheelForce(along / 4, front / 2, 0.0, 0.0, 0.0, 0.0)
     half_rear = WheelForce(along / 4, rear / 2, 0.0, 0.0, 0.0, 0.0)
-    return driven_body(x, WheelForces(half_front, half_front, half_rear, half_rear), c)
+    return body_acceleration(x, Wheels(half_front, half_front, half_rear, half_rear), c)
 
 
 @equation
-def _drift_of(x: State, place: Place) -> Place:
-    cosine, sine = math.cos(place.heading), math.sin(place.heading)
-    return Place(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
+def _pose_rates(x: State, heading: float) -> PlanePose:
+    cosine, sine = math.cos(heading), math.sin(heading)
+    return PlanePose(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
 
 
 @kernel
 def _steps(
     motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
 ) -> Motion:
-    x, place, slopes, before = motion
+    x, pose, slopes, previous = motion
     for _ in range(count):
-        drift = _drift_of(x, place)
-        place = Place(
-            place.x + step * extrapolate(drift.x, before.x, order),
-            place.y + step * extrapolate(drift.y, before.y, order),
-            place.heading + step * extrapolate(drift.heading, before.heading, order),
+        rates = _pose_rates(x, pose.heading)
+        pose = PlanePose(
+            pose.x + step * extrapolate(rates.x, previous.x, order),
+            pose.y + step * extrapolate(rates.y, previous.y, order),
+            pose.heading + step * extrapolate(rates.heading, previous.heading, order),
         )
-        before = drift
+        previous = rates
         x, slopes = advance(x, derivative(x, u, NO_BRAKES, c), slopes, c, step, order)
         order = SECOND_ORDER
-    return Motion(x, place, slopes, before)
+    return Motion(x, pose, slopes, previous)
 
 
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     """A car with four wheels on highway-env's roads.
 
-    Of highway-env's actions `steering` is the road wheels' angle in rad, `acceleration` the
-    tractive force per mass in m/s². `speed` is longitudinal, as in `BicycleVehicle`; `velocity` has
-    both parts. A class for another car sets `PARAMETERS` or `ADHESION`.
+    In highway-env's actions, `steering` is the angle of the road wheels in rad and `acceleration`
+    the tractive force per mass in m/s². `speed` is longitudinal, as in `BicycleVehicle`; `velocity`
+    has both components. A subclass for another car sets `PARAMETERS` or `ADHESION`.
+
+    Parameters
+    ----------
+    road
+        Road of highway-env, or None.
+    position
+        Position of the centre of gravity (x, y), in m.
+    heading
+        Heading in rad.
+    speed
+        Longitudinal speed in m/s.
+    parameters
+        The car; by default `PARAMETERS`.
+    adhesion
+        Adhesion coefficient of the road; by default `ADHESION`.
     """
 
     PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
@@ -140,7 +155,6 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         parameters: VehicleParameters | None = None,
         adhesion: float | None = None,
     ) -> None:
-        """Put the car on a road, or none, straight ahead, in m, rad and m/s."""
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion
         c = self.constants = constants(self.parameters, self.adhesion)
@@ -151,14 +165,14 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         self.FRICTION_REAR = cornering_stiffness(c.static_rear, c.stiffness_rear, c)
         super().__init__(road, position, heading, speed)
         rolling = speed * c.inverse_radius
-        self._hidden = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
+        self._internal = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
         self._slopes = NO_SLOPES
-        self._drift = Place(0.0, 0.0, 0.0)
+        self._pose_rates = PlanePose(0.0, 0.0, 0.0)
         self._step_s = 0.0
 
     @classmethod
     def create_from(cls, vehicle: Vehicle) -> Self:
-        """Return a car where another vehicle is, in the same motion if that is of this kind."""
+        """Return a car where another vehicle is, in the same motion if it has four wheels."""
         if not isinstance(vehicle, FourWheelVehicle):
             return super().create_from(vehicle)  # type: ignore[no-any-return]
         copy = cls(
@@ -170,15 +184,15 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
             vehicle.adhesion,
         )
         copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
-        copy._hidden = vehicle._hidden
+        copy._internal = vehicle._internal
         if hasattr(vehicle, "color"):
             copy.color = vehicle.color
         return copy
 
     @property
     def motion(self) -> State:
-        """State of the car in its own frame; velocities as highway-env may have set them."""
-        return self._hidden._replace(
+        """State of the car in its own frame, with the velocities that highway-env may have set."""
+        return self._internal._replace(
             vx=float(self.speed), vy=float(self.lateral_speed), yaw_rate=float(self.yaw_rate)
         )
 
@@ -189,7 +203,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
 
     @property
     def controls(self) -> Controls:
-        """The present action as demands on steering wheel and drivetrain."""
+        """Demands of the present action on steering wheel and drivetrain."""
         steering = self.parameters.steering
         angle = steering.ratio * math.tan(float(self.action["steering"]))
         angle = min(max(angle, -steering.limit_rad), steering.limit_rad)
@@ -197,57 +211,55 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
 
     @property
     def velocity(self) -> FloatArray:
-        """Velocity of the centre of gravity in highway-env's plane, with its lateral part."""
-        cosine, sine = math.cos(self.heading), math.sin(self.heading)
-        vx, vy = self.speed, self.lateral_speed
-        return np.array([vx * cosine - vy * sine, vx * sine + vy * cosine])
+        """Velocity of the centre of gravity in highway-env's plane, shape (2,), in m/s."""
+        return np.array(_plane_velocity(self.heading, self.speed, self.lateral_speed))
 
     def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
-        """Return the rates of highway-env's state (x, y, heading, vx, vy, yaw rate), (6, 1)."""
+        """Return the rates of the state (x, y, heading, vx, vy, yaw rate), shape (6, 1)."""
         del time
         heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
-        rates = self._rates_of(self._hidden._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
-        cosine, sine = math.cos(heading), math.sin(heading)
-        place = (vx * cosine - vy * sine, vx * sine + vy * cosine, yaw_rate)
-        return np.array([*place, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
+        rates = self._rates_of(self._internal._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
+        pose_rates = (*_plane_velocity(heading, vx, vy), yaw_rate)
+        return np.array([*pose_rates, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
     def _rates_of(self, x: State) -> Derivative | Acceleration:
         return _rates(x, self.controls, self.constants)
 
     def step(self, dt: float) -> None:
-        """Move on by `dt` s in steps of at most `STEP_S`."""
+        """Advance by `dt` seconds in steps of at most `STEP_S`."""
         self.clip_actions()
         count = max(1, math.ceil(dt / STEP_S - 1e-9))
         step_s = dt / count
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
-        place = Place(float(self.position[0]), float(self.position[1]), float(self.heading))
-        moved = _steps(
-            Motion(self.motion, place, self._slopes, self._drift),
-            self.controls,
-            self.constants,
-            step_s,
-            count,
-            order,
-        )
-        self._hidden, self._slopes, self._drift = moved.state, moved.slopes, moved.drift
+        pose = PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading))
+        motion = Motion(self.motion, pose, self._slopes, self._pose_rates)
+        motion = _steps(motion, self.controls, self.constants, step_s, count, order)
+        self._internal, pose, self._slopes, self._pose_rates = motion
         self._step_s = step_s
-        self.position = np.array([moved.place.x, moved.place.y])
-        self.heading = moved.place.heading
-        self.speed, self.lateral_speed, self.yaw_rate = moved.state[:3]
+        self.position, self.heading = np.array([pose.x, pose.y]), pose.heading
+        self.speed, self.lateral_speed, self.yaw_rate = motion.state[:3]
         self.on_state_update()
 
 
-class PlainVehicle(FourWheelVehicle):
-    """`FourWheelVehicle` with all extensions off, which moves as highway-env's own bicycle.
+def _plane_velocity(heading: float, vx: float, vy: float) -> tuple[float, float]:
+    cosine, sine = math.cos(heading), math.sin(heading)
+    return vx * cosine - vy * sine, vx * sine + vy * cosine
 
-    Its axles have linear tyres, nothing lags or drags, and its speed follows the demand. Rajamani,
-    equations 2.21 to 2.28.
+
+class LinearTyreVehicle(FourWheelVehicle):
+    """`FourWheelVehicle` without extensions: it moves as highway-env's own bicycle.
+
+    Its axles have linear tyres, it has no lags and no drag, and its speed follows the demand.
+
+    References
+    ----------
+    R. Rajamani, "Vehicle Dynamics and Control" (2012), equations 2.21 to 2.28.
     """
 
     step = BicycleVehicle.step
 
     def _rates_of(self, x: State) -> Acceleration:
-        """Return how the body moves under the forces of linear axles."""
+        """Return the motion of the body under the forces of linear axles."""
         c = self.constants._replace(drag_per_mass=0.0)
         slip_front = self.action["steering"] - math.atan2(x.vy + c.front * x.yaw_rate, x.vx)
         slip_rear = -math.atan2(x.vy - c.rear * x.yaw_rate, x.vx)
@@ -256,8 +268,8 @@ class PlainVehicle(FourWheelVehicle):
         return _rates_on_axles(x, along, front, rear, c)
 
 
-def bicycle_of(car: FourWheelVehicle) -> BicycleVehicle:
-    """Return highway-env's own vehicle with a car's mass, inertia, axles and motion."""
+def highway_twin(car: FourWheelVehicle) -> BicycleVehicle:
+    """Return highway-env's own vehicle with the mass, inertia, axles and motion of a car."""
     twin = BicycleVehicle(None, car.position, car.heading, car.speed)
     for name in (*AXLES, "MAX_SPEED"):
         setattr(twin, name, getattr(car, name))
@@ -265,42 +277,56 @@ def bicycle_of(car: FourWheelVehicle) -> BicycleVehicle:
 
 
 def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
-    """Raise `RefusedError` if the first seconds of a drive are not as highway-env drives them.
+    """Require that the first 1.5 s of a drive agree with highway-env.
 
-    The kernel's car is compared with `FourWheelVehicle`, and that without its extensions with
-    `BicycleVehicle`, under the demands of the kernel's driver. The drive is of a perfect car.
-    What departs by more than `tolerance` of a quantity's largest value is refused.
+    The kernel's car is compared with `FourWheelVehicle`, and `LinearTyreVehicle` with highway-env's
+    `BicycleVehicle`, under the demands of the kernel's driver.
+
+    Parameters
+    ----------
+    drive
+        A drive of a car without imperfections.
+    name
+        Name of the drive, for messages.
+    tolerance
+        Largest difference over the largest value of a quantity.
+
+    Raises
+    ------
+    RefusedError
+        If a quantity differs by more than the tolerance.
     """
     speed = float(drive.road.speed_mps[0])
-    car, plain = (
+    car, linear = (
         kind(None, [0.0, 0.0], speed=speed, parameters=drive.vehicle, adhesion=drive.adhesion)
-        for kind in (FourWheelVehicle, PlainVehicle)
+        for kind in (FourWheelVehicle, LinearTyreVehicle)
     )
-    car.MAX_SPEED = plain.MAX_SPEED = math.inf
-    bicycle = bicycle_of(plain)
-    kernel, extended, ours, theirs = [], [], [], []
-    for demands, moved in simulate_samples(drive, CHECKED_SAMPLES):
+    car.MAX_SPEED = linear.MAX_SPEED = math.inf
+    bicycle = highway_twin(linear)
+    kernel_states, car_states, linear_states, bicycle_states = [], [], [], []
+    for demands, state in simulate_samples(drive, CHECKED_SAMPLES):
         wheel = math.atan(demands.steering_wheel / drive.vehicle.steering.ratio)
-        for vehicle in (car, plain, bicycle):
+        for vehicle in (car, linear, bicycle):
             vehicle.act({"steering": wheel, "acceleration": demands.traction})
             vehicle.step(SAMPLE_S)
-        kernel.append(moved)
-        extended.append(car.motion)
-        ours.append(plain.state[:, 0])
-        theirs.append(bicycle.state[:, 0])
-    for quantities, one, other, vehicle in (
-        (State._fields, kernel, extended, FourWheelVehicle),
-        (BICYCLE_STATE, ours, theirs, BicycleVehicle),
+        kernel_states.append(state)
+        car_states.append(car.motion)
+        linear_states.append(linear.state[:, 0])
+        bicycle_states.append(bicycle.state[:, 0])
+    for quantities, values, expected, vehicle in (
+        (State._fields, kernel_states, car_states, FourWheelVehicle),
+        (BICYCLE_STATE, linear_states, bicycle_states, BicycleVehicle),
     ):
-        apart, largest = np.abs(np.subtract(one, other)), np.abs(other).max(axis=0)
-        wrong = np.argwhere(~(apart <= tolerance * np.maximum(largest, LEAST_SCALE)))
+        difference = np.abs(np.subtract(values, expected))
+        largest = np.abs(expected).max(axis=0)
+        wrong = np.argwhere(~(difference <= tolerance * np.maximum(largest, MIN_SCALE)))
         if not len(wrong):
             continue
         tick, quantity = wrong[0]
         raise RefusedError(
             f"the simulated car departs from highway-env: {(tick + 1) * SAMPLE_S:.2f} s after the "
-            f"start of {name}, {quantities[quantity]} is {one[tick][quantity]:.9g}, but "
-            f"{other[tick][quantity]:.9g} of {vehicle.__name__}. Its file is not written. The "
-            f"compiler or highway-env {highway_env.__version__} is not as expected: install the "
-            "versions that constraints.txt names, and give the command again."
+            f"start of {name}, {quantities[quantity]} is {values[tick][quantity]:.9g}, but "
+            f"{expected[tick][quantity]:.9g} in {vehicle.__name__}. The file was not written. The "
+            f"compiler or highway-env {highway_env.__version__} differs from the tested one: "
+            "install the versions of constraints.txt and run the command again."
         )

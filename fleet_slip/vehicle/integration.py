@@ -1,27 +1,33 @@
-"""One step in time, of second order, with one evaluation of the equations; and the car's pose.
+"""Time integration of second order, with one evaluation of the equations a step; the car's pose.
 
-The car is stepped explicitly (Adams-Bashforth; actuators by their Taylor series), its stiff wheels
-linearly implicitly (SBDF2; Ascher, Ruuth and Wetton 1995). The pose is curvilinear (Serret-Frenet),
-its heading a unit vector: no search, no angle.
+Body and load transfer use explicit Adams-Bashforth steps, actuators their Taylor series. The stiff
+wheels use linearly implicit steps (SBDF2). The pose is curvilinear (Serret-Frenet) and its heading
+a unit vector, so that no nearest point is searched and no angle is computed.
+
+References
+----------
+U. M. Ascher, S. J. Ruuth, B. T. R. Wetton, "Implicit-explicit methods for time-dependent partial
+differential equations", SIAM J. Numer. Anal. 32 (1995).
 """
 
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import Derivative, Give, GiveRates, WheelRate
-from fleet_slip.vehicle.parameters import Constants, State, Traits
+from fleet_slip.vehicle.dynamics import Compliance, ComplianceRates, Derivative, WheelRate
+from fleet_slip.vehicle.parameters import Constants, ImperfectionConstants, State
 
 STEP_S = 0.002
+"""Time step in s. `docs/simulator.md` compares the errors of other steps."""
 
 FIRST_ORDER = 0.0
-"""Extrapolation of the first step: the step is Euler's."""
+"""Weight of the extrapolation in a drive's first step: the explicit Euler method."""
 
 SECOND_ORDER = 0.5
-"""Extrapolation of all other steps, from this and the previous rate."""
+"""Weight of the extrapolation in all other steps, from the present and the previous rate."""
 
 
 class Slopes(NamedTuple):
-    """The previous step: rates at its beginning, and how far the wheels' speeds moved."""
+    """Rates at the beginning of the previous step, and the changes of the wheels' speeds in it."""
 
     vx: float
     vy: float
@@ -39,122 +45,178 @@ class Slopes(NamedTuple):
 
 
 @equation
-def extrapolate(now: float, before: float, extrapolation: float) -> float:
-    """Return the slope of an Adams-Bashforth step from this and the previous rate."""
-    return now + extrapolation * (now - before)
+def extrapolate(rate: float, previous: float, extrapolation: float) -> float:
+    """Compute the slope of an Adams-Bashforth step from the present and the previous rate."""
+    return rate + extrapolation * (rate - previous)
 
 
 @equation
-def followed(rate: float, inverse_lag: float, step: float) -> float:
-    """Return how far a first-order lag moves in a step under a constant demand, by −rate / lag."""
+def lag_step(rate: float, inverse_lag: float, step: float) -> float:
+    """Compute the change of a first-order lag in a step under a constant demand.
+
+    h ẏ (1 − h / (2 τ)), the Taylor series of τ ẏ (1 − exp(−h / τ)) to second order.
+
+    Parameters
+    ----------
+    rate
+        Rate ẏ at the beginning of the step.
+    inverse_lag
+        1 / τ, in 1/s.
+    step
+        Time step h, in s.
+    """
     return step * rate * (1.0 - 0.5 * step * inverse_lag)
 
 
 @equation
-def turned(
-    wheel: WheelRate, rate_before: float, change_before: float, step: float, extrapolation: float
+def wheel_step(
+    wheel: WheelRate, previous_rate: float, previous_change: float, step: float, order: float
 ) -> float:
-    """Return the change of a wheel's speed in a step, stable however stiff the tyre.
+    """Compute the change of a wheel's speed in a step, stable for any stiffness of the tyre.
 
-    With K at least −∂f/∂ω, −K ω is taken at the step's end and the rest of the rate extrapolated:
-    (3/2 + h K) Δω = Δω_before / 2 + h (2 f − f_before + K Δω_before)
+    With K at least −∂f/∂ω, the term −K ω is implicit and the remaining rate is extrapolated::
+
+        (3/2 + h K) Δω = Δω_previous / 2 + h (2 f − f_previous + K Δω_previous)
+
+    Parameters
+    ----------
+    wheel
+        Rate f and stiffness K of the wheel.
+    previous_rate, previous_change
+        Rate at the beginning of the previous step in rad/s², and the change in it in rad/s.
+    step
+        Time step h, in s.
+    order
+        `FIRST_ORDER` in a drive's first step, else `SECOND_ORDER`.
+
+    Returns
+    -------
+    float
+        Change Δω of the wheel's speed, in rad/s.
     """
-    twice = 2.0 * extrapolation
-    rate = wheel.rate + twice * (wheel.rate - rate_before + wheel.stiffness * change_before)
-    return (extrapolation * change_before + step * rate) / (
-        1.0 + extrapolation + step * wheel.stiffness
-    )
+    twice = 2.0 * order
+    rate = wheel.rate + twice * (wheel.rate - previous_rate + wheel.stiffness * previous_change)
+    return (order * previous_change + step * rate) / (1.0 + order + step * wheel.stiffness)
 
 
 @equation
 def advance(
-    x: State, d: Derivative, before: Slopes, c: Constants, step: float, extrapolation: float
+    x: State, d: Derivative, previous: Slopes, c: Constants, step: float, order: float
 ) -> tuple[State, Slopes]:
-    """Return the state after a step, and what the next step needs to know of this one."""
-    fl = turned(d.wheel_fl, before.rate_fl, before.change_fl, step, extrapolation)
-    fr = turned(d.wheel_fr, before.rate_fr, before.change_fr, step, extrapolation)
-    rl = turned(d.wheel_rl, before.rate_rl, before.change_rl, step, extrapolation)
-    rr = turned(d.wheel_rr, before.rate_rr, before.change_rr, step, extrapolation)
+    """Advance the state by one step.
+
+    Parameters
+    ----------
+    x, d
+        State and its rates at the beginning of the step.
+    previous
+        Slopes of the previous step; zeros in a drive's first step.
+    c
+        Constants of the car.
+    step
+        Time step, in s.
+    order
+        `FIRST_ORDER` in a drive's first step, else `SECOND_ORDER`.
+
+    Returns
+    -------
+    State
+        State at the end of the step.
+    Slopes
+        Slopes for the next step.
+    """
+    fl = wheel_step(d.wheel_fl, previous.rate_fl, previous.change_fl, step, order)
+    fr = wheel_step(d.wheel_fr, previous.rate_fr, previous.change_fr, step, order)
+    rl = wheel_step(d.wheel_rl, previous.rate_rl, previous.change_rl, step, order)
+    rr = wheel_step(d.wheel_rr, previous.rate_rr, previous.change_rr, step, order)
     after = State(
-        x.vx + step * extrapolate(d.vx, before.vx, extrapolation),
-        x.vy + step * extrapolate(d.vy, before.vy, extrapolation),
-        x.yaw_rate + step * extrapolate(d.yaw_rate, before.yaw_rate, extrapolation),
-        x.steering_wheel + followed(d.steering_wheel, c.inverse_steering_lag, step),
-        x.traction + followed(d.traction, c.inverse_drive_lag, step),
-        x.ax_lag + step * extrapolate(d.ax_lag, before.ax_lag, extrapolation),
-        x.ay_lag + step * extrapolate(d.ay_lag, before.ay_lag, extrapolation),
+        x.vx + step * extrapolate(d.vx, previous.vx, order),
+        x.vy + step * extrapolate(d.vy, previous.vy, order),
+        x.yaw_rate + step * extrapolate(d.yaw_rate, previous.yaw_rate, order),
+        x.steering_wheel + lag_step(d.steering_wheel, c.inverse_steering_lag, step),
+        x.traction + lag_step(d.traction, c.inverse_drive_lag, step),
+        x.ax_lag + step * extrapolate(d.ax_lag, previous.ax_lag, order),
+        x.ay_lag + step * extrapolate(d.ay_lag, previous.ay_lag, order),
         x.wheel_fl + fl,
         x.wheel_fr + fr,
         x.wheel_rl + rl,
         x.wheel_rr + rr,
     )
-    slopes = Slopes(
-        d.vx,
-        d.vy,
-        d.yaw_rate,
-        d.ax_lag,
-        d.ay_lag,
-        d.wheel_fl.rate,
-        d.wheel_fr.rate,
-        d.wheel_rl.rate,
-        d.wheel_rr.rate,
-        fl,
-        fr,
-        rl,
-        rr,
+    f_fl, f_fr, f_rl, f_rr = d.wheel_fl.rate, d.wheel_fr.rate, d.wheel_rl.rate, d.wheel_rr.rate
+    return after, Slopes(
+        d.vx, d.vy, d.yaw_rate, d.ax_lag, d.ay_lag, f_fl, f_fr, f_rl, f_rr, fl, fr, rl, rr
     )
-    return after, slopes
 
 
 @equation
-def advance_give(
-    give: Give,
-    d: GiveRates,
-    before: GiveRates,
+def advance_compliance(
+    compliance: Compliance,
+    d: ComplianceRates,
+    previous: ComplianceRates,
     column: float,
-    t: Traits,
+    t: ImperfectionConstants,
     step: float,
-    extrapolation: float,
-) -> Give:
-    """Return what follows the car after a step; the rack rests within the play, else goes along."""
-    return Give(
-        min(max(give.rack, column - t.half_lash), column + t.half_lash),
-        give.rack_force + step * extrapolate(d.rack_force, before.rack_force, extrapolation),
-        give.side_fl + step * extrapolate(d.side_fl, before.side_fl, extrapolation),
-        give.side_fr + step * extrapolate(d.side_fr, before.side_fr, extrapolation),
-        give.side_rl + step * extrapolate(d.side_rl, before.side_rl, extrapolation),
-        give.side_rr + step * extrapolate(d.side_rr, before.side_rr, extrapolation),
+    order: float,
+) -> Compliance:
+    """Advance the elastic states by one step.
+
+    Parameters
+    ----------
+    compliance, d
+        Elastic states and their rates at the beginning of the step.
+    previous
+        Rates of the previous step.
+    column
+        Angle of the steering wheel at the end of the step, in rad. The rack rests within the play
+        about it, and is carried along at its ends.
+    t
+        Constants of the car's imperfections.
+    step, order
+        As of `advance`.
+
+    Returns
+    -------
+    Compliance
+        Elastic states at the end of the step.
+    """
+    return Compliance(
+        min(max(compliance.rack, column - t.half_lash), column + t.half_lash),
+        compliance.rack_force + step * extrapolate(d.rack_force, previous.rack_force, order),
+        compliance.side_fl + step * extrapolate(d.side_fl, previous.side_fl, order),
+        compliance.side_fr + step * extrapolate(d.side_fr, previous.side_fr, order),
+        compliance.side_rl + step * extrapolate(d.side_rl, previous.side_rl, order),
+        compliance.side_rr + step * extrapolate(d.side_rr, previous.side_rr, order),
     )
 
 
-LEAST_RADIUS_SHARE = 0.2
-"""The station stops short of the centre of a bend's curvature, where it is not defined."""
+MIN_RADIUS_RATIO = 0.2
+"""Lower bound of 1 − κ e: at the centre of a bend's curvature the station is not defined."""
 
 
 class Pose(NamedTuple):
-    """Place and heading relative to the road's line."""
+    """Position and heading relative to the road's line."""
 
     station: float
     """Along the line, in m."""
     offset: float
     """From the line to the left, in m."""
     cosine: float
-    """Of the car's heading against the line's."""
+    """Cosine of the car's heading against the line's."""
     sine: float
 
 
 class Path(NamedTuple):
-    """The road as it was looked up at the last sample."""
+    """The road as the driver sees it at a sample."""
 
     station: float
     curvature: float
     curvature_slope: float
-    """Per metre: within a sample curvature is linear in the station."""
+    """Change of curvature per metre: within a sample curvature is linear in the station."""
     curvature_ahead: float
     target_speed: float
     target_acceleration: float
     lost: float
-    """1 once the driver has lost the car, else 0."""
+    """1 after the driver lost the car, else 0."""
 
 
 class PoseSlopes(NamedTuple):
@@ -168,12 +230,30 @@ class PoseSlopes(NamedTuple):
 
 @equation
 def pose_slopes(x: State, pose: Pose, path: Path) -> PoseSlopes:
-    """Return ṡ = (vx cos ψ − vy sin ψ) / (1 − κ e), ė = vx sin ψ + vy cos ψ, and ψ̇ = r − κ ṡ.
+    """Compute the rates of the pose on a line of curvature κ.
 
-    The heading's rate turns its unit vector.
+    With station s, offset e and heading ψ against the line::
+
+        ṡ = (vx cos ψ − vy sin ψ) / (1 − κ e)
+        ė = vx sin ψ + vy cos ψ
+        ψ̇ = r − κ ṡ, which rotates the unit vector of the heading
+
+    Parameters
+    ----------
+    x
+        State of the car.
+    pose
+        Position and heading.
+    path
+        Curvature of the line.
+
+    Returns
+    -------
+    PoseSlopes
+        Rates of station and offset in m/s, and of the unit vector in 1/s.
     """
     curvature = path.curvature + path.curvature_slope * (pose.station - path.station)
-    shrink = max(1.0 - curvature * pose.offset, LEAST_RADIUS_SHARE)
+    shrink = max(1.0 - curvature * pose.offset, MIN_RADIUS_RATIO)
     station = (x.vx * pose.cosine - x.vy * pose.sine) / shrink
     turning = x.yaw_rate - curvature * station
     return PoseSlopes(
@@ -183,16 +263,19 @@ def pose_slopes(x: State, pose: Pose, path: Path) -> PoseSlopes:
 
 @equation
 def advance_pose(
-    pose: Pose, d: PoseSlopes, before: PoseSlopes, step: float, extrapolation: float
+    pose: Pose, d: PoseSlopes, previous: PoseSlopes, step: float, order: float
 ) -> Pose:
-    """Return the pose after a step of Adams-Bashforth, its unit vector of length 1 again."""
-    cosine = pose.cosine + step * extrapolate(d.cosine, before.cosine, extrapolation)
-    sine = pose.sine + step * extrapolate(d.sine, before.sine, extrapolation)
+    """Advance the pose by an Adams-Bashforth step, and normalise the unit vector of the heading.
+
+    Parameters and result are as those of `advance`.
+    """
+    cosine = pose.cosine + step * extrapolate(d.cosine, previous.cosine, order)
+    sine = pose.sine + step * extrapolate(d.sine, previous.sine, order)
     # One Newton iteration for 1/√n from 1: the length is 1 to a few parts in a million before.
     scale = 1.5 - 0.5 * (cosine * cosine + sine * sine)
     return Pose(
-        pose.station + step * extrapolate(d.station, before.station, extrapolation),
-        pose.offset + step * extrapolate(d.offset, before.offset, extrapolation),
+        pose.station + step * extrapolate(d.station, previous.station, order),
+        pose.offset + step * extrapolate(d.offset, previous.offset, order),
         cosine * scale,
         sine * scale,
     )

@@ -1,6 +1,7 @@
-"""A car: the parameters of `configs/vehicles/*.toml`, and what a real car has beyond these.
+"""Vehicle parameters (`configs/vehicles/*.toml`), imperfections of cars, and state and controls.
 
-What the equations of motion take and give. Sources: `docs/vehicle.md`, `docs/simulator.md`.
+Units are SI unless a name states another; signs follow ISO 8855. Sources of the figures are in
+`docs/vehicle.md` and `docs/simulator.md`.
 """
 
 import math
@@ -14,44 +15,47 @@ from fleet_slip.errors import ConfigError
 from fleet_slip.resources import Configs
 
 GRAVITY_MPS2 = 9.80665
-STIFFEST_TYRE = 30.0
-"""Largest slip stiffness over load that the time step allows; real tyres stay below."""
+MAX_STIFFNESS_PER_LOAD = 30.0
+"""Limit of the slip stiffness over the load for a stable time step; real tyres are below."""
 
 AIR_DENSITY_KGPM3 = 1.225
+"""Density of air at 15 °C at sea level, in kg/m³."""
 
 
 class Body(Config):
-    """Masses and geometry. The centre of gravity of the whole car is that of its sprung mass."""
+    """Masses and geometry. The whole car has the centre of gravity of its sprung mass."""
 
     sprung_mass_kg: FiniteFloat = Field(gt=0)
     unsprung_mass_front_kg: FiniteFloat = Field(gt=0)
     unsprung_mass_rear_kg: FiniteFloat = Field(gt=0)
     sprung_yaw_inertia_kgm2: FiniteFloat = Field(gt=0)
     front_axle_m: FiniteFloat = Field(gt=0)
-    """From the centre of gravity to the front axle."""
+    """Distance from the centre of gravity to the front axle."""
     rear_axle_m: FiniteFloat = Field(gt=0)
-    """From the centre of gravity to the rear axle."""
+    """Distance from the centre of gravity to the rear axle."""
     height_m: FiniteFloat = Field(gt=0)
-    """Of the centre of gravity above the road."""
+    """Height of the centre of gravity above the road."""
     track_front_m: FiniteFloat = Field(gt=0)
+    """Track width of the front axle."""
     track_rear_m: FiniteFloat = Field(gt=0)
-    reference_m: FiniteFloat = Field(default=0.0, exclude_if=lambda one: not one)
-    """Where the side-slip angle is meant, so far before the centre of gravity: a sensor is fixed to
-    the body, and stays at the centre of gravity of the empty car when it is loaded."""
+    """Track width of the rear axle."""
+    reference_m: FiniteFloat = Field(default=0.0, exclude_if=lambda value: not value)
+    """Position of the side-slip sensor before the centre of gravity. The sensor is fixed to the
+    body: when the car is loaded, it stays at the empty car's centre of gravity."""
 
     @property
     def mass_kg(self) -> float:
-        """Mass of the whole car."""
+        """Mass of the whole car, in kg."""
         return self.sprung_mass_kg + self.unsprung_mass_front_kg + self.unsprung_mass_rear_kg
 
     @property
     def wheelbase_m(self) -> float:
-        """Distance between the axles."""
+        """Distance between the axles, in m."""
         return self.front_axle_m + self.rear_axle_m
 
     @property
     def yaw_inertia_kgm2(self) -> float:
-        """Yaw inertia of the whole car: the sprung mass, and the unsprung ones at the wheels."""
+        """Yaw inertia in kg m²: of the sprung mass, and of the unsprung masses at the wheels."""
         front = self.front_axle_m**2 + self.track_front_m**2 / 4
         rear = self.rear_axle_m**2 + self.track_rear_m**2 / 4
         return (
@@ -62,21 +66,22 @@ class Body(Config):
 
 
 class Suspension(Config):
-    """How the car leans on its wheels, and how the axles soften the tyres."""
+    """Load transfer, and the compliance of the axles."""
 
     front_roll_share: FiniteFloat = Field(ge=0, le=1)
-    """Share of the lateral load transfer that the front axle takes."""
+    """Share of the front axle in the lateral load transfer."""
     roll_lag_s: FiniteFloat = Field(ge=0.01)
     """Time constant of the lateral load transfer."""
     pitch_lag_s: FiniteFloat = Field(ge=0.01)
     """Time constant of the longitudinal load transfer."""
     front_stiffness_factor: FiniteFloat = Field(gt=0)
-    """Effective cornering stiffness of the axle over that of its tyres."""
+    """Effective cornering stiffness of the front axle over that of its tyres."""
     rear_stiffness_factor: FiniteFloat = Field(gt=0)
+    """Effective cornering stiffness of the rear axle over that of its tyres."""
 
 
 class Tyre(Config):
-    """The brush tyre of `fleet_slip.vehicle.tyre` and its wheel."""
+    """Parameters of the brush tyre (`fleet_slip.vehicle.tyre`) and its wheel."""
 
     rolling_radius_m: FiniteFloat = Field(gt=0)
     spin_inertia_kgm2: FiniteFloat = Field(gt=0)
@@ -90,53 +95,53 @@ class Tyre(Config):
     """Static friction coefficient at the nominal load, on a road of adhesion 1."""
     nominal_load_n: FiniteFloat = Field(gt=0)
     friction_load_sensitivity: FiniteFloat = Field(ge=0, le=0.2)
-    """Relative fall of friction per relative rise of load."""
+    """Relative decrease of friction per relative increase of load."""
     friction_decay_speed_mps: FiniteFloat = Field(gt=0)
-    """Sliding speed at which half of the friction is left."""
+    """Sliding speed at which the friction is halved."""
     rolling_resistance: FiniteFloat = Field(ge=0)
 
     @model_validator(mode="after")
     def _not_too_stiff(self) -> Self:
         stiffness = 2 * self.peak_stiffness_n / self.peak_stiffness_load_n
         stiffness *= max(1.0, self.longitudinal_stiffness_ratio)
-        if stiffness > STIFFEST_TYRE:
+        if stiffness > MAX_STIFFNESS_PER_LOAD:
             raise ValueError(
-                f"slip stiffness is {stiffness:.1f} times the load, at most {STIFFEST_TYRE} can be"
-                f" simulated: lower peak_stiffness_n"
+                f"the slip stiffness is {stiffness:.1f} times the load, more than the "
+                f"{MAX_STIFFNESS_PER_LOAD} that can be simulated: lower peak_stiffness_n"
             )
         return self
 
 
 class Steering(Config):
-    """From the steering wheel to the rack."""
+    """Steering, from the steering wheel to the rack."""
 
     ratio: FiniteFloat = Field(gt=0)
     """Steering wheel angle over the tangent of the mean road wheel angle."""
     lag_s: FiniteFloat = Field(ge=0.01)
     limit_rad: FiniteFloat = Field(gt=0)
-    """Largest angle of the steering wheel to each side."""
+    """Maximum angle of the steering wheel to each side."""
 
 
 class Drivetrain(Config):
-    """How the demanded tractive force reaches the wheels."""
+    """Distribution and limits of the tractive force."""
 
     front_drive_share: FiniteFloat = Field(ge=0, le=1)
     front_brake_share: FiniteFloat = Field(ge=0, le=1)
     lag_s: FiniteFloat = Field(ge=0.01)
     power_w: FiniteFloat = Field(gt=0)
     slip_control: FiniteFloat = Field(gt=0)
-    """Slip at which anti-lock and traction control begin to take torque off a wheel."""
+    """Slip at which anti-lock and traction control begin to reduce the torque of a wheel."""
 
 
 class Aerodynamics(Config):
-    """Resistance of the air."""
+    """Air resistance."""
 
     drag_area_m2: FiniteFloat = Field(ge=0)
     """Drag coefficient times frontal area."""
 
 
 class VehicleParameters(Config):
-    """One car, as in `configs/vehicles/*.toml`."""
+    """Parameters of a car, as in `configs/vehicles/*.toml`."""
 
     name: Identifier
     description: str = Field(min_length=1)
@@ -148,11 +153,25 @@ class VehicleParameters(Config):
     aerodynamics: Aerodynamics
 
     def with_sprung_mass(self, mass_kg: float, load_position_m: float | None = None) -> Self:
-        """Return the car loaded to another sprung mass.
+        """Return the car with a load.
 
-        Without a position the load sits as the sprung mass did, whose yaw inertia grows in
-        proportion; else it is a point before the empty car's centre of gravity. Raises
-        `ConfigError` if the car cannot be.
+        Parameters
+        ----------
+        mass_kg
+            Sprung mass including the load.
+        load_position_m
+            Position of the load before the empty car's centre of gravity, as a point mass. None:
+            mass and yaw inertia grow in proportion, and the centre of gravity stays.
+
+        Returns
+        -------
+        VehicleParameters
+            The loaded car.
+
+        Raises
+        ------
+        ConfigError
+            If the loaded car is impossible.
         """
         body = self.body
         changes = {"sprung_mass_kg": mass_kg}
@@ -173,46 +192,60 @@ class VehicleParameters(Config):
     def with_tyres(
         self, *, stiffness_factor: float = 1.0, rolling_radius_factor: float = 1.0
     ) -> Self:
-        """Return the car on other tyres. Raises `ConfigError` if these cannot be simulated."""
+        """Return the car with other tyres.
+
+        Parameters
+        ----------
+        stiffness_factor
+            Cornering stiffness over that of the present tyres.
+        rolling_radius_factor
+            Rolling radius over that of the present tyres.
+
+        Raises
+        ------
+        ConfigError
+            If the tyres cannot be simulated.
+        """
         changes = {
             "peak_stiffness_n": self.tyre.peak_stiffness_n * stiffness_factor,
             "rolling_radius_m": self.tyre.rolling_radius_m * rolling_radius_factor,
         }
         return self.model_copy(update={"tyre": self._changed(self.tyre, changes)})
 
-    def _changed(self, part: ConfigT, changes: dict[str, float]) -> ConfigT:
+    def _changed(self, config: ConfigT, changes: dict[str, float]) -> ConfigT:
         try:
-            return type(part).model_validate(part.model_dump() | changes)
+            return type(config).model_validate(config.model_dump() | changes)
         except ValidationError as error:
             reason = "; ".join(fault["msg"] for fault in error.errors())
             raise ConfigError(f"{self.name} with {changes}: {reason}.") from None
 
 
 def load_vehicle(name_or_path: str, configs: Configs) -> VehicleParameters:
-    """Read a car by name or path. Raises `ConfigError`."""
+    """Read a car by name or path. Raises `ConfigError` if the file is missing or not valid."""
     return load_config(configs.find("vehicles", name_or_path), VehicleParameters)
 
 
 class Constants(NamedTuple):
-    """What the equations of one car on one road need, in SI units, divisions done beforehand."""
+    """Constants of the equations for a car on a road, in SI units; divisions are precomputed."""
 
     mass: float
     inverse_mass: float
     yaw_inertia: float
     inverse_yaw_inertia: float
     front: float
+    """Distance from the centre of gravity to the front axle."""
     rear: float
-    half_track_front: float
-    half_track_rear: float
+    half_track_width_front: float
+    half_track_width_rear: float
     ackermann: float
-    """Half of the front track over the wheelbase."""
+    """Half of the front track width over the wheelbase."""
     static_front: float
     """Load of one front wheel at rest."""
     static_rear: float
     pitch_transfer: float
-    """Load that one wheel gains per longitudinal acceleration."""
+    """Load transfer of one wheel per longitudinal acceleration."""
     roll_transfer_front: float
-    """Load that one front wheel gains per lateral acceleration."""
+    """Load transfer of one front wheel per lateral acceleration."""
     roll_transfer_rear: float
     inverse_roll_lag: float
     inverse_pitch_lag: float
@@ -222,32 +255,45 @@ class Constants(NamedTuple):
     inverse_stiffness_load: float
     stiffness_ratio: float
     friction: float
-    """At no load: tyre, road, and the load sensitivity extrapolated."""
+    """Friction of tyre and road, extrapolated to no load."""
     friction_per_load: float
-    """Loss of friction per load."""
+    """Decrease of friction per load."""
     inverse_decay_speed: float
     rolling_resistance: float
     radius: float
     inverse_radius: float
     inverse_spin_inertia: float
     steer_per_wheel: float
-    """Tangent of the mean road wheel angle per steering wheel angle."""
+    """Tangent of the mean road wheel angle per angle of the steering wheel."""
     inverse_steering_lag: float
     steering_limit: float
     inverse_drive_lag: float
     drive_front: float
-    """Force of one front wheel over the drive's force."""
+    """Force of one front wheel over the force of the drivetrain."""
     drive_rear: float
     brake_front: float
     brake_rear: float
     power_per_mass: float
     drag_per_mass: float
     inverse_slip_band: float
-    """One over the range of slip within which slip control takes all torque off."""
+    """Inverse of the range of slip over which slip control reduces the torque to zero."""
 
 
 def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
-    """Return the constants of a car on a road with an adhesion coefficient."""
+    """Compute the constants of a car on a road.
+
+    Parameters
+    ----------
+    vehicle
+        The car.
+    adhesion
+        Adhesion coefficient μ of the road, 1 on dry asphalt.
+
+    Returns
+    -------
+    Constants
+        Constants in SI units.
+    """
     body, suspension, tyre = vehicle.body, vehicle.suspension, vehicle.tyre
     drive, steering = vehicle.drivetrain, vehicle.steering
     mass, wheelbase = body.mass_kg, body.wheelbase_m
@@ -262,8 +308,8 @@ def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
         inverse_yaw_inertia=1 / body.yaw_inertia_kgm2,
         front=body.front_axle_m,
         rear=body.rear_axle_m,
-        half_track_front=body.track_front_m / 2,
-        half_track_rear=body.track_rear_m / 2,
+        half_track_width_front=body.track_front_m / 2,
+        half_track_width_rear=body.track_rear_m / 2,
         ackermann=body.track_front_m / 2 / wheelbase,
         static_front=weight * body.rear_axle_m / wheelbase / 2,
         static_rear=weight * body.front_axle_m / wheelbase / 2,
@@ -298,67 +344,68 @@ def constants(vehicle: VehicleParameters, adhesion: float) -> Constants:
 
 
 class State(NamedTuple):
-    """Motion of the car in its own frame, SI units, signs after ISO 8855."""
+    """Motion of the car in its own frame, in SI units, with the signs of ISO 8855."""
 
     vx: float
     vy: float
     yaw_rate: float
     steering_wheel: float
     traction: float
-    """Tractive force per mass after the drivetrain's lag; braking where negative."""
+    """Tractive force per mass behind the drivetrain's lag; braking if negative."""
     ax_lag: float
-    """Longitudinal acceleration as the load transfer has followed it."""
+    """Longitudinal acceleration behind the lag of the load transfer."""
     ay_lag: float
+    """Lateral acceleration behind the lag of the load transfer."""
     wheel_fl: float
+    """Speed of the front left wheel."""
     wheel_fr: float
     wheel_rl: float
     wheel_rr: float
 
 
 class Controls(NamedTuple):
-    """What the driver asks for."""
+    """Demands of the driver."""
 
     steering_wheel: float
-    """Angle in rad."""
+    """Angle of the steering wheel, in rad."""
     traction: float
-    """Force along the car per mass, in m/s²; braking where negative."""
+    """Force along the car per mass, in m/s²; braking if negative."""
 
-
-# What a real car has beyond the textbook's; zero is without.
 
 Angle = Annotated[FiniteFloat, Field(ge=-5, le=5)]
 RadiusError = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]
 
 
 class CarImperfections(Config):
-    """One car's own departures from its parameters."""
+    """Imperfections of a car; with zeros it is the textbook's car."""
 
     steering_lash_deg: FiniteFloat = Field(default=0.0, ge=0, le=30)
-    """Free play of the steering wheel, from stop to stop."""
+    """Free play of the steering wheel, from one end to the other."""
     steering_compliance_deg_per_kn: FiniteFloat = Field(default=0.0, ge=0, le=0.5)
-    """How far the front wheels give way under the lateral force of their axle."""
+    """Angle that the front wheels yield per lateral force of their axle."""
     toe_front_deg: Angle = 0.0
-    """Of each front wheel, positive where the wheels point inwards."""
+    """Toe angle of each front wheel, positive if the wheels point inwards."""
     toe_rear_deg: Angle = 0.0
+    """Toe angle of each rear wheel, positive if the wheels point inwards."""
     thrust_angle_deg: Angle = 0.0
-    """How far the rear axle is turned to the left."""
+    """Angle of the rear axle to the left."""
     radius_error_fl: RadiusError = 0.0
-    """Rolling radius over that of the tyre, less one: pressure and wear of this wheel."""
+    """Relative error of the rolling radius of this wheel, from pressure and wear."""
     radius_error_fr: RadiusError = 0.0
     radius_error_rl: RadiusError = 0.0
     radius_error_rr: RadiusError = 0.0
     radius_loss_mm_per_kn: FiniteFloat = Field(default=0.0, ge=0, le=5)
-    """How much shorter the rolling radius is under further load."""
+    """Decrease of the rolling radius per load."""
     relaxation_length_m: FiniteFloat = Field(default=0.0, ge=0, le=2)
-    """Way after which a tyre's lateral slip has built up to 63 %."""
+    """Distance over which the lateral slip of a tyre builds up to 63 %."""
     cold_stiffness: FiniteFloat = Field(default=0.0, ge=-0.5, le=0.5)
-    """Cornering stiffness at the start of a drive over that of warm tyres, less one."""
+    """Relative excess of the cornering stiffness at the start of a drive, on cold tyres."""
     warm_up_s: FiniteFloat = Field(default=600.0, ge=1)
-    """Time constant of its decay."""
+    """Time constant of the decay of `cold_stiffness`."""
     roll_gradient_deg_per_g: FiniteFloat = Field(default=0.0, ge=0, le=15)
-    """Roll angle of the body per lateral acceleration: it tilts what is fixed to the body."""
+    """Roll angle of the body, and of its sensors, per lateral acceleration."""
     pitch_gradient_deg_per_g: FiniteFloat = Field(default=0.0, ge=0, le=15)
-    """Pitch angle of the body per longitudinal acceleration."""
+    """Pitch angle of the body, and of its sensors, per longitudinal acceleration."""
     side_force_area_m2: FiniteFloat = Field(default=0.0, ge=0)
     """Frontal area times the slope of the side force coefficient, per rad of air flow angle."""
     yawing_moment_volume_m3: FiniteFloat = Field(default=0.0, ge=0)
@@ -368,56 +415,77 @@ class CarImperfections(Config):
 PERFECT = CarImperfections()
 
 
-class Traits(NamedTuple):
-    """The imperfections of a car as its equations take them, in SI units."""
+class ImperfectionConstants(NamedTuple):
+    """Imperfections of a car as constants of its equations, in SI units."""
 
     half_lash: float
-    compliance: float
-    """Tangent of the road wheels' angle lost per lateral force of the front axle."""
+    steering_compliance: float
+    """Decrease of the tangent of the front wheels' angle per lateral force of the axle."""
     toe: float
-    """Tangent of the front wheels' toe-in."""
+    """Tangent of the toe-in of the front wheels."""
     rear_left: float
     """Tangent of the rear left wheel's angle."""
     rear_right: float
     radius_fl: float
-    """At the load at rest."""
+    """Rolling radius of the front left wheel at the load at rest."""
     radius_fr: float
     radius_rl: float
     radius_rr: float
     radius_loss: float
+    """Decrease of the rolling radius per load."""
     relaxes: float
-    """1 where the tyres have a relaxation length, else 0."""
+    """1 if the tyres have a relaxation length, else 0."""
     inverse_relaxation: float
     cold_stiffness: float
     cooling: float
-    """Share of the cold tyres' excess of stiffness that is left after a sample."""
+    """Factor of the excess stiffness of cold tyres after each sample."""
     wind_force: float
     """Lateral acceleration per speed and cross-wind, in 1/m."""
     wind_moment: float
     """Yaw acceleration per speed and cross-wind, in 1/m²."""
 
 
-def traits(vehicle: VehicleParameters, flaws: CarImperfections, sample_s: float) -> Traits:
-    """Return what the equations need of a car's imperfections."""
+def imperfection_constants(
+    vehicle: VehicleParameters, imperfections: CarImperfections, sample_s: float
+) -> ImperfectionConstants:
+    """Compute the constants of a car's imperfections.
+
+    Parameters
+    ----------
+    vehicle
+        The car.
+    imperfections
+        Its imperfections.
+    sample_s
+        Time between two samples, in s.
+
+    Returns
+    -------
+    ImperfectionConstants
+        Constants in SI units.
+    """
     radius, body = vehicle.tyre.rolling_radius_m, vehicle.body
-    toe_rear, thrust = math.radians(flaws.toe_rear_deg), math.radians(flaws.thrust_angle_deg)
-    length_m = flaws.relaxation_length_m
+    toe_rear, thrust = (
+        math.radians(imperfections.toe_rear_deg),
+        math.radians(imperfections.thrust_angle_deg),
+    )
+    length_m = imperfections.relaxation_length_m
     pressure = 0.5 * AIR_DENSITY_KGPM3
-    return Traits(
-        half_lash=math.radians(flaws.steering_lash_deg) / 2,
-        compliance=math.radians(flaws.steering_compliance_deg_per_kn) / 1000,
-        toe=math.radians(flaws.toe_front_deg),
+    return ImperfectionConstants(
+        half_lash=math.radians(imperfections.steering_lash_deg) / 2,
+        steering_compliance=math.radians(imperfections.steering_compliance_deg_per_kn) / 1000,
+        toe=math.radians(imperfections.toe_front_deg),
         rear_left=thrust - toe_rear,
         rear_right=thrust + toe_rear,
-        radius_fl=radius * (1 + flaws.radius_error_fl),
-        radius_fr=radius * (1 + flaws.radius_error_fr),
-        radius_rl=radius * (1 + flaws.radius_error_rl),
-        radius_rr=radius * (1 + flaws.radius_error_rr),
-        radius_loss=flaws.radius_loss_mm_per_kn * 1e-6,
+        radius_fl=radius * (1 + imperfections.radius_error_fl),
+        radius_fr=radius * (1 + imperfections.radius_error_fr),
+        radius_rl=radius * (1 + imperfections.radius_error_rl),
+        radius_rr=radius * (1 + imperfections.radius_error_rr),
+        radius_loss=imperfections.radius_loss_mm_per_kn * 1e-6,
         relaxes=1.0 if length_m else 0.0,
         inverse_relaxation=1 / length_m if length_m else 0.0,
-        cold_stiffness=flaws.cold_stiffness,
-        cooling=1 - sample_s / flaws.warm_up_s,
-        wind_force=pressure * flaws.side_force_area_m2 / body.mass_kg,
-        wind_moment=pressure * flaws.yawing_moment_volume_m3 / body.yaw_inertia_kgm2,
+        cold_stiffness=imperfections.cold_stiffness,
+        cooling=1 - sample_s / imperfections.warm_up_s,
+        wind_force=pressure * imperfections.side_force_area_m2 / body.mass_kg,
+        wind_moment=pressure * imperfections.yawing_moment_volume_m3 / body.yaw_inertia_kgm2,
     )

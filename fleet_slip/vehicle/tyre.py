@@ -1,12 +1,13 @@
-"""Forces of a tyre: the brush model with combined slip, load and sliding speed.
+"""The brush tyre model with combined slip, and a portable arctangent.
 
-H. B. Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.3, equations 4.E25 (cornering stiffness
-over load) and 4.E7 (friction over sliding speed); J. Svendenius, "Tire Modeling and Friction
-Estimation" (Lund, 2007), for sticking and sliding parts. Derived in `docs/vehicle.md`.
+Bristles stick to the road over a part of the contact patch and slide over the remainder. The model
+and its derivation are in `docs/vehicle.md`.
 
-Arctangent from additions, multiplications and one division: the same bits everywhere.
-
-Libraries differ in the last bit. The error is below 1e-12 rad, far under one count.
+References
+----------
+H. B. Pacejka, "Tire and Vehicle Dynamics", 3rd ed. (2012), section 3.3, equations 4.E25
+(cornering stiffness over load) and 4.E7 (friction over sliding speed).
+J. Svendenius, "Tire Modeling and Friction Estimation" (Lund, 2007): sticking and sliding parts.
 """
 
 import math
@@ -16,22 +17,25 @@ from fleet_slip.compiling import equation
 from fleet_slip.vehicle.parameters import Constants
 
 CREEP_SPEED_MPS = 2.5
-"""Rolling speed below which slip is measured against this speed, so that a car comes to rest.
+"""Lower bound of the rolling speed that slip is divided by, in m/s, so that a car comes to rest.
 
-Stable where C h / (m v) < 1/4, C the slip stiffness of all wheels within `STIFFEST_TYRE`.
+Stable where C h / (m v) < 1/4, with C the slip stiffness of all wheels, h the time step, m the
+mass and v this speed. `MAX_STIFFNESS_PER_LOAD` limits C.
 """
 
-SMALLEST_SLIDING_MPS = 1e-9
-"""Keeps the direction of sliding finite where nothing slides."""
+MIN_SLIDING_MPS = 1e-9
+"""Lower bound of the sliding speed in m/s: the direction of sliding stays finite at rest."""
 
 
 class TyreForce(NamedTuple):
-    """Force of the road on the tyre in the wheel's frame, in N."""
+    """Force of the road on the tyre in the wheel's frame."""
 
     x: float
+    """Along the wheel, in N."""
     y: float
+    """Across the wheel to the left, in N."""
     damping: float
-    """−∂x/∂(longitudinal velocity), nearly: how stiffly the wheel's spin is held, in N s/m."""
+    """Approximately −∂x/∂(longitudinal velocity), in N s/m: how the tyre damps the wheel's spin."""
     slip: float
     """Longitudinal slip σx, positive when driven."""
     slip_per_speed: float
@@ -40,7 +44,26 @@ class TyreForce(NamedTuple):
 
 @equation
 def cornering_stiffness(load: float, peak: float, c: Constants) -> float:
-    """Return c1·sin(2·arctan(Fz/c2)) in N per unit of slip, without the sine."""
+    """Compute the cornering stiffness c1·sin(2·arctan(Fz/c2)), without the sine.
+
+    Parameters
+    ----------
+    load
+        Vertical load Fz, in N.
+    peak
+        Largest cornering stiffness c1, in N per unit of slip.
+    c
+        Constants of the car.
+
+    Returns
+    -------
+    float
+        Cornering stiffness, in N per unit of slip.
+
+    References
+    ----------
+    Pacejka (2012), equation 4.E25.
+    """
     x = load * c.inverse_stiffness_load
     return peak * 2.0 * x / (1.0 + x * x)
 
@@ -55,15 +78,33 @@ def brush_force(
     c: Constants,
     grip: float = 1.0,
 ) -> TyreForce:
-    """Return the force of a brush tyre where the road has `grip` times the drive's adhesion.
+    """Compute the force of a brush tyre.
 
-    `along` and `across` are the wheel centre's velocity in its frame, `rolling` is spin times
-    radius, in m/s; `load` > 0 in N; `peak` the largest cornering stiffness. Bristles stick over a
-    part λ of the patch. With slip stiffnesses Cx, Cy, slip σ = v_s / |rolling| and μ(v_s) = μ0 / (1
-    + |v_s| / V),
+    With slip stiffnesses Cx and Cy, slip σ = v_s / |rolling| and μ(v_s) = μ0 / (1 + |v_s| / V),
+    bristles stick over a part λ of the contact patch::
 
         λ = max(0, 1 − |(Cx σx, Cy σy)| / (3 μ0 Fz))
         F = λ² (Cx σx, Cy σy) + (1 − λ)² (1 + 2 λ) μ(v_s) Fz v_s / |v_s|, v_s against the sliding.
+
+    Parameters
+    ----------
+    along, across
+        Velocity of the wheel's centre in the wheel's frame, in m/s.
+    rolling
+        Spin times rolling radius, in m/s.
+    load
+        Vertical load, positive, in N.
+    peak
+        Largest cornering stiffness, in N per unit of slip.
+    c
+        Constants of the car.
+    grip
+        Adhesion at this wheel over the adhesion of the drive.
+
+    Returns
+    -------
+    TyreForce
+        Force of the road on the tyre.
     """
     slide_x = rolling - along
     slide_y = -across
@@ -83,7 +124,7 @@ def brush_force(
     stuck = max(0.0, 1.0 - used)
     stuck2 = stuck * stuck
     loose = (1.0 - stuck) * (1.0 - stuck) * (1.0 + 2.0 * stuck)
-    sliding = max(math.sqrt(slide_x * slide_x + slide_y * slide_y), SMALLEST_SLIDING_MPS)
+    sliding = max(math.sqrt(slide_x * slide_x + slide_y * slide_y), MIN_SLIDING_MPS)
     decay = 1.0 + sliding * c.inverse_decay_speed
     decayed = 1.0 / (sliding * decay)
     drag = limit * loose * decayed
@@ -98,7 +139,8 @@ def brush_force(
 
 
 TAN_PI_8 = math.sqrt(2.0) - 1.0
-SMALLEST = 1e-300
+MIN_DENOMINATOR = 1e-300
+"""Keeps the quotient of the null vector finite."""
 
 A0 = 0.99999999999927092
 A1 = -0.3333333327838281
@@ -113,15 +155,29 @@ A7 = -0.037701690770728893
 
 @equation
 def arctan2(y: float, x: float) -> float:
-    """Return the angle of the vector (x, y) in rad, in [−π, π]; 0 for the null vector."""
+    """Compute the angle of a vector, with the same bits on every machine.
+
+    C libraries differ in the last bit of `atan2`. This one uses additions, multiplications and one
+    division. Its error is below 1e-12 rad, far less than one count.
+
+    Parameters
+    ----------
+    y, x
+        Components of the vector.
+
+    Returns
+    -------
+    float
+        Angle in rad, in [−π, π]; 0 for the null vector.
+    """
     small, large = min(abs(x), abs(y)), max(abs(x), abs(y))
-    turned = small > TAN_PI_8 * large
-    numerator = small - large if turned else small
-    denominator = small + large if turned else large
-    q = numerator / max(denominator, SMALLEST)
+    rotated = small > TAN_PI_8 * large
+    numerator = small - large if rotated else small
+    denominator = small + large if rotated else large
+    q = numerator / max(denominator, MIN_DENOMINATOR)
     z = q * q
     series = A0 + z * (A1 + z * (A2 + z * (A3 + z * (A4 + z * (A5 + z * (A6 + z * A7))))))
-    octant = q * series + (math.pi / 4 if turned else 0.0)
+    octant = q * series + (math.pi / 4 if rotated else 0.0)
     quadrant = math.pi / 2 - octant if abs(y) > abs(x) else octant
     half = math.pi - quadrant if x < 0.0 else quadrant
     return -half if y < 0.0 else half

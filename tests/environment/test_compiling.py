@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip import compiling
-from fleet_slip.vehicle.batch_kernel import simulate as lanes
+from fleet_slip.vehicle.batch_kernel import simulate_lanes as lanes
 from tests.support.commands import Finished, run
 
 SOURCE = """
@@ -176,7 +176,7 @@ def test_a_change_of_what_a_kernel_imports_or_of_the_compiler_takes_another_fold
 
 
 LANES = """
-from fleet_slip.vehicle.batch_kernel import simulate as lanes
+from fleet_slip.vehicle.batch_kernel import simulate_lanes as lanes
 print(lanes._cache._index_key("signature", lanes.targetctx.codegen()))
 """
 

@@ -8,14 +8,20 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
-from fleet_slip.vehicle.dynamics import NO_BRAKES, Around, Give, GiveRates, imperfect_derivative
+from fleet_slip.vehicle.dynamics import (
+    NO_BRAKES,
+    Compliance,
+    ComplianceRates,
+    Environment,
+    imperfect_derivative,
+)
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
     STEP_S,
     Slopes,
     advance,
-    advance_give,
+    advance_compliance,
 )
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
@@ -24,7 +30,7 @@ from fleet_slip.vehicle.parameters import (
     State,
     VehicleParameters,
     constants,
-    traits,
+    imperfection_constants,
 )
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
@@ -123,9 +129,9 @@ class Response(NamedTuple):
 def _run(
     x: State,
     slopes: Slopes,
-    give: Give,
-    rates: GiveRates,
-    around: Around,
+    compliance: Compliance,
+    rates: ComplianceRates,
+    environment: Environment,
     c: Any,
     t: Any,
     demand: FloatArray,
@@ -138,11 +144,13 @@ def _run(
         u = Controls(demand[i], resistance - x.vy * x.yaw_rate + SPEED_GAIN_1PS * (speed - x.vx))
         out[0, i], out[1, i], out[3, i] = x.yaw_rate, x.vy, x.vx
         for step in range(STEPS):
-            d, new = imperfect_derivative(x, u, give, around, NO_BRAKES, c, t)
+            d, new = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
             if step == 0:
                 out[2, i] = d.ay
             x, slopes = advance(x, d, slopes, c, STEP_S, order)
-            give = advance_give(give, new, rates, x.steering_wheel, t, STEP_S, order)
+            compliance = advance_compliance(
+                compliance, new, rates, x.steering_wheel, t, STEP_S, order
+            )
             rates, order = new, SECOND_ORDER
     return out
 
@@ -151,11 +159,14 @@ def steer(
     car: VehicleParameters, flaws: CarImperfections, demand_rad: FloatArray, speed_mps: float
 ) -> Response:
     """Return what a car does on a flat, dry road under a demand for every 10 ms."""
-    c, t = constants(car, 1.0), traits(car, flaws, SAMPLE_S)
+    c, t = constants(car, 1.0), imperfection_constants(car, flaws, SAMPLE_S)
     x = State(speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *4 * (speed_mps * c.inverse_radius,))
     still = Slopes(*(0.0 for _ in Slopes._fields))
-    rest, steady = Give(*(0.0 for _ in Give._fields)), GiveRates(*(0.0 for _ in GiveRates._fields))
-    warm = Around(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+    rest, steady = (
+        Compliance(*(0.0 for _ in Compliance._fields)),
+        ComplianceRates(*(0.0 for _ in ComplianceRates._fields)),
+    )
+    warm = Environment(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
     rate, vy, ay, vx = _run(x, still, rest, steady, warm, c, t, demand_rad, speed_mps)
     time_s = np.arange(len(demand_rad), dtype=np.float64) * SAMPLE_S
     return Response(time_s, demand_rad, rate, np.arctan2(vy, vx), ay, vx)

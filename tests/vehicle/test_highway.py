@@ -10,7 +10,7 @@ from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle.highway import FourWheelVehicle, PlainVehicle, bicycle_of
+from fleet_slip.vehicle.highway import FourWheelVehicle, LinearTyreVehicle, highway_twin
 from fleet_slip.vehicle.parameters import Controls, State, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
 
@@ -20,8 +20,8 @@ gymnasium.register_envs(highway_env)
 def test_without_its_extensions_the_car_moves_as_highway_env_s() -> None:
     """Rajamani, equations 2.21 to 2.28."""
     generator = np.random.default_rng(7)
-    car = PlainVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
-    twin = bicycle_of(car)
+    car = LinearTyreVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
+    twin = highway_twin(car)
     for _ in range(2000):
         vx, vy, yaw_rate = generator.normal(size=3) * np.array([25.0, 5.0, 1.0])
         vx = vx if abs(vx) > 1 else 25.0
@@ -35,14 +35,14 @@ def test_without_its_extensions_the_car_moves_as_highway_env_s() -> None:
 def test_at_small_slip_the_car_moves_as_highway_env_s() -> None:
     generator = np.random.default_rng(8)
     car = FourWheelVehicle(None, [3.0, -2.0], heading=0.3, speed=20.0)
-    twin, c = bicycle_of(car), car.constants
+    twin, c = highway_twin(car), car.constants
     for _ in range(500):
         vx, steering = generator.uniform(15.0, 40.0), generator.uniform(-1e-4, 1e-4)
         vy, yaw_rate = generator.uniform(-1e-4, 1e-4, size=2) * np.array([vx, vx / 3])
-        turn = yaw_rate * np.array([-c.half_track_front, c.half_track_front] * 2)
+        turn = yaw_rate * np.array([-c.half_track_width_front, c.half_track_width_front] * 2)
         wheels = dict(zip(State._fields[-4:], (vx + turn) * c.inverse_radius, strict=True))
         at_wheel = SEDAN.steering.ratio * np.tan(steering)
-        car._hidden = rolling(vx, steering_wheel=at_wheel)._replace(**wheels)
+        car._internal = rolling(vx, steering_wheel=at_wheel)._replace(**wheels)
         car.action = twin.action = {"steering": steering, "acceleration": 0.0}
         state = np.array([[100.0, 100.0, 0.3, vx, vy, yaw_rate]]).T
         ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)

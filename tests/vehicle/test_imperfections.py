@@ -5,12 +5,18 @@ import pytest
 
 from fleet_slip.vehicle.batch import LaneDrive, Road, Surface
 from fleet_slip.vehicle.driver import SAMPLE_S, handling
-from fleet_slip.vehicle.dynamics import Give, GiveRates
-from fleet_slip.vehicle.integration import SECOND_ORDER, advance_give
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, PERFECT, CarImperfections, constants, traits
+from fleet_slip.vehicle.dynamics import Compliance, ComplianceRates
+from fleet_slip.vehicle.integration import SECOND_ORDER, advance_compliance
+from fleet_slip.vehicle.parameters import (
+    GRAVITY_MPS2,
+    PERFECT,
+    CarImperfections,
+    constants,
+    imperfection_constants,
+)
 from tests.support.rolling import SEDAN, Truth, simulate_drives
 
-RIGID = Give(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+RIGID = Compliance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def surface(entries: int, **changes: float) -> Surface:
@@ -93,13 +99,15 @@ def test_compliance_shows_in_the_wheels_and_not_in_what_the_sideslip_is() -> Non
 
 
 def test_a_rack_with_play_rests_until_the_column_has_crossed_it() -> None:
-    t = traits(SEDAN, CarImperfections(steering_lash_deg=4.0), SAMPLE_S)
-    half, still = np.radians(2.0), GiveRates(0.0, 0.0, 0.0, 0.0, 0.0)
+    t = imperfection_constants(SEDAN, CarImperfections(steering_lash_deg=4.0), SAMPLE_S)
+    half, still = np.radians(2.0), ComplianceRates(0.0, 0.0, 0.0, 0.0, 0.0)
     rack = []
-    give = RIGID
+    compliance = RIGID
     for column in np.radians([1.0, 2.0, 3.0, 5.0, 3.0, 1.0, 0.9, -3.0]):
-        give = advance_give(give, still, still, float(column), t, 0.002, SECOND_ORDER)
-        rack.append(give.rack)
+        compliance = advance_compliance(
+            compliance, still, still, float(column), t, 0.002, SECOND_ORDER
+        )
+        rack.append(compliance.rack)
     expected = [0.0, 0.0, np.radians(1), np.radians(3), np.radians(3), np.radians(3)]
     np.testing.assert_allclose(rack[:6], expected, atol=1e-12)
     assert rack[6] == pytest.approx(np.radians(0.9) + half)

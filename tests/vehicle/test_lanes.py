@@ -92,7 +92,7 @@ def test_on_a_slippery_road_a_dry_speed_profile_loses_the_car(mass_kg: float) ->
     truth = drive(SEDAN.with_sprung_mass(mass_kg), road("waterford_hills", 5.0), adhesion=0.4)
     lost = truth.lost_control_tick
     assert lost is not None
-    assert len(truth.vx_mps) == lost + batch_kernel.AFTER_LOSS + 1
+    assert len(truth.vx_mps) == lost + batch_kernel.SAMPLES_AFTER_LOSS + 1
     assert np.abs(truth.lateral_offset_m[:lost]).max() <= batch_kernel.LOST_OFFSET_M
     for name in CHANNELS:
         assert np.isfinite(getattr(truth, name)).all()
@@ -213,7 +213,7 @@ def test_an_open_road_ends_the_drive() -> None:
 
 
 def test_a_drive_that_gets_nowhere_ends() -> None:
-    """An engine too weak for the profile: the drive ends after PATIENCE times the plan."""
+    """An engine too weak for the profile: the drive ends after MAX_TIME_FACTOR times the plan."""
     feeble = SEDAN.model_copy(
         update={"drivetrain": SEDAN.drivetrain.model_copy(update={"power_w": 3000.0})}
     )
@@ -226,8 +226,8 @@ def test_a_drive_that_gets_nowhere_ends() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"speed_mps": np.full(3, 10.0)}, "as many of speed"),
-        ({"length_m": 300.0}, "not 300.0 m long"),
+        ({"speed_mps": np.full(3, 10.0)}, "as many of both"),
+        ({"length_m": 300.0}, "length of 300.0 m"),
         ({"speed_mps": np.full(200, 0.0)}, "above 0.5 m/s"),
         ({"curvature_1pm": np.full(200, np.nan)}, "finite curvature"),
     ],
@@ -248,8 +248,8 @@ def test_the_inner_loop_is_vector_instructions_without_fused_operations() -> Non
     """On x86-64 with AVX: the physics divides in whole vectors, and no operation is fused."""
 
     def loops(memory: Any) -> None:  # those of the kernel over all lanes
-        batch_kernel.decide_all(memory)
-        batch_kernel.integrate(memory, 0.002, True)
+        batch_kernel.decide_lanes(memory)
+        batch_kernel.integrate_lanes(memory, 0.002, True)
 
     fresh = inner_loop(loops)
     fresh(batch_kernel.empty_lanes()[0])

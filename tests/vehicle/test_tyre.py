@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.compiling import kernel
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle.driver import LARGEST_GRIP_USE, Handling, slip_growth
-from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, followed
+from fleet_slip.vehicle.driver import MAX_GRIP_USE, Handling, slip_growth
+from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, lag_step
 from fleet_slip.vehicle.parameters import Constants, constants, load_vehicle
 from fleet_slip.vehicle.tyre import TyreForce, arctan2, brush_force, cornering_stiffness
 from tests.support.rolling import CAR
@@ -143,22 +143,22 @@ def test_a_lag_is_followed_to_third_order(rate: float, inverse_lag: float) -> No
     """Against rate · lag · (1 − exp(−h / lag)); the next term of the series bounds the error."""
     z = STEP_S * inverse_lag
     exact = rate / inverse_lag * -math.expm1(-z)
-    assert abs(followed(rate, inverse_lag, STEP_S) - exact) <= abs(rate) * STEP_S * z**2 / 6 + 1e-15
+    assert abs(lag_step(rate, inverse_lag, STEP_S) - exact) <= abs(rate) * STEP_S * z**2 / 6 + 1e-15
 
 
 def test_the_drivers_growth_of_slip_stays_below_the_brush_tyres() -> None:
     """3 / (3 − f) against 3 (1 − ∛(1 − f)) / f: 3.1 % low at half the grip, 20 % at 0.9 of it."""
     knows = Handling(2.8, 1.7, 0.0, 0.0, 1.0, 15.0)
-    for use in np.linspace(1e-3, LARGEST_GRIP_USE, 500):
+    for use in np.linspace(1e-3, MAX_GRIP_USE, 500):
         exact = 3 * (1 - (1 - use) ** (1 / 3)) / use
         low = 1 - slip_growth(0.0, float(use), knows) / exact
         assert -1e-9 <= low <= (0.031 if use <= 0.5 else 0.201), use
 
 
 def test_the_cars_lags_are_long_against_the_step() -> None:
-    """So that the series of `followed` is short of the exponential by less than 0.05 %."""
+    """So that the series of `lag_step` is short of the exponential by less than 0.05 %."""
     for name in CARS:
         c = constants(load_vehicle(name, SHIPPED_CONFIGS), adhesion=1.0)
         for inverse_lag in (c.inverse_steering_lag, c.inverse_drive_lag):
             exact = -math.expm1(-STEP_S * inverse_lag) / inverse_lag
-            assert abs(followed(1.0, inverse_lag, STEP_S) / exact - 1) < 5e-4
+            assert abs(lag_step(1.0, inverse_lag, STEP_S) / exact - 1) < 5e-4
