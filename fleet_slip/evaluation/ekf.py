@@ -216,13 +216,13 @@ def axles_of(
 
 
 def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> FloatArray:
-    """Estimate side-slip in rad by row. Raises `DataError` without a sensor."""
+    """Estimate side-slip in rad by row. Raises `MissingSignalError`."""
     vx_mps, vy_mps = _filter(inputs_of(drive, car, noise))
     return sideslip_angle(vx_mps, vy_mps)
 
 
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
-    """Return the inputs of the filter for a drive, gaps bridged. Raises `DataError`."""
+    """Return the inputs of the filter for a drive, gaps bridged. Raises `MissingSignalError`."""
     drive = noise.sensors.corrected(drive, car)
     yaw_rate_rad_s, _ = yaw_rate_filter.estimate(drive, car, noise.yaw_rate)
     vx_mps = measured_speed_mps(drive, car)

@@ -9,7 +9,12 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.errors import DataError
+
+
+class MissingSignalError(DataError):
+    """A drive lacks a signal that an estimator needs."""
+
 
 MIN_SPEED_MPS = 2.0
 """Speed below which no angle is evaluated: at standstill there is none, and a label is noise."""
@@ -36,7 +41,8 @@ D = TypeVar("D", bound=Drive)
 Estimator = Callable[[D], FloatArray]
 """Side-slip angle in rad at every tick, shape (ticks,); NaN where there is no estimate.
 
-An estimator reads the signals of a drive and the attributes of its vehicle, never the reference.
+An estimator reads the signals of a drive and the attributes of its vehicle, never the reference. It
+raises `MissingSignalError` for a drive without a signal that it needs.
 """
 
 
@@ -127,23 +133,25 @@ class EvaluatedDrive(Generic[D]):
 def evaluate(
     drives: Sequence[D], estimators: Mapping[str, Estimator[D]]
 ) -> tuple[EvaluatedDrive[D], ...]:
-    """Estimate every drive by every estimator, all on the same rows of a drive."""
+    """Estimate every drive by every estimator, all on the same rows of a drive.
+
+    A drive that lacks a signal has no estimate (NaN); any other error of an estimator is raised.
+    """
     return tuple(
         EvaluatedDrive(
             drive,
             drive.name,
             drive.evaluated,
-            {name: try_estimate(estimator, drive) for name, estimator in estimators.items()},
+            {name: _estimate(estimator, drive) for name, estimator in estimators.items()},
         )
         for drive in drives
     )
 
 
-def try_estimate(estimator: Estimator[D], drive: D) -> FloatArray:
-    """Estimate a drive; NaN everywhere if it lacks a signal that the estimator needs."""
+def _estimate(estimator: Estimator[D], drive: D) -> FloatArray:
     try:
         return estimator(drive)
-    except (DataError, QuestionError):
+    except MissingSignalError:
         return np.full(len(drive.sideslip_rad), np.nan)
 
 

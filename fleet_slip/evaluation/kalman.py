@@ -13,8 +13,8 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.errors import DataError
 from fleet_slip.evaluation import yaw_rate_filter
+from fleet_slip.evaluation.evaluator import MissingSignalError
 from fleet_slip.evaluation.gaussian_state import (
     GaussianState,
     independent_state,
@@ -132,12 +132,14 @@ def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) ->
     """Return vx in m/s, the bias of ax in m/s², vy and the bias of ay, shape (4, rows).
 
     The filter starts at the first GPS fix, NaN before it, predicts at every row and updates at
-    every fix. Gaps of the accelerometers are bridged by the last value. Raises `DataError` if the
-    drive has no fix.
+    every fix. Gaps of the accelerometers are bridged by the last value. Raises
+    `MissingSignalError` if the drive has no fix.
     """
     fixes = np.flatnonzero(np.isfinite(drive.gps_vx_mps) & np.isfinite(drive.gps_vy_mps))
     if not len(fixes):
-        raise DataError("no GPS fix, which the Kalman filter starts from. Choose drives with GPS.")
+        raise MissingSignalError(
+            "the drive has no GPS fix, from which the Kalman filter starts. Choose drives with GPS."
+        )
     return _filter(
         hold_last(drive.ax_mps2, "ax"),
         hold_last(drive.ay_mps2, "ay"),

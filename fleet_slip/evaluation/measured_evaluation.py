@@ -4,7 +4,7 @@ Without the held-out segments, columns are chosen by each model's own recipe and
 tuned and a car is identified: neither a fit nor a choice saw the rows that an error is taken on.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -22,7 +22,6 @@ from fleet_slip.evaluation.evaluator import (
     Estimator,
     evaluate,
     pooled_statistics,
-    try_estimate,
     variation_between_drives,
 )
 from fleet_slip.evaluation.filters import (
@@ -93,11 +92,9 @@ def evaluate_measured(
         held_out: competition.fit(held_out) for held_out in dict.fromkeys([*folds, *kinds.values()])
     }
     runs = evaluate(competition.drives, cross_fitted({fold: fitted[fold] for fold in folds}))
-    errors = {
-        name: statistics
-        for name, statistics in pooled_statistics(runs).items()
-        if statistics.rmse_deg is not None
-    }
+    pooled = pooled_statistics(runs)
+    errors = {name: row for name, row in pooled.items() if row.rmse_deg is not None}
+    competition.warn_of_missing(pooled, errors)
     of_kinds = {}
     if kinds:
         by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
@@ -181,7 +178,7 @@ def cross_fitted(fitted: Mapping[Segments, FittedFold]) -> dict[str, Estimator[H
         for held_out, fold in fitted.items():
             rows = drive.rows_in(held_out)
             if name in fold and rows.any():
-                combined[rows] = try_estimate(fold[name].estimate, drive)[rows]
+                combined[rows] = fold[name].estimate(drive)[rows]
         return combined
 
     names = dict.fromkeys(name for fold in fitted.values() for name in fold)
@@ -217,7 +214,7 @@ class Competition:
     cars: CarCounts
     executor: Executor
     _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
-    _failures: set[str] = field(default_factory=set)
+    _failures: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def collect(
@@ -296,14 +293,20 @@ class Competition:
             try:
                 columns, model = learner.train(held_out, self._prior(learner, identified))
             except (DataError, QuestionError) as error:
-                if name not in self._failures:
-                    LOGGER.warning("%s is missing in some folds: %s", name, error)
-                self._failures.add(name)
+                self._failures[name] = str(error)
             else:
                 yield (
                     name,
                     FittedEstimator(source, partial(predict_drive, model, self.cars), columns),
                 )
+
+    def warn_of_missing(self, estimators: Collection[str], evaluated: Collection[str]) -> None:
+        """Warn of models without a fit for some segments, and of estimators without an estimate."""
+        for name, reason in self._failures.items():
+            extent = "segments without a fit" if name in evaluated else "not evaluated"
+            LOGGER.warning("%s: %s: %s", name, extent, reason)
+        for name in set(estimators) - {*evaluated, *self._failures}:
+            LOGGER.warning("%s: not evaluated: no drive has the signals that it needs.", name)
 
     def _prior(self, learner: Learner, identified: Identified | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""

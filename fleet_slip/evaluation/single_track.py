@@ -15,8 +15,8 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.compiling import kernel
-from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
+from fleet_slip.errors import QuestionError
+from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS, MissingSignalError
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from fleet_slip.warehouse.database import reading_files
@@ -93,12 +93,12 @@ def read_drive(
 
 
 def hold_last(values: FloatArray, name: str) -> FloatArray:
-    """Return a signal, gaps filled by the last value. Raises `DataError` without any value."""
+    """Fill the gaps of a signal by the last value. Raises `MissingSignalError` without any."""
     valid = np.isfinite(values)
     if valid.all():
         return values
     if not valid.any():
-        raise DataError(
+        raise MissingSignalError(
             f"the drive has no {name}, which this estimator needs. Choose drives that have it, or "
             "another estimator."
         )
@@ -170,7 +170,7 @@ SLOWEST_MPS = 5.0
 
 
 def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
-    """Return the longitudinal velocity from wheel speeds. Raises `DataError` without them."""
+    """Return the longitudinal velocity from wheel speeds. Raises `MissingSignalError`."""
     return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
@@ -180,7 +180,7 @@ L = TypeVar("L", bound=LabelledDrive)
 def without_rest(drive: L, car: VehicleParameters) -> L:
     """Drop the labels of rows in which the car rests or creeps.
 
-    Raises `DataError` without wheel speeds.
+    Raises `MissingSignalError` without wheel speeds.
     """
     moves = measured_speed_mps(drive.signals, car) > MIN_SPEED_MPS
     return replace(drive, sideslip_rad=np.where(moves, drive.sideslip_rad, np.nan))
@@ -189,7 +189,7 @@ def without_rest(drive: L, car: VehicleParameters) -> L:
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:
     """Return the mean angle of the front wheels that are logged.
 
-    Raises `DataError` without any.
+    Raises `MissingSignalError` without any.
     """
     wheels = (drive.steer_fl_rad, drive.steer_fr_rad)
     logged = [angle_rad for angle_rad in wheels if np.isfinite(angle_rad).any()]

@@ -8,8 +8,12 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.errors import DataError
-from fleet_slip.evaluation.evaluator import evaluate, pooled_statistics, variation_between_drives
+from fleet_slip.evaluation.evaluator import (
+    MissingSignalError,
+    evaluate,
+    pooled_statistics,
+    variation_between_drives,
+)
 from fleet_slip.evaluation.held_out import HeldOutDrive, Segments, folds_of
 from fleet_slip.evaluation.measured_evaluation import FittedEstimator, cross_fitted
 from fleet_slip.evaluation.single_track import DriveSignals
@@ -34,7 +38,7 @@ def off_by(degrees: float) -> Callable[[Straight], FloatArray]:
 
 
 def lacks_a_signal(drive: Straight) -> FloatArray:
-    raise DataError(f"{drive.name} has no ay. Choose drives that have it.")
+    raise MissingSignalError(f"{drive.name} has no ay. Choose drives that have it.")
 
 
 def straight(name: str, rows: int) -> Straight:

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pytest
 
 import fleet_slip
+from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, filters, measured_evaluation
 from fleet_slip.evaluation.held_out import (
     HeldOutDrive,
@@ -113,6 +114,36 @@ def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
 def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> None:
     done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
     assert done.json["estimators"]["own@1"]["told"] == "as published"
+
+
+def test_an_error_of_a_published_model_stops_the_evaluation(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Missing estimates would pass for a model that does not compete."""
+
+    def fail(*_: object) -> None:
+        raise DataError("the drive has too many rows for windows.")
+
+    monkeypatch.setattr(measured_evaluation, "predict_drive", fail)
+    done = run_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
+    assert done.exit_code == DataError.exit_code
+    assert "too many rows" in done.stderr
+
+
+def test_a_model_that_cannot_be_fitted_is_reported_with_the_reason(
+    own: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train = Learner.train
+
+    def fail(learner: Learner, *words: Any) -> Any:
+        if learner.plan.request.model == "ax,ay,yaw_rate":
+            raise DataError("the training drives have no ax.")
+        return train(learner, *words)
+
+    monkeypatch.setattr(Learner, "train", fail)
+    done = done_on(own, "publish", "three", "--model", "ax,ay,yaw_rate", "--force")
+    done = done_on(own, "evaluate", "three", "--cohort", "vehicle_id >= 'car-2'")
+    assert "three@1: not evaluated: the training drives have no ax." in done.stderr
 
 
 MORE_SIGNALS = """
