@@ -24,8 +24,9 @@ from fleet_slip.catalogue.course import (
 from fleet_slip.catalogue.facts import BY_COURSE, BY_SATELLITE, NumberName
 from fleet_slip.catalogue.features import features, input_scales
 from fleet_slip.catalogue.signals import catalogue
+from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
+from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms
 
 NO_COURSE = "no row above 3 m/s has the yaw rate, ay and all four wheel speeds"
 NO_STEERING = "no row above 3 m/s has both steering angles beside the other signals"
@@ -186,7 +187,7 @@ def bank_of_bends(sums: Mapping[str, Gram]) -> Fraction | None:
     course = sums.get("course")
     if course is None or (noise := gyroscope_noise(course, sums.get("steering"))) is None:
         return None
-    solution = solve(COURSE.system(ExactSums(course, course_terms()), noise))
+    solution = solve_rational(COURSE.system(ExactSums(course, course_terms()), noise))
     return solution[-1] if solution else None
 
 
@@ -204,7 +205,7 @@ def _estimate_course(
 ) -> dict[NumberName, CarEstimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
-    solution = solve(relation.system(sums, noise))
+    solution = solve_rational(relation.system(sums, noise))
     if solution is None or not solution[1]:
         return ALIKE
     gradients: dict[NumberName, tuple[float, ...]]
@@ -241,7 +242,7 @@ def _estimate_steering(
     yaw_rate_offset, ay_offset = found["yaw_rate_offset"].value, found["ay_offset"].value
     terms = steering_terms(yaw_rate_offset)
     sums = ExactSums(gram, terms)
-    solution = solve(STEERING.system(sums, noise))
+    solution = solve_rational(STEERING.system(sums, noise))
     if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
         return dict.fromkeys(OF_STEERING, STRAIGHT)
     straight, by_bend, understeer = solution
@@ -281,7 +282,7 @@ def _standstill(sums: Mapping[str, Gram]) -> Estimates:
         return {}
     terms = {name: course_terms()[name] for name in ("yaw_rate", "speed", "wheels")}
     still = ExactSums(gram, terms)
-    solution = solve(STILL.system(still, 0))
+    solution = solve_rational(STILL.system(still, 0))
     if solution is None or still.mean("speed") >= LONGEST_ROLL_MPS:
         return {}
     one = CarEstimate(STANDSTILL, STILL, terms, Fraction(0), solution[0], (1.0, 0.0))
@@ -338,7 +339,7 @@ def _speed_ratio(sums: Mapping[str, Gram]) -> Estimates:
     if gram is None or gram.n == 0:
         return {}
     terms = {"speed": course_terms()["speed"], SATELLITE: _si(**{SATELLITE: 1})}
-    solution = solve(SPEED.system(ExactSums(gram, terms), 0))
+    solution = solve_rational(SPEED.system(ExactSums(gram, terms), 0))
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
@@ -358,7 +359,7 @@ def _slip(sums: Mapping[str, Gram]) -> Estimates:
     exact = ExactSums(gram, terms)
     if gram.n < FEWEST_CHANGES or exact.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
         return dict.fromkeys(OF_SLIP, FEW_TURNS)
-    solution = solve(CHANGE.system(exact, 0))
+    solution = solve_rational(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
         return dict.fromkeys(OF_SLIP, NO_CAR)
     of = (SLIP, CHANGE, terms, Fraction(0))

@@ -13,9 +13,8 @@ import numpy as np
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.drives import DriveMoments
-from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,
@@ -27,7 +26,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
-from fleet_slip.regression.least_squares import Fit, Scales, dependence, fit_leading, moments
+from fleet_slip.regression.least_squares import Fit, Scales, fit
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_size, criterion_values
 
@@ -242,13 +241,30 @@ def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
 def nested_fits(
     gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
 ) -> list[Fit]:
-    """Return the exact fits of the first 0..k signals. Raises `DataError` for dependent ones."""
-    part = gram.restrict([*order, label])
-    triangle = eliminate(moments(part, intercept=intercept))
-    if triangle.singular is not None:
-        raise DataError(dependence(part, order, intercept=intercept))
-    sizes = range(len(order) + 1)
-    return [fit_leading(part, triangle, size, intercept=intercept) for size in sizes]
+    """Fit the nested models of an order of signals exactly.
+
+    Parameters
+    ----------
+    gram : Gram
+        Sums and products of counts, of at least the order and the label.
+    order : sequence of str
+        The k signals; model j has the first j of them.
+    label : str
+    intercept : bool
+
+    Returns
+    -------
+    list of Fit
+        k + 1 fits, of 0 to k signals.
+
+    Raises
+    ------
+    DataError
+        If signals are linearly dependent, or the Gram has no rows.
+    """
+    full = fit(gram, order, label, intercept=intercept)
+    smaller = [fit(gram, order[:size], label, intercept=intercept) for size in range(len(order))]
+    return [*smaller, full]
 
 
 CROSS_VALIDATION = "cross-validation"

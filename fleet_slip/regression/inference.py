@@ -18,7 +18,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.drives import DriveMoments
-from fleet_slip.regression.exact import inverse_matrix
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
@@ -110,14 +109,15 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     inputs, gram = fitted.model.signals, fitted.gram
     scale = gram.n if fitted.has_intercept else 1
     part = gram.restrict(inputs)
-    inverse = inverse_matrix(moments(part, intercept=fitted.has_intercept))
-    slopes = [variance * scale * inverse[i][i] for i in range(fitted.size)]
+    inverse, denominator = exact.invert(moments(part, intercept=fitted.has_intercept))
+    unit = variance * scale / denominator
+    slopes = [unit * inverse[i][i] for i in range(fitted.size)]
     if not fitted.has_intercept:
         return slopes
     k = range(fitted.size)
     # S^-1 = n N^-1 and m = sums / n, so m'S^-1 m = sums'N^-1 sums / n.
     form = sum(part.sums[i] * inverse[i][j] * part.sums[j] for i in k for j in k)
-    return [variance * (1 + form) / gram.n, *slopes]
+    return [variance * (1 + Fraction(form, denominator)) / gram.n, *slopes]
 
 
 def infer_classically(fitted: Fit, scales: Scales) -> Inference:
@@ -172,8 +172,11 @@ def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
     if relations:
         raise DataError(relations)
     matrix = moments(gram.restrict(inputs))
-    inverse = inverse_matrix(matrix)
-    return {name: float(matrix[i][i] * inverse[i][i]) for i, name in enumerate(inputs)}
+    inverse, denominator = exact.invert(matrix)
+    return {
+        name: matrix[i][i] * inverse[i][i] / denominator  # two integers: one rounding
+        for i, name in enumerate(inputs)
+    }
 
 
 def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact import eliminate, inverse_matrix
+from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import dependence, moments
 
@@ -36,9 +36,10 @@ def correlation(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...
 def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Order by |t| in the full model, largest first: b_i^2 / (S^-1)_ii."""
     matrix = _moments(gram, inputs, label)
-    inverse = inverse_matrix([row[:-1] for row in matrix[:-1]])
+    inverse, denominator = exact.invert([row[:-1] for row in matrix[:-1]])
     slopes = [sum(a * b for a, b in zip(row, matrix[-1], strict=False)) for row in inverse]
-    return _descending(inputs, [b**2 / inverse[i][i] for i, b in enumerate(slopes)])
+    scores = [Fraction(b**2, inverse[i][i] * denominator) for i, b in enumerate(slopes)]
+    return _descending(inputs, scores)
 
 
 def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
@@ -68,10 +69,10 @@ def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str,
 
 
 def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
-    matrix = moments(gram.restrict([*inputs, label]))
-    if eliminate(matrix).singular is not None:
-        raise DataError(dependence(gram, inputs))
-    return matrix
+    relations = dependence(gram, inputs)
+    if relations:
+        raise DataError(relations)
+    return moments(gram.restrict([*inputs, label]))
 
 
 def _stepwise(gram: Gram, inputs: Sequence[str], label: str, method: str) -> tuple[str, ...]:
@@ -262,6 +263,8 @@ class _Search:
         return work
 
     def _rss(self, chosen: Sequence[int]) -> Fraction:
-        at = [*chosen, self.inputs]
-        found = eliminate([[self.exact[i][j] for j in at] for i in at])
-        return found.residual(len(found.rows))
+        bordered, inner = (
+            exact.determinant([[self.exact[i][j] for j in columns] for i in columns])
+            for columns in ([*chosen, self.inputs], chosen)
+        )
+        return Fraction(bordered, inner)

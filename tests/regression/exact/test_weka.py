@@ -17,7 +17,6 @@ import pytest
 
 from fleet_slip.regression import exact as exact_roots
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate
 from fleet_slip.regression.gram import Gram
@@ -88,7 +87,9 @@ def fit_penalised(
     matrix = [[common * entry for entry in row] for row in part.centred()]
     for i, penalty in enumerate(penalties):
         matrix[i][i] += int(part.n * common * penalty)
-    numerators, determinant = eliminate(matrix).solve(len(inputs))
+    solution = exact_roots.solve([row[:-1] for row in matrix[:-1]], matrix[-1][:-1])
+    assert solution is not None
+    numerators, determinant = solution
     slopes = [Fraction(x, determinant) for x in numerators]
     total = part.sums[-1] - sum(b * s for b, s in zip(slopes, part.sums, strict=False))
     return LinearModel(tuple(inputs), label, tuple(slopes), Fraction(total, part.n))

@@ -1,5 +1,6 @@
-"""Standard errors, Chow test and variance inflation against dense formulas and SciPy."""
+"""Standard errors, Chow test and variance inflation against dense formulas and closed forms."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -9,13 +10,12 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy.special import betainc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import DriveMoments, serving_drives
-from fleet_slip.regression.figures import incomplete_beta
+from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
     Evidence,
@@ -105,9 +105,17 @@ def test_serving_drives_stacks_tables() -> None:
     assert mask.tolist() == [True, False, True]
 
 
-@given(st.floats(0.05, 1e4), st.floats(0.05, 1e4), st.floats(0.0, 1.0))
-def test_incomplete_beta_equals_scipy(a: float, b: float, x: float) -> None:
-    assert incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-8, abs=1e-12)
+@given(st.floats(-30, 30))
+def test_p_values_of_one_and_two_degrees_have_closed_forms(t: float) -> None:
+    one = 1 - 2 / math.pi * math.atan(abs(t))
+    assert student_t_two_sided(t, 1) == pytest.approx(one, rel=1e-12)
+    two = 1 - abs(t) / math.sqrt(2 + t * t)
+    assert student_t_two_sided(t, 2) == pytest.approx(two, rel=1e-10)
+
+
+def test_p_values_of_no_effect_and_of_no_error() -> None:
+    assert student_t_two_sided(0.0, 3) == student_t_two_sided(1e-200, 3) == 1
+    assert student_t_two_sided(math.inf, 3) == student_t_two_sided(1e200, 3) == 0
 
 
 AGREEMENT = 1e-9
