@@ -26,7 +26,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
-from fleet_slip.regression.least_squares import Fit, Scales, fit
+from fleet_slip.regression.least_squares import Fit, Scales, fit_moments, moments
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_size, criterion_values
 
@@ -262,9 +262,15 @@ def nested_fits(
     DataError
         If signals are linearly dependent, or the Gram has no rows.
     """
-    full = fit(gram, order, label, intercept=intercept)
-    smaller = [fit(gram, order[:size], label, intercept=intercept) for size in range(len(order))]
-    return [*smaller, full]
+    matrix = moments(gram.restrict([*order, label]), intercept=intercept)
+
+    def fit_first(size: int) -> Fit:
+        at = [*range(size), len(order)]
+        part = gram.restrict([*order[:size], label])
+        return fit_moments(part, [[matrix[i][j] for j in at] for i in at], intercept=intercept)
+
+    full = fit_first(len(order))  # names all dependent signals
+    return [*(fit_first(size) for size in range(len(order))), full]
 
 
 CROSS_VALIDATION = "cross-validation"

@@ -114,7 +114,12 @@ def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True
         If the Gram has no rows, or if inputs are linearly dependent. The message names them.
     """
     part = gram.restrict([*inputs, label])
-    matrix = moments(part, intercept=intercept)
+    return fit_moments(part, moments(part, intercept=intercept), intercept=intercept)
+
+
+def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
+    """Fit the last signal of a Gram on all others, from its `moments`. Raises `DataError`."""
+    *inputs, label = part.signals
     right = matrix[-1][:-1]
     solution = exact.solve([row[:-1] for row in matrix[:-1]], right)
     if solution is None:
