@@ -46,7 +46,7 @@ def draw_folds(columns: int) -> tuple[Folds, list[str]]:
 def ratios(columns: int) -> dict[str, float]:
     folds, names = draw_folds(columns)
     total = folds.total
-    matrix = np.array(total.centred(), dtype=np.float64)
+    matrix = np.array(total.centered_products(), dtype=np.float64)
     unit = min(
         seconds(lambda: np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])) for _ in range(9)
     )

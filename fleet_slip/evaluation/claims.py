@@ -191,10 +191,10 @@ NAMES = frozenset({*AS_THEY_ARE, *(name for name in vars(Facts) if not name.star
 def _smallest(winner: Winner) -> str:
     if winner.model is winner.best:
         return f"No model with fewer signals comes near model {winner.best.name}"
-    gain = next(s for s in winner.shortfalls if s.model is winner.model)
+    gain = next(s for s in winner.gaps if s.model is winner.model)
     return (
         f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE that is "
-        f"larger by {gain}: {'real' if gain.real else 'not real'}, and negligible"
+        f"larger by {gain}: {'real' if gain.is_significant else 'not real'}, and negligible"
     )
 
 

@@ -39,8 +39,8 @@ from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,
     DriveMoments,
+    complete_cases,
     missing_signals_error,
-    serving_drives,
 )
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
@@ -159,8 +159,8 @@ class Cohort:
         folds = self._own_folds(by, count)
         if self.prior is None:
             return folds
-        beside = tuple(table.total() for table in self.prior.tables)
-        return replace(folds, beside=beside, weight=self.weight)
+        auxiliary = tuple(table.total() for table in self.prior.tables)
+        return replace(folds, auxiliary=auxiliary, weight=self.weight)
 
     def _own_folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         folding = Folding(by=by, count=count)
@@ -177,7 +177,7 @@ class Cohort:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
             return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
-        table, mask = serving_drives(self.tables, [*inputs, catalogue().label])
+        table, mask = complete_cases(self.tables, [*inputs, catalogue().label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
             self.drive_numbers[rows], return_index=True, return_inverse=True

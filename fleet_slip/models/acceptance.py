@@ -33,7 +33,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
-from fleet_slip.regression.choice import Shortfall, Worth, compare_paired, compare_typical
+from fleet_slip.regression.choice import RmseGap, Tolerance, compare_paired, compare_typical
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -89,7 +89,7 @@ class Comparison:
         challenger: fitted to all groups but the one that it is tested on, its columns searched for
             there if a search found them.
         incumbents: the champion, and the best of the champions so far if that is another one.
-        shortfalls: of the challenger, from each of them, over all rows.
+        gaps: of the challenger, from each of them, over all rows.
         typical: the same in the median group, where cars are held out.
         unseen: whether all these rows are of drives that made no incumbent.
     """
@@ -97,24 +97,24 @@ class Comparison:
     by: FoldKey
     challenger: CrossValidation
     incumbents: tuple[CrossValidation, ...]
-    shortfalls: tuple[Shortfall, ...]
-    typical: tuple[Shortfall, ...] = ()
+    gaps: tuple[RmseGap, ...]
+    typical: tuple[RmseGap, ...] = ()
     unseen: bool = False
 
     @property
     def better(self) -> tuple[CrossValidation, ...]:
         """Those that the challenger is worse than, over all rows or in the median group."""
-        both = zip_longest(self.shortfalls, self.typical)
+        both = zip_longest(self.gaps, self.typical)
         return tuple(
             incumbent
-            for incumbent, shortfalls in zip(self.incumbents, both, strict=True)
-            if not all(one is None or one.negligible for one in shortfalls)
+            for incumbent, gaps in zip(self.incumbents, both, strict=True)
+            if not all(one is None or one.negligible for one in gaps)
         )
 
     @property
     def drifts(self) -> bool:
         """Whether the champion is better by much more than chance, though hardly worth it."""
-        first = self.shortfalls[0]
+        first = self.gaps[0]
         enough = len(self.challenger.folds) >= LEAST_VEHICLES
         return enough and first.rmse > SURE * first.standard_error
 
@@ -135,9 +135,7 @@ class Comparison:
             f"{one.name} as published has {one.pooled.rmse_deg:.4f} deg and "
             f"{one.pooled.correlation:.4f}, difference {shortfall}"
             + (f", in the median group {typical}" if typical else "")
-            for one, shortfall, typical in zip_longest(
-                self.incumbents, self.shortfalls, self.typical
-            )
+            for one, shortfall, typical in zip_longest(self.incumbents, self.gaps, self.typical)
         )
         return (
             f"on the same {number_of(challenger.rows, 'row')} of "
@@ -191,15 +189,15 @@ class Contest:
         whole = self.procedure(groups.total)
         challenger = assemble(self.name, tested, sums, whole, input_scales())
         others = tuple(as_it_is(*one, tested) for one in self.incumbents.items())
-        shortfalls = tuple(compare_paired(challenger, one, worth()) for one in others)
+        gaps = tuple(compare_paired(challenger, one, worth()) for one in others)
         typical = tuple(compare_typical(challenger, one, worth()) for one in others)
         by_car = self.by == "vehicle"
-        return Comparison(self.by, challenger, others, shortfalls, typical if by_car else ())
+        return Comparison(self.by, challenger, others, gaps, typical if by_car else ())
 
 
-def worth() -> Worth:
+def worth() -> Tolerance:
     """Return what a challenger may lack that is no reason to refuse it."""
-    return Worth(math.radians(floor().worth_deg))
+    return Tolerance(math.radians(floor().worth_deg))
 
 
 def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
@@ -380,7 +378,7 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
     if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
     found = contest.on(groups, old)
-    (shortfall,) = found.shortfalls
+    (shortfall,) = found.gaps
     if shortfall.negligible:
         return None
     return (

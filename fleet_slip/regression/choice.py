@@ -45,7 +45,7 @@ from fleet_slip.regression.subsets import best_size, criterion_values
 
 
 @dataclass(frozen=True)
-class Worth:
+class Tolerance:
     """The smallest gain that is worth a signal.
 
     Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a part of the best's.
@@ -65,49 +65,50 @@ class Worth:
         return f"{math.degrees(self.amount):.4g} deg"
 
 
-DEFAULT_WORTH = Worth(math.radians(0.025))
+DEFAULT_TOLERANCE = Tolerance(math.radians(0.025))
 """A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
 
 
-ANY_WORTH = Worth(0.0)
+ZERO_TOLERANCE = Tolerance(0.0)
 """Any gain that is larger than its standard error."""
 
 
 @dataclass(frozen=True)
-class Shortfall:
+class RmseGap:
     """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
 
-    `square` is the difference of mean squared errors, rad^2; `worthless` if not worth having.
+    `square` is the difference of mean squared errors, rad^2. A gap `within_tolerance` is too small
+    to be worth a signal.
     """
 
     model: CrossValidation
     rmse: float
     standard_error: float
     square: float
-    worthless: bool
+    within_tolerance: bool
 
     @property
-    def lacks(self) -> float:
+    def independent_error(self) -> float:
         """What the model lacks, in rad, without the noise of the label; 0 if it is the better."""
         return math.sqrt(max(self.square, 0.0))
 
     @property
-    def real(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether it is larger than its standard error."""
         return self.rmse > self.standard_error
 
     @property
     def negligible(self) -> bool:
         """Whether the best model is no reason to do without this one."""
-        return self.worthless or not self.real
+        return self.within_tolerance or not self.is_significant
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
         return {
             "rmse_deg": math.degrees(self.rmse),
             "standard_error_deg": math.degrees(self.standard_error),
-            "lacks_deg": math.degrees(self.lacks),
-            "real": self.real,
+            "lacks_deg": math.degrees(self.independent_error),
+            "real": self.is_significant,
             "negligible": self.negligible,
         }
 
@@ -117,15 +118,15 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Winner:
-    """The chosen model, the best-correlated one, the reason, and the shortfalls of all if any."""
+    """The chosen model, the best-correlated one, the reason, and the gaps of all if any."""
 
     model: CrossValidation
     best: CrossValidation
     reason: str
-    shortfalls: tuple[Shortfall, ...] = ()
+    gaps: tuple[RmseGap, ...] = ()
 
 
-def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> Winner:
+def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOLERANCE) -> Winner:
     """Return the winner of cross-validated models, given in their declared order.
 
     Among those negligibly worse than the best pooled correlation the fewest signals win, then the
@@ -134,20 +135,20 @@ def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> W
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
     best = max(models, key=lambda model: model.sums.signed_r_squared)
-    shortfalls = tuple(fall_short(model, best, worth) for model in models)
-    near = [one for one in shortfalls if one.model is best or one.negligible]
+    gaps = tuple(measure_gap(model, best, tolerance) for model in models)
+    near = [one for one in gaps if one.model is best or one.negligible]
     fewest = min(len(one.model.signals) for one in near)
     smallest = [one for one in near if len(one.model.signals) == fewest]
     winner = max(smallest, key=lambda one: one.model.sums.signed_r_squared)
-    reason = _reason(winner, best, len(near), len(models), worth)
-    return Winner(winner.model, best, reason, shortfalls)
+    reason = _reason(winner, best, len(near), len(models), tolerance)
+    return Winner(winner.model, best, reason, gaps)
 
 
-def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolerance) -> RmseGap:
     """Return how much larger a model's RMSE is than another's, over the same folds."""
     difference, square = _differences(model, best)
-    worthless = square < worth.squared(best.pooled.rmse)
-    return Shortfall(model, difference, _standard_error(model, best), square, worthless)
+    within_tolerance = square < tolerance.squared(best.pooled.rmse)
+    return RmseGap(model, difference, _standard_error(model, best), square, within_tolerance)
 
 
 def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
@@ -165,19 +166,21 @@ def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
     return math.hypot(error_of_mean(first), error_of_mean(second))
 
 
-def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, worth: Worth) -> str:
+def _reason(
+    winner: RmseGap, best: CrossValidation, near: int, total: int, tolerance: Tolerance
+) -> str:
     if winner.model is best and near == total == 1:
         return f"Model {best.name} is the only one."
     rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
     if winner.model is best:
         others = "every other model" if near == 1 else "every model with fewer signals"
-        larger = f"{worth} or more, and by " if worth.amount else ""
+        larger = f"{tolerance} or more, and by " if tolerance.amount else ""
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
             f"with {rmse}. The gain over {others} is {larger}more than one standard error, so it "
             "is significant."
         )
-    if not worth.amount:
+    if not tolerance.amount:
         return (
             f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of "
             f"the {near} models within one standard error of the best. The gain of model "
@@ -185,21 +188,24 @@ def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, wor
         )
     real = (
         "significant, but less than the required"
-        if winner.real
+        if winner.is_significant
         else "not significant; required are"
     )
-    lacks_deg = math.degrees(winner.lacks)
+    lacks_deg = math.degrees(winner.independent_error)
     lacking = (
-        "" if worth.relative else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
+        ""
+        if tolerance.relative
+        else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
     )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
         f"{near} models that are about as good as model {best.name}, the best "
-        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} {worth}."
+        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} "
+        f"{tolerance}."
     )
 
 
-def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
+def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: Tolerance) -> RmseGap:
     """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
     rows = _common_rows(model, other)
     differences = [
@@ -211,11 +217,13 @@ def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth)
     error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
     both = model.pooled.rmse + other.pooled.rmse
     rmse, lacking = _differences(model, other)
-    worthless = lacking < worth.squared(other.pooled.rmse)
-    return Shortfall(model, rmse, error / both if both else 0.0, lacking, worthless)
+    within_tolerance = lacking < tolerance.squared(other.pooled.rmse)
+    return RmseGap(model, rmse, error / both if both else 0.0, lacking, within_tolerance)
 
 
-def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
+def compare_typical(
+    model: CrossValidation, other: CrossValidation, tolerance: Tolerance
+) -> RmseGap:
     """Return how much larger a model's RMSE is than another's in the median group, a vote each.
 
     After the median of means (Lugosi and Mendelson 2019); the standard error is that of a median of
@@ -227,8 +235,8 @@ def compare_typical(model: CrossValidation, other: CrossValidation, worth: Worth
     deviation = 1.4826 * median(abs(one - middle) for one in differences)
     error = math.sqrt(math.pi / 2 / len(differences)) * deviation
     square = middle * (2 * other.pooled.rmse + middle)
-    worthless = square < worth.squared(other.pooled.rmse)
-    return Shortfall(model, middle, error, square, worthless)
+    within_tolerance = square < tolerance.squared(other.pooled.rmse)
+    return RmseGap(model, middle, error, square, within_tolerance)
 
 
 def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
@@ -287,7 +295,7 @@ class Rule:
 
     ranking: str
     criterion: str
-    worth: Worth = DEFAULT_WORTH
+    tolerance: Tolerance = DEFAULT_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -364,7 +372,7 @@ def select_nested(
     evidence = training.evidence(fits)
     if rule.criterion == CROSS_VALIDATION:
         models = cross_validate_nested(training, order, label)
-        size = len(choose(models, rule.worth).model.signals)
+        size = len(choose(models, rule.tolerance).model.signals)
         values = tuple(-model.correlation for model in models)
     else:
         size = best_size(rule.criterion, evidence)

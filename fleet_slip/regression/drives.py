@@ -27,7 +27,7 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
     )
 
 
-def serving_drives(
+def complete_cases(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
     """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
@@ -75,7 +75,9 @@ class DriveMoments:
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
         centre = tuple(round(s / total.n) for s in total.sums)
-        squares = np.array([row[i] for i, row in enumerate(total.centred())], dtype=np.float64)
+        squares = np.array(
+            [row[i] for i, row in enumerate(total.centered_products())], dtype=np.float64
+        )
         spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
         unit_of_u = np.array([1.0, *spread])
         each = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)

@@ -95,7 +95,7 @@ class Gram:
             )
         return rest
 
-    def times(self, count: int) -> "Gram":
+    def scaled(self, count: int) -> "Gram":
         """Return the Gram in which each row counts so many times."""
         return Gram(
             self.signals,
@@ -118,13 +118,17 @@ class Gram:
         """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
-    def about_mean(self) -> "Gram":
+    def centered(self) -> "Gram":
         """Return n times the Gram of the rows less their mean, as of no rows: no part of a mean."""
         return Gram(
             self.signals,
             0,
             (0,) * len(self.sums),
-            tuple(product for i, row in enumerate(self.centred()) for product in row[: i + 1]),
+            tuple(
+                product
+                for i, row in enumerate(self.centered_products())
+                for product in row[: i + 1]
+            ),
         )
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
@@ -161,7 +165,7 @@ class Gram:
         """Return the k x k matrix of product sums about zero, as integers."""
         return _mirrored([self._packed_row(i) for i in range(len(self.signals))])
 
-    def centred(self) -> list[list[int]]:
+    def centered_products(self) -> list[list[int]]:
         """Return n S_ab = n sum(a b) - sum(a) sum(b), with S the product sums about the means."""
         return _mirrored(
             [

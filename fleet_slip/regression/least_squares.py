@@ -140,7 +140,7 @@ def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
     """Return n S about the means, or raw products. Raises `DataError` if there are no rows."""
     if gram.n == 0:
         raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
-    return gram.centred() if intercept else gram.raw()
+    return gram.centered_products() if intercept else gram.raw()
 
 
 def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> str:
@@ -199,7 +199,7 @@ def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction], *, inter
 
 def correlation_matrix(gram: Gram) -> FloatArray:
     """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
-    centred = gram.centred()
+    centred = gram.centered_products()
     correlations = np.zeros((len(centred), len(centred)))
     for i, row in enumerate(centred):
         for j in range(i + 1):
@@ -225,7 +225,7 @@ def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
     float
         1 without inputs; infinity if they are dependent.
     """
-    return exact.condition_number(gram.restrict(inputs).centred()) if inputs else 1.0
+    return exact.condition_number(gram.restrict(inputs).centered_products()) if inputs else 1.0
 
 
 # Relations that hold on average, from sums of products: exactly, and how single drives move them.
@@ -321,7 +321,7 @@ class ExactSums:
 
     def residual_variance(self, name: str, inputs: Sequence[str]) -> Fraction | None:
         """Return what least squares on other terms leave of a variance; None if undetermined."""
-        matrix = self.gram.restrict((*inputs, name)).centred()
+        matrix = self.gram.restrict((*inputs, name)).centered_products()
         inner = exact.determinant([row[:-1] for row in matrix[:-1]])
         if inner == 0:
             return None

@@ -33,8 +33,8 @@ from fleet_slip.grams.car_estimates import (
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import DriveSums, collect_sums
 from fleet_slip.operations.forget import forget
-from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.exact import solve_rational
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ExactSums, fit
 from fleet_slip.warehouse.forgotten import Forgettable
 from fleet_slip.warehouse.tables import Warehouse

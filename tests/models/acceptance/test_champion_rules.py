@@ -21,7 +21,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import models_trained_on
-from fleet_slip.regression.choice import ANY_WORTH
+from fleet_slip.regression.choice import ZERO_TOLERANCE
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
@@ -199,7 +199,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules, "worth", lambda: ANY_WORTH)
+    monkeypatch.setattr(champion_rules, "worth", lambda: ZERO_TOLERANCE)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = answer_request(warehouse, SelectionRequest(model=every))

@@ -84,7 +84,7 @@ def fit_penalised(
     """Solve (S + diag(penalties)) b = S_xy exactly, penalties >= 0 in counts^2, or `DataError`."""
     part = gram.restrict([*inputs, label])
     common = math.lcm(*(penalty.denominator for penalty in penalties))
-    matrix = [[common * entry for entry in row] for row in part.centred()]
+    matrix = [[common * entry for entry in row] for row in part.centered_products()]
     for i, penalty in enumerate(penalties):
         matrix[i][i] += int(part.n * common * penalty)
     solution = exact_roots.solve([row[:-1] for row in matrix[:-1]], matrix[-1][:-1])
@@ -122,13 +122,13 @@ def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -
 
     (n - 1) C + penalty I for standard deviations with n - 1 is S + penalty diag(S) / (n - 1).
     """
-    matrix = gram.restrict(inputs).centred()
+    matrix = gram.restrict(inputs).centered_products()
     return [penalty * Fraction(row[i], gram.n * (gram.n - 1)) for i, row in enumerate(matrix)]
 
 
 def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
     """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
-    matrix = gram.restrict([*model.signals, model.label]).centred()
+    matrix = gram.restrict([*model.signals, model.label]).centered_products()
     return {
         name: exact_roots.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
         for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.drives import DriveMoments, complete_cases
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
@@ -91,16 +91,16 @@ def test_questions_without_an_answer_are_errors() -> None:
     with pytest.raises(DataError, match="2 rows are too few"):
         infer_classically(fit(few, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
-        serving_drives([moments_table()], ["x9"])
+        complete_cases([moments_table()], ["x9"])
 
 
 def moments_table() -> GramTable:
     return table_of([gram_of(random_drives(1)[0])])
 
 
-def test_serving_drives_stacks_tables() -> None:
+def test_complete_cases_stacks_tables() -> None:
     full = moments_table()
-    table, mask = serving_drives([full, full.restrict(["x1", "y"]), full], ["y", "x2"])
+    table, mask = complete_cases([full, full.restrict(["x1", "y"]), full], ["y", "x2"])
     assert len(table) == 2
     assert mask.tolist() == [True, False, True]
 
