@@ -51,8 +51,8 @@ def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
         name for name, yes in zip(cohort.drives["drive_id"].to_pylist(), mask, strict=True) if yes
     ]
     assignment = by_hash(ids, 5)
-    folds = CohortFolds.of([table], assignment).serving(NINE, LABEL)
-    return TrainingFolds(folds, DriveMoments.of(table), SCALES), assignment.fold
+    folds = CohortFolds.from_tables([table], assignment).serving(NINE, LABEL)
+    return TrainingFolds(folds, DriveMoments.from_table(table), SCALES), assignment.fold
 
 
 def evidence(training: TrainingFolds, output: Path) -> None:

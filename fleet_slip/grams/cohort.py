@@ -171,7 +171,9 @@ class Cohort:
             return again._own_folds(by, count)
         require_divided(self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
+        return CohortFolds.from_tables(
+            self.tables, assign_folds(values, by, count), self.drive_numbers
+        )
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
@@ -459,8 +461,8 @@ def clustered_moments(
     owners = cars if unit == "vehicle" else served.drives["trip"].to_pylist()
     number = {owner: i for i, owner in enumerate(sorted(set(owners), key=str))}
     if unit == "drive" and len(number) == len(owners):
-        return DriveMoments.of(table)
-    return DriveMoments.of(table, np.array([number[one] for one in owners]), unit)
+        return DriveMoments.from_table(table)
+    return DriveMoments.from_table(table, np.array([number[one] for one in owners]), unit)
 
 
 def drive_folds(
@@ -483,6 +485,6 @@ def drive_folds(
     assignment = assign_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
-    folds = CohortFolds.of([served.table], assignment).serving(inputs, catalogue().label)
+    folds = CohortFolds.from_tables([served.table], assignment).serving(inputs, catalogue().label)
     moments = clustered_moments(served, cluster, intercept=intercept)
     return TrainingFolds(folds, moments, input_scales(), intercept), assignment.fold

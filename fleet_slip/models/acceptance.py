@@ -176,7 +176,7 @@ class Contest:
         names = tuple(whole.names[number] for number in used.tolist())
         part = cohort.part(wanted)
         assignment = FoldAssignment(fold, names)
-        return self.serving(CohortFolds.of(part.tables, assignment, part.drive_numbers))
+        return self.serving(CohortFolds.from_tables(part.tables, assignment, part.drive_numbers))
 
     def on(self, groups: Folds, tested: Folds) -> Comparison:
         """Compare, the challenger made without each of `groups`, on what `tested` has of it."""

@@ -62,7 +62,7 @@ from fleet_slip.warehouse.tables import Warehouse
 def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
     """Return the drives that `robust` counts less, the most unusual first."""
     table = served.table if intercept else served.table.about_origin()
-    weights = robust_weights(DriveMoments.of(table), intercept=intercept)
+    weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
     less = np.flatnonzero(weights.parts < FULL).tolist()
     names = served.drives["drive_id"].to_pylist()
     return {names[i]: weights.of(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))}

@@ -136,11 +136,11 @@ def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOL
         raise QuestionError("no model to choose from: the list of models is empty.")
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     gaps = tuple(measure_gap(model, best, tolerance) for model in models)
-    near = [one for one in gaps if one.model is best or one.negligible]
-    fewest = min(len(one.model.signals) for one in near)
-    smallest = [one for one in near if len(one.model.signals) == fewest]
-    winner = max(smallest, key=lambda one: one.model.sums.signed_r_squared)
-    reason = _reason(winner, best, len(near), len(models), tolerance)
+    contenders = [gap for gap in gaps if gap.model is best or gap.negligible]
+    min_size = min(len(gap.model.signals) for gap in contenders)
+    smallest = [gap for gap in contenders if len(gap.model.signals) == min_size]
+    winner = max(smallest, key=lambda gap: gap.model.sums.signed_r_squared)
+    reason = _reason(winner, best, len(contenders), len(models), tolerance)
     return Winner(winner.model, best, reason, gaps)
 
 
@@ -153,37 +153,37 @@ def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolera
 
 def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
     """Return how much larger a model's pooled RMSE is than another's, and its square."""
-    one, two = model.pooled.rmse, other.pooled.rmse
-    return one - two, (one - two) * (one + two)
+    first, second = model.pooled.rmse, other.pooled.rmse
+    return first - second, (first - second) * (first + second)
 
 
-def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
+def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
     """Return the standard error of the difference of RMSEs over folds, paired where rows agree."""
-    first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
-    rows = [[fold.rows for fold in model.folds] for model in (one, other)]
-    if one.fold_names == other.fold_names and rows[0] == rows[1]:
+    first, second = ([fold.rmse for fold in model.folds] for model in (candidate, other))
+    rows = [[fold.rows for fold in model.folds] for model in (candidate, other)]
+    if candidate.fold_names == other.fold_names and rows[0] == rows[1]:
         return error_of_mean([a - b for a, b in zip(first, second, strict=True)])
     return math.hypot(error_of_mean(first), error_of_mean(second))
 
 
 def _reason(
-    winner: RmseGap, best: CrossValidation, near: int, total: int, tolerance: Tolerance
+    winner: RmseGap, best: CrossValidation, contenders: int, total: int, tolerance: Tolerance
 ) -> str:
-    if winner.model is best and near == total == 1:
+    if winner.model is best and contenders == total == 1:
         return f"Model {best.name} is the only one."
     rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
     if winner.model is best:
-        others = "every other model" if near == 1 else "every model with fewer signals"
+        rivals = "every other model" if contenders == 1 else "every model with fewer signals"
         larger = f"{tolerance} or more, and by " if tolerance.amount else ""
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
-            f"with {rmse}. The gain over {others} is {larger}more than one standard error, so it "
+            f"with {rmse}. The gain over {rivals} is {larger}more than one standard error, so it "
             "is significant."
         )
     if not tolerance.amount:
         return (
             f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of "
-            f"the {near} models within one standard error of the best. The gain of model "
+            f"the {contenders} models within one standard error of the best. The gain of model "
             f"{best.name} ({len(best.signals)} signals, {rmse}), {winner}, is not significant."
         )
     real = (
@@ -199,7 +199,7 @@ def _reason(
     )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
-        f"{near} models that are about as good as model {best.name}, the best "
+        f"{contenders} models that are about as good as model {best.name}, the best "
         f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} "
         f"{tolerance}."
     )
@@ -209,8 +209,8 @@ def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: To
     """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
     rows = _common_rows(model, other)
     differences = [
-        n * (one.rmse - two.rmse) * (one.rmse + two.rmse)
-        for n, one, two in zip(rows, model.folds, other.folds, strict=True)
+        n * (first.rmse - second.rmse) * (first.rmse + second.rmse)
+        for n, first, second in zip(rows, model.folds, other.folds, strict=True)
     ]
     ratio, groups = math.fsum(differences) / sum(rows), len(rows)
     square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
@@ -230,9 +230,11 @@ def compare_typical(
     normals, their deviation from the median absolute one. Raises `ValueError` for other rows.
     """
     _common_rows(model, other)
-    differences = [one.rmse - two.rmse for one, two in zip(model.folds, other.folds, strict=True)]
+    differences = [
+        first.rmse - second.rmse for first, second in zip(model.folds, other.folds, strict=True)
+    ]
     middle = median(differences)
-    deviation = 1.4826 * median(abs(one - middle) for one in differences)
+    deviation = 1.4826 * median(abs(first - middle) for first in differences)
     error = math.sqrt(math.pi / 2 / len(differences)) * deviation
     square = middle * (2 * other.pooled.rmse + middle)
     within_tolerance = square < tolerance.squared(other.pooled.rmse)
@@ -409,9 +411,9 @@ def cross_validate_selection(
     folds = training.folds
     tests = []
     for number, test in enumerate(folds.grams):
-        rest = _without(training, fold, number)
-        model = select_nested(rest, inputs, label, rule).fit.model
-        tests.append(held_out_errors(model, rest.folds.total, test))
+        inner = _without(training, fold, number)
+        model = select_nested(inner, inputs, label, rule).fit.model
+        tests.append(held_out_errors(model, inner.folds.total, test))
     chosen = select_nested(training, inputs, label, rule).fit.model
     return assemble(name, folds, tests, chosen, training.scales)
 
@@ -419,5 +421,5 @@ def cross_validate_selection(
 def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
     if len(training.folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
-    rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return replace(training, folds=rest, drives=training.drives.take(fold != number))
+    remaining = training.folds.without(number, int(np.count_nonzero(fold != number)))
+    return replace(training, folds=remaining, drives=training.drives.take(fold != number))

@@ -70,8 +70,10 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
     if len(assignment.names) <= count:
         return assignment
     bands = np.array_split(np.arange(len(assignment.names)), count)
-    band = np.repeat(np.arange(count), [len(one) for one in bands])
-    names = tuple(f"{assignment.names[one[0]]} to {assignment.names[one[-1]]}" for one in bands)
+    band = np.repeat(np.arange(count), [len(members) for members in bands])
+    names = tuple(
+        f"{assignment.names[members[0]]} to {assignment.names[members[-1]]}" for members in bands
+    )
     return FoldAssignment(band[assignment.fold].astype(np.int64), names)
 
 
@@ -91,11 +93,13 @@ class Folds:
     @cached_property
     def total(self) -> Gram:
         """The Gram of all that a model is trained on, in whole parts of a row's weight."""
-        own = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
+        scaled_total = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
         if self.auxiliary is None or not self.weight:
-            return own
+            return scaled_total
         centered = self.auxiliary.centered()
-        return own + centered.scaled(self.weight.numerator * self._row_factor // self._divisor)
+        return scaled_total + centered.scaled(
+            self.weight.numerator * self._row_factor // self._divisor
+        )
 
     @property
     def _divisor(self) -> int:
@@ -133,7 +137,7 @@ class CohortFolds:
     weight: Fraction = Fraction(1)
 
     @classmethod
-    def of(
+    def from_tables(
         cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
     ) -> "CohortFolds":
         """Add up each fold's Gram rows; `drives` numbers their drives, by default one each."""
@@ -163,8 +167,8 @@ class CohortFolds:
         signals = (*inputs, label)
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
         if not served:
-            known = sorted({name for grams in self.tables for name in grams[0].signals})
-            require_signals(known, signals)
+            available = sorted({name for grams in self.tables for name in grams[0].signals})
+            require_signals(available, signals)
             raise missing_signals_error(signals)
         folds = tuple(
             sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
@@ -180,10 +184,10 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        others = [
-            one.restrict(signals) for one in self.auxiliary if set(signals) <= set(one.signals)
+        matching = [
+            gram.restrict(signals) for gram in self.auxiliary if set(signals) <= set(gram.signals)
         ]
-        auxiliary = sum(others[1:], others[0]) if others else None
+        auxiliary = sum(matching[1:], matching[0]) if matching else None
         return Folds(folds, names, self.count_drives(served), auxiliary, self.weight)
 
 

@@ -261,13 +261,13 @@ class Relation:
     @classmethod
     def least_squares(
         cls,
-        of: str,
+        response: str,
         by: tuple[str, ...],
         noise: Mapping[tuple[int, int], Product] = MappingProxyType({}),
     ) -> "Relation":
         """Return that of a term by others, which are the instruments themselves."""
-        left = tuple(tuple((a, b) for b in by) for a in by)
-        return cls(by, left, tuple((of, a) for a in by), noise)
+        products = tuple(tuple((a, b) for b in by) for a in by)
+        return cls(by, products, tuple((response, a) for a in by), noise)
 
     def system(
         self, sums: Callable[[str, str], Any], variance: Fraction | float
@@ -291,13 +291,15 @@ class ExactSums:
     def __init__(self, gram: Gram, terms: Terms) -> None:
         """Raises `DataError` for a column that the Gram lacks."""
         self._factors = {
-            name: lcm(*(weight.denominator for weight in one.values()))
-            for name, one in terms.items()
+            name: lcm(*(weight.denominator for weight in weights.values()))
+            for name, weights in terms.items()
         }
         self.gram = gram.combine(
             {
-                name: {column: int(weight * self._factors[name]) for column, weight in one.items()}
-                for name, one in terms.items()
+                name: {
+                    column: int(weight * self._factors[name]) for column, weight in weights.items()
+                }
+                for name, weights in terms.items()
             }
         )
 
@@ -341,16 +343,16 @@ def influence(
     the equations A_g of a drive, A of all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g
     theta); its share is h'Z_g'Z_g h.
     """
-    each = _stacked(relation.system(sums, noise))
-    left, right = each[:, :, :-1], each[:, :, -1]
-    total = left.sum(axis=0)
+    equations = _stacked(relation.system(sums, noise))
+    coefficients, right = equations[:, :, :-1], equations[:, :, -1]
+    summed = coefficients.sum(axis=0)
     try:
-        unknowns = np.linalg.solve(total, right.sum(axis=0))
-        h = np.linalg.solve(total.T, np.asarray(gradient))
+        unknowns = np.linalg.solve(summed, right.sum(axis=0))
+        h = np.linalg.solve(summed.T, np.asarray(gradient))
     except np.linalg.LinAlgError:
         return None
     squares = _stacked([[sums(a, b) for b in relation.instruments] for a in relation.instruments])
-    return (right - left @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
+    return (right - coefficients @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
 
 
 class DriveTermSums:
@@ -361,15 +363,15 @@ class DriveTermSums:
         self._at = {name: i for i, name in enumerate((ONE, *terms))}
         turn = np.zeros((len(self._at), moments.shape[1]))
         turn[0, 0] = 1.0
-        for name, one in terms.items():
-            for column, weight in one.items():
+        for name, weights in terms.items():
+            for column, weight in weights.items():
                 turn[self._at[name], 1 + columns.index(column)] = float(weight)
         self._sums = turn @ moments @ turn.T
 
     def __call__(self, a: str, b: str) -> FloatArray:
         """Return the sum of the products of two terms in each drive."""
-        found: FloatArray = self._sums[:, self._at[a], self._at[b]]
-        return found
+        sums: FloatArray = self._sums[:, self._at[a], self._at[b]]
+        return sums
 
 
 def _stacked(rows: Sequence[Sequence[Any]]) -> FloatArray:

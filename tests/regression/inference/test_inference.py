@@ -40,7 +40,7 @@ from tests.support.counts import (
 
 
 def moments_of(drives: list[np.ndarray]) -> DriveMoments:
-    return DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
+    return DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
 
 
 @settings(max_examples=25)
@@ -151,7 +151,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
     model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]))
     mine, theirs = infer_classically(fitted, unit_scales(inputs)), model.fit()
     largest = np.abs(theirs.params).max()
     values = [estimate.value for estimate in mine.estimates]
@@ -187,7 +187,7 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
     counts = np.concatenate(parts)
     fitted = fit(gram_of(counts), INPUTS, "y", intercept=False)
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
     classical, clustered = (
         infer_classically(fitted, unit_scales(4)),
         infer_by_clusters(fitted, moments, unit_scales(4)),
@@ -205,7 +205,7 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
 def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
     parts = offset_drives(3)
     gram = gram_of(np.concatenate(parts))
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
     fits = nested_fits(gram, INPUTS, "y", intercept=False)
     counts = np.concatenate(parts)
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))

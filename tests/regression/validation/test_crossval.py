@@ -35,7 +35,7 @@ SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_0
 
 def cohort_of(drives: list[np.ndarray], fold: list[int]) -> CohortFolds:
     table = table_of([gram_of(counts) for counts in drives])
-    return CohortFolds.of([table], by_value(fold))
+    return CohortFolds.from_tables([table], by_value(fold))
 
 
 @settings(max_examples=25)
@@ -76,7 +76,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     poor = table_of(
         [Gram.from_counts(("y", "x1", "x2"), counts[:, [4, 0, 1]]) for counts in drives[6:]]
     )
-    cohort = CohortFolds.of([full, poor], by_value([0, 1, 2] * 4))
+    cohort = CohortFolds.from_tables([full, poor], by_value([0, 1, 2] * 4))
     both = cross_validate_inputs("two", cohort, ["x1", "x2"], "y", SCALES)
     assert both.drives == 12
     assert both.pooled.rows == 12 * 60
@@ -90,7 +90,9 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
 def test_folds_lacking_a_signal_are_an_error() -> None:
     drives = random_drives(7, drives=4)
     full = table_of([gram_of(counts) for counts in drives[:2]])
-    cohort = CohortFolds.of([full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"]))
+    cohort = CohortFolds.from_tables(
+        [full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"])
+    )
     with pytest.raises(DataError, match="fold b has no rows with all of x2, y"):
         cohort.serving(["x2"], "y")
 
