@@ -203,6 +203,12 @@ def test_a_small_eigenvalue_is_correctly_rounded(large: int) -> None:
     assert exact.condition_number(matrix) == float(2 * large - 1)
 
 
+def test_the_condition_number_of_a_hilbert_matrix_is_that_of_mpmath() -> None:
+    """By mpmath's eigsy with 60 digits, of the matrix scaled to a unit diagonal."""
+    matrix = [[360360 // (i + j + 1) for j in range(8)] for i in range(8)]
+    assert exact.condition_number(matrix) == 5933993485.836007
+
+
 def test_the_last_bits_of_eigenvectors_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     columns = np.random.default_rng(3).integers(-9, 10, size=(60, 25))
     columns += 9 * columns[:, :1]
