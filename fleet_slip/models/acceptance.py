@@ -109,7 +109,7 @@ class Comparison:
     @property
     def drifts(self) -> bool:
         """Whether the champion is better by much more than chance, though hardly worth it."""
-        first = self.shortfalls[0]
+        first = self.gaps[0]
         enough = len(self.challenger.folds) >= LEAST_VEHICLES
         return enough and first.rmse > SURE * first.standard_error
 
@@ -173,7 +173,7 @@ class Contest:
         names = tuple(whole.names[number] for number in used.tolist())
         part = cohort.part(wanted)
         assignment = FoldAssignment(fold, names)
-        return self.serving(CohortFolds.of(part.tables, assignment, part.drive_numbers))
+        return self.serving(CohortFolds.from_tables(part.tables, assignment, part.drive_numbers))
 
     def on(self, groups: Folds, tested: Folds) -> Comparison:
         """Compare, the challenger made without each of `groups`, on what `tested` has of it."""
@@ -373,7 +373,7 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
     if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
     found = contest.on(groups, old)
-    (shortfall,) = found.shortfalls
+    (shortfall,) = found.gaps
     if shortfall.negligible:
         return None
     return (

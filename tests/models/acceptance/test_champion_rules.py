@@ -19,7 +19,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import models_trained_on
-from fleet_slip.regression.choice import ANY_WORTH
+from fleet_slip.regression.choice import ZERO_TOLERANCE
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
