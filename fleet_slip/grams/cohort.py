@@ -181,7 +181,7 @@ class Cohort:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
             return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
-        table, mask = serving_drives(self.tables, [*inputs, self.catalog.signals.label])
+        table, mask = complete_cases(self.tables, [*inputs, self.catalog.signals.label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
             self.drive_numbers[rows], return_index=True, return_inverse=True

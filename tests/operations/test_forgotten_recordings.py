@@ -208,7 +208,7 @@ def test_entries_of_names_as_they_were_typed_bar_that_name_until_it_is_allowed(
     typed = hashlib.blake2b(b"vehicle:CAR", key=bytes(32), digest_size=32).hexdigest()
     for event in ("begun", "done"):
         entry: dict[str, Any] = {"kind": "vehicle", "subject": typed, "key": key, "event": event}
-        DocumentFolder(audit.root / FOLDER).append(entry)
+        DocumentFolder(audit.root, FOLDER).append(entry)
     assert audit.barred({"CAR", " CAR", "car"}, ()).vehicles == {"CAR", " CAR"}
     assert audit.state(Forgettable("vehicle", "CAR")) == "done"
     audit.begin(Forgettable("vehicle", "car"), 1, [])

@@ -198,7 +198,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules.Floor, "worth", ANY_WORTH)
+    monkeypatch.setattr(champion_rules.Floor, "worth", ZERO_TOLERANCE)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = answer_request(warehouse, SelectionRequest(model=every))

@@ -14,7 +14,7 @@ from scipy import stats
 
 from fleet_slip.base import hash_fold
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice import Shortfall, Worth, choose, compare_paired
+from fleet_slip.regression.choice import RmseGap, Tolerance, choose, compare_paired
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -288,7 +288,7 @@ def test_rows_of_a_group_are_not_taken_for_independent() -> None:
 
 def test_the_same_model_falls_short_of_itself_by_nothing() -> None:
     one = predict((1, 1), draw(np.random.default_rng(3), 5))
-    shortfall = compare_paired(one, one, Worth(0.0))
+    shortfall = compare_paired(one, one, Tolerance(0.0))
     assert (shortfall.rmse, shortfall.standard_error) == (0.0, 0.0)
 
 
