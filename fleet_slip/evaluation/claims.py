@@ -271,7 +271,8 @@ def last_two_best(report: ReportContext) -> Finding:
         gain = next(gap for gap in winner.gaps if gap.model is winner.model)
         why = (
             f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE "
-            f"that is larger by {gain}: {'real' if gain.is_significant else 'not real'}, and negligible."
+            f"that is larger by {gain}, {'real' if gain.is_significant else 'not real'} and "
+            "negligible."
         )
     return Finding(
         sorted(model.name for model in ranked[:2]) == ["4", "5"],
