@@ -39,7 +39,7 @@ from fleet_slip.operations.forget import forget
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ExactSums, fit
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
 from tests.support.catalog import CATALOG, SIGNALS
@@ -359,7 +359,7 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
     with pytest.raises(DataError, match="no drive of"):
         calibrate(warehouse, "vehicle_id = 'delta'")
 
-    forget(warehouse, Forgettable("vehicle", "beta"))
+    forget(warehouse, ErasureSubject("vehicle", "beta"))
     after = calibrate(warehouse)
     assert set(after.cars) == {"alfa", "gamma"}
     assert {c: after.cars[c]["ay_offset"].value for c in after.cars} == {

@@ -25,7 +25,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import land, log_rows
@@ -345,7 +345,7 @@ def test_a_version_keeps_which_drives_made_it(champion: Warehouse) -> None:
     made = [registry.trained_drives(registry.load("beta", one).manifest) for one in (1, 2)]
     assert [len(one.salted) for one in made if one] == [48, 48]
     # The question of the first cohort, asked anew, would now have the other drives, too.
-    assert forget(champion, Forgettable("drive", "more-3")).models == ("beta@2",)
+    assert forget(champion, ErasureSubject("drive", "more-3")).models == ("beta@2",)
 
 
 def test_drives_that_are_gone_or_damaged_count_as_trained_on(champion: Warehouse) -> None:
