@@ -36,7 +36,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Table
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG
 
@@ -120,7 +120,7 @@ def state(root: Path) -> dict[str, Any]:
         },
         "forgotten": [
             [entry["event"], entry.get("drives"), entry.get("models")]
-            for entry in Audit(LocalFolder(root)).entries()
+            for entry in ErasureLog(LocalFolder(root)).entries()
         ],
         "damage": [str(finding) for finding in verify(warehouse, full=True).damage],
     }

@@ -21,7 +21,7 @@ from fleet_slip.regression.choice import (
     cross_validate_selection,
     nested_fits,
 )
-from fleet_slip.regression.drives import DriveMoments, serving_drives
+from fleet_slip.regression.drives import DriveMoments, complete_cases
 from fleet_slip.regression.folds import CohortFolds, by_hash
 from fleet_slip.regression.inference import Evidence, infer_by_clusters, infer_classically
 from fleet_slip.regression.least_squares import correlation_matrix
@@ -46,13 +46,13 @@ SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}
 
 def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
     cohort = load_cohort(Warehouse(LocalFolder(Path(root))), f"campaign = '{campaign}'")
-    table, mask = serving_drives(cohort.tables, [*NINE, LABEL])
+    table, mask = complete_cases(cohort.tables, [*NINE, LABEL])
     ids = [
         name for name, yes in zip(cohort.drives["drive_id"].to_pylist(), mask, strict=True) if yes
     ]
     assignment = by_hash(ids, 5)
-    folds = CohortFolds.of([table], assignment).serving(NINE, LABEL)
-    return TrainingFolds(folds, DriveMoments.of(table), SCALES), assignment.fold
+    folds = CohortFolds.from_tables([table], assignment).serving(NINE, LABEL)
+    return TrainingFolds(folds, DriveMoments.from_table(table), SCALES), assignment.fold
 
 
 def evidence(training: TrainingFolds, output: Path) -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.rewriting import CompactionReport
     from fleet_slip.operations.status import WarehouseStatus
     from fleet_slip.operations.verify import Verification
-    from fleet_slip.warehouse.forgotten import Forgettable
+    from fleet_slip.warehouse.erasure_log import ErasureSubject
 
 
 @dataclass(frozen=True)
@@ -259,11 +259,11 @@ class HealthAndUpkeep(JudgedModels):
         unless one subject is given, `QuestionError` if it was never forgotten, and `RefusedError`
         while it is being forgotten.
         """
-        from fleet_slip.warehouse.forgotten import Audit
+        from fleet_slip.warehouse.erasure_log import ErasureLog
 
         self.warehouse.require()
-        subject, audit = _subject(vehicle, drive), Audit(self.root)
-        state = audit.state(subject)
+        subject, erasure_log = _subject(vehicle, drive), ErasureLog(self.root)
+        state = erasure_log.state(subject)
         if state is None:
             raise QuestionError(f"{subject.kind} {subject.value!r} was never forgotten.")
         if state == "begun":
@@ -272,7 +272,7 @@ class HealthAndUpkeep(JudgedModels):
                 "until it is done, then allow it."
             )
         if state == "done":
-            audit.allow(subject)
+            erasure_log.allow(subject)
         return state == "done"
 
     @record_call
@@ -294,12 +294,12 @@ class HealthAndUpkeep(JudgedModels):
         return report
 
 
-def _subject(vehicle: str | None, drive: str | None) -> "Forgettable":
+def _subject(vehicle: str | None, drive: str | None) -> "ErasureSubject":
     """Return the one that is given. Raises `UsageError` for none, for both and for a blank name."""
-    from fleet_slip.warehouse.forgotten import Forgettable
+    from fleet_slip.warehouse.erasure_log import ErasureSubject
 
     names = {"vehicle": vehicle, "drive": drive}
     match [(kind, normalize_name(name)) for kind, name in names.items() if name is not None]:
         case [("vehicle" | "drive" as kind, name)] if name:
-            return Forgettable(kind, name)
+            return ErasureSubject(kind, name)
     raise UsageError("give a vehicle or a drive by its name.")

@@ -17,7 +17,7 @@ from fleet_slip.cli.progress import progress
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.warehouse.forgotten import skipped_drives
+from fleet_slip.warehouse.erasure_log import skipped_drives
 
 if TYPE_CHECKING:
     from fleet_slip.ingest.draft import Draft

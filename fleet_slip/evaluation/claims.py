@@ -268,10 +268,11 @@ def last_two_best(report: ReportContext) -> Finding:
     if winner.model is winner.best:
         why = f"No model with fewer signals comes near model {winner.best.name}."
     else:
-        gain = next(gap for gap in winner.shortfalls if gap.model is winner.model)
+        gain = next(gap for gap in winner.gaps if gap.model is winner.model)
         why = (
             f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE "
-            f"that is larger by {gain}: {'real' if gain.real else 'not real'}, and negligible."
+            f"that is larger by {gain}, {'real' if gain.is_significant else 'not real'} and "
+            "negligible."
         )
     return Finding(
         sorted(model.name for model in ranked[:2]) == ["4", "5"],

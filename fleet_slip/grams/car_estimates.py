@@ -27,8 +27,9 @@ from fleet_slip.catalog.course import (
     TURNED,
     turned_scale,
 )
+from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms, solve
+from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms
 
 NO_COURSE = "no row above 3 m/s has the yaw rate, ay and all four wheel speeds"
 NO_STEERING = "no row above 3 m/s has both steering angles beside the other signals"
@@ -201,7 +202,7 @@ def bank_of_bends(terms: CarTerms, sums: Mapping[str, Gram]) -> Fraction | None:
     course = sums.get("course")
     if course is None or (noise := gyroscope_noise(terms, course, sums.get("steering"))) is None:
         return None
-    solution = solve(COURSE.system(ExactSums(course, terms.course), noise))
+    solution = solve_rational(COURSE.system(ExactSums(course, terms.course), noise))
     return solution[-1] if solution else None
 
 
@@ -219,7 +220,7 @@ def _estimate_course(
 ) -> dict[CalibrationParameterName, CarEstimate] | str:
     """Tell by the relation of flat roads, or with a noise by that of banked ones."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
-    solution = solve(relation.system(sums, noise))
+    solution = solve_rational(relation.system(sums, noise))
     if solution is None or not solution[1]:
         return ALIKE
     gradients: dict[CalibrationParameterName, tuple[float, ...]]
@@ -259,7 +260,7 @@ def _estimate_steering(
     yaw_rate_offset, ay_offset = course["yaw_rate_offset"].value, course["ay_offset"].value
     columns = terms.steering(yaw_rate_offset)
     sums = ExactSums(gram, columns)
-    solution = solve(STEERING.system(sums, noise))
+    solution = solve_rational(STEERING.system(sums, noise))
     if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
         return dict.fromkeys(OF_STEERING, STRAIGHT)
     straight, by_bend, understeer = solution
@@ -299,7 +300,7 @@ def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
         return {}
     columns = {name: terms.course[name] for name in ("yaw_rate", "speed", "wheels")}
     still = ExactSums(gram, columns)
-    solution = solve(STILL.system(still, 0))
+    solution = solve_rational(STILL.system(still, 0))
     if solution is None or still.mean("speed") >= LONGEST_ROLL_MPS:
         return {}
     bias = CarEstimate(STANDSTILL, STILL, columns, Fraction(0), solution[0], (1.0, 0.0))
@@ -356,7 +357,7 @@ def _speed_ratio(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     if gram is None or gram.n == 0:
         return {}
     columns = {"speed": terms.course["speed"], SATELLITE: terms.si(**{SATELLITE: 1})}
-    solution = solve(SPEED.system(ExactSums(gram, columns), 0))
+    solution = solve_rational(SPEED.system(ExactSums(gram, columns), 0))
     least, most = SPEED_RATIOS[True]
     if solution is None or not least <= solution[0] <= most:
         return {}
@@ -377,7 +378,7 @@ def _slip(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     exact = ExactSums(gram, columns)
     if gram.n < FEWEST_CHANGES or exact.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
         return dict.fromkeys(OF_SLIP, FEW_TURNS)
-    solution = solve(CHANGE.system(exact, 0))
+    solution = solve_rational(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
         return dict.fromkeys(OF_SLIP, NO_CAR)
     of = (SLIP, CHANGE, columns, Fraction(0))

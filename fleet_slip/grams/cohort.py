@@ -39,8 +39,8 @@ from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,
     DriveMoments,
+    complete_cases,
     missing_signals_error,
-    serving_drives,
 )
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
@@ -161,8 +161,8 @@ class Cohort:
         folds = self._own_folds(by, count)
         if self.prior is None:
             return folds
-        beside = tuple(table.total() for table in self.prior.tables)
-        return replace(folds, beside=beside, weight=self.weight)
+        auxiliary = tuple(table.total() for table in self.prior.tables)
+        return replace(folds, auxiliary=auxiliary, weight=self.weight)
 
     def _own_folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         folding = Folding(by=by, count=count)
@@ -173,13 +173,15 @@ class Cohort:
             return again._own_folds(by, count)
         require_divided(self.catalog, self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.of(self.tables, assign_folds(values, by, count), self.drive_numbers)
+        return CohortFolds.from_tables(
+            self.tables, assign_folds(values, by, count), self.drive_numbers
+        )
 
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
             return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
-        table, mask = serving_drives(self.tables, [*inputs, self.catalog.signals.label])
+        table, mask = complete_cases(self.tables, [*inputs, self.catalog.signals.label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
             self.drive_numbers[rows], return_index=True, return_inverse=True
@@ -463,8 +465,8 @@ def clustered_moments(
     owners = cars if unit == "vehicle" else served.drives["trip"].to_pylist()
     number = {owner: i for i, owner in enumerate(sorted(set(owners), key=str))}
     if unit == "drive" and len(number) == len(owners):
-        return DriveMoments.of(table)
-    return DriveMoments.of(table, np.array([number[one] for one in owners]), unit)
+        return DriveMoments.from_table(table)
+    return DriveMoments.from_table(table, np.array([number[one] for one in owners]), unit)
 
 
 def drive_folds(
@@ -488,6 +490,6 @@ def drive_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     label, scales = cohort.catalog.signals.label, cohort.catalog.input_scales
-    folds = CohortFolds.of([served.table], assignment).serving(inputs, label)
+    folds = CohortFolds.from_tables([served.table], assignment).serving(inputs, label)
     moments = clustered_moments(served, cluster, intercept=intercept)
     return TrainingFolds(folds, moments, scales, intercept), assignment.fold

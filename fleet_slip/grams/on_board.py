@@ -65,7 +65,7 @@ from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.tables import Warehouse
 
 # The feature sets that cars can count: their columns, the ranges of these, and their definition.
@@ -530,13 +530,13 @@ def _require_possible(sets: Mapping[str, CountedSet], file: Path, table: pa.Tabl
 
 def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:
     """Raise `InputError` for a car or a drive that was forgotten, or that has such counts."""
-    audit = Audit(warehouse.root)
+    erasure_log = ErasureLog(warehouse.root)
     cars, drives = (rows[name].to_pylist() for name in NAMES)
-    barred, counts = audit.barred(set(cars), set(drives)), audit.barred_counts()
+    erased, counts = erasure_log.erased(set(cars), set(drives)), erasure_log.erased_count_digests()
     for row, (car, drive, digest) in enumerate(
         zip(cars, drives, rows["digest"].to_pylist(), strict=True), 1
     ):
-        if car in barred.vehicles or drive in barred.drives:
+        if car in erased.vehicles or drive in erased.drives:
             _refuse(file, row, drive, "was forgotten; fleet-slip forget --allow lets it come back")
         if digest in counts:
             _refuse(file, row, drive, "has the counts of a drive that was forgotten")

@@ -27,7 +27,7 @@ from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, row
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.erased import find_erased, names_by_column
+from fleet_slip.warehouse.erasure_log import find_erased
 from fleet_slip.warehouse.tables import Warehouse
 
 SPAN, STEP, STEPS = 40, 5, 12
@@ -263,7 +263,7 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
         identity = warehouse.catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
             counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
-            for column, names in names_by_column(erased).items():
+            for column, names in erased.by_column.items():
                 returned = pc.is_in(rows[column].cast(pa.string()), pa.array(names, pa.string()))
                 counts = pc.and_(counts, pc.invert(returned))
             yield from rows.filter(counts).to_batches()

@@ -65,8 +65,8 @@ def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeig
     `drives` are the moments of the inputs, the label last. c is `USUAL_ERRORS`, or so large that no
     more than `MOST_LOST` of the weight of rows is lost.
     """
-    each = drives.each[:, int(not intercept) :, int(not intercept) :]
-    rows, limit = drives.each[:, 0, 0], USUAL_ERRORS
+    each = drives.moments[:, int(not intercept) :, int(not intercept) :]
+    rows, limit = drives.moments[:, 0, 0], USUAL_ERRORS
     found = _weigh(each, rows, limit)
     while float(rows @ (FULL - found.parts)) > MOST_LOST * FULL * float(rows.sum()):
         limit *= 1.25

@@ -51,7 +51,7 @@ from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, retry_conflicts
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.tables import Warehouse
 
 BATCH_BYTES = 2**24
@@ -342,8 +342,12 @@ class _Writer:
         writers: ThreadPoolExecutor,
         replace: Replace,
     ) -> None:
-        self.warehouse, self.audit, self.mapping = warehouse, Audit(warehouse.root), mapping
-        self.forgotten, self._number = self.audit.begun(), len(files)
+        self.warehouse, self.erasure_log, self.mapping = (
+            warehouse,
+            ErasureLog(warehouse.root),
+            mapping,
+        )
+        self.forgotten, self._number = self.erasure_log.begun(), len(files)
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
         self._same = SameRecordings(warehouse, logs, mapping.name, replace)
@@ -372,7 +376,7 @@ class _Writer:
         fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
         left_out, ticks = set[str](), 0
         for drives in _groups(stream.drives()):
-            kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self.audit)
+            kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self.erasure_log)
             left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
             ticks += _rows_of(kept)
             if is_new and kept:
@@ -380,7 +384,7 @@ class _Writer:
                 self.data["logs"].add(log_table(kept, self.mapping), full=full)
                 fingerprints |= fingerprints_of(kept)
         for table, following in pairwise(chain(stream.quarantine(), [None])):
-            allowed = keep_refused(table, self.audit, left_out)
+            allowed = keep_refused(table, self.erasure_log, left_out)
             self.data["quarantine"].add(allowed, full=following is not None)
         report = IngestReport(str(asked.file), stream.counts, new=is_new)
         one = WrittenFile(asked.file, digest, report)
@@ -598,7 +602,7 @@ def commit_batch(
 
     def is_outdated(name: TableName, snapshot: Snapshot) -> bool:
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-        if Audit(warehouse.root).begun() != written.forgotten:
+        if ErasureLog(warehouse.root).begun() != written.forgotten:
             return True
         landed = snapshot.landed_among(len(written.new[name].transactions))
         if any(landed(transaction.name) for transaction in written.new[name].transactions):

@@ -28,7 +28,7 @@ from fleet_slip.storage.table import (
     Table,
     retry_conflicts,
 )
-from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
@@ -45,21 +45,23 @@ def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
 # What was forgotten does not come back.
 
 
-def keep_drives(drives: Sequence[MeasuredDrive], audit: Audit) -> list[MeasuredDrive]:
+def keep_drives(drives: Sequence[MeasuredDrive], erasure_log: ErasureLog) -> list[MeasuredDrive]:
     """Return the drives that were not forgotten under any name, nor their cars."""
     cars = {drive.drive_id: str(drive.metadata["vehicle_id"]) for drive in drives}
-    barred = audit.barred(set(cars.values()), set(cars))
-    counts = audit.barred_counts()
+    erased = erasure_log.erased(set(cars.values()), set(cars))
+    counts = erasure_log.erased_count_digests()
     return [
         drive
         for drive in drives
-        if drive.drive_id not in barred.drives
-        and cars[drive.drive_id] not in barred.vehicles
+        if drive.drive_id not in erased.drives
+        and cars[drive.drive_id] not in erased.vehicles
         and not (counts and drive.counts_digest in counts)
     ]
 
 
-def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()) -> pa.Table:
+def keep_refused(
+    refused: pa.Table, erasure_log: ErasureLog, left_out: Collection[str] = ()
+) -> pa.Table:
     """Return the refused rows of what was not forgotten; `left_out` are drives of their file.
 
     A row goes with its car, or with its drive, whose name begins that of each stretch of it.
@@ -68,10 +70,10 @@ def keep_refused(refused: pa.Table, audit: Audit, left_out: Collection[str] = ()
         set(refused[column].unique().drop_null().cast(pa.string()).to_pylist())
         for column in ("vehicle_id", "drive_id")
     )
-    barred = audit.barred(vehicles, named)
-    drives = barred.drives | set(left_out)
+    erased = erasure_log.erased(vehicles, named)
+    drives = erased.drives | set(left_out)
     whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
-    for column, unwanted in (("vehicle_id", barred.vehicles), ("drive_id", drives | whole)):
+    for column, unwanted in (("vehicle_id", erased.vehicles), ("drive_id", drives | whole)):
         if unwanted:
             names = pa.array(sorted(unwanted), pa.string())
             mine = pc.is_in(refused[column].cast(pa.string()), names)
@@ -319,8 +321,11 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
     Only what was forgotten by a drive's name may: what is too old stays away.
     """
-    audit = Audit(warehouse.root)
-    if not audit.allows_drives or audit.state(Forgettable("drive", first_drive)) != ALLOWED:
+    erasure_log = ErasureLog(warehouse.root)
+    if (
+        not erasure_log.allows_drives
+        or erasure_log.state(ErasureSubject("drive", first_drive)) != ALLOWED
+    ):
         return False
 
     def attempt(table: Table) -> None:
@@ -338,7 +343,9 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
 def are_gone(warehouse: Warehouse, digest: str) -> bool:
     """Whether drives were forgotten, and none is left of a file that was ingested."""
-    return bool(Audit(warehouse.root).entries()) and not _drives_of(warehouse, {Origin.of(digest)})
+    return bool(ErasureLog(warehouse.root).entries()) and not _drives_of(
+        warehouse, {Origin.of(digest)}
+    )
 
 
 def _replaced(there: Named[str, str], origins: frozenset[Origin], name: str) -> frozenset[Origin]:

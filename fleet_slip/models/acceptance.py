@@ -27,7 +27,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import searching
 from fleet_slip.models.select import Selection
-from fleet_slip.regression.choice import Shortfall, Worth, compare_paired
+from fleet_slip.regression.choice import RmseGap, Tolerance, compare_paired
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -58,9 +58,9 @@ class Floor(Config):
     min_rows_per_column: int = Field(default=100, ge=1)
 
     @property
-    def worth(self) -> Worth:
+    def worth(self) -> Tolerance:
         """What a challenger may lack that is no reason to refuse it."""
-        return Worth(math.radians(self.worth_deg))
+        return Tolerance(math.radians(self.worth_deg))
 
 
 def load_floor(configs: Configs) -> Floor:
@@ -94,7 +94,7 @@ class Comparison:
     by: FoldKey
     challenger: CrossValidation
     incumbents: tuple[CrossValidation, ...]
-    shortfalls: tuple[Shortfall, ...]
+    gaps: tuple[RmseGap, ...]
     unseen: bool = False
 
     @property
@@ -102,14 +102,14 @@ class Comparison:
         """The incumbents that the challenger is worse than."""
         return tuple(
             incumbent
-            for incumbent, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
+            for incumbent, shortfall in zip(self.incumbents, self.gaps, strict=True)
             if not shortfall.negligible
         )
 
     @property
     def drifts(self) -> bool:
         """Whether the champion is better by much more than chance, though hardly worth it."""
-        first = self.shortfalls[0]
+        first = self.gaps[0]
         enough = len(self.challenger.folds) >= LEAST_VEHICLES
         return enough and first.rmse > SURE * first.standard_error
 
@@ -129,7 +129,7 @@ class Comparison:
         others = "; ".join(
             f"{one.name} as published has {one.pooled.rmse_deg:.4f} deg and "
             f"{one.pooled.correlation:.4f}, difference {shortfall}"
-            for one, shortfall in zip(self.incumbents, self.shortfalls, strict=True)
+            for one, shortfall in zip(self.incumbents, self.gaps, strict=True)
         )
         return (
             f"on the same {number_of(challenger.rows, 'row')} of "
@@ -159,7 +159,7 @@ class Contest:
     by: FoldKey
     procedure: Procedure
     incumbents: dict[str, LinearModel]
-    worth: Worth
+    worth: Tolerance
 
     def serving(self, folds: CohortFolds) -> Folds:
         """Return the folds of drives with all signals. Raises `DataError` without."""
@@ -173,7 +173,7 @@ class Contest:
         names = tuple(whole.names[number] for number in used.tolist())
         part = cohort.part(wanted)
         assignment = FoldAssignment(fold, names)
-        return self.serving(CohortFolds.of(part.tables, assignment, part.drive_numbers))
+        return self.serving(CohortFolds.from_tables(part.tables, assignment, part.drive_numbers))
 
     def on(self, groups: Folds, tested: Folds) -> Comparison:
         """Compare, the challenger made without each of `groups`, on what `tested` has of it."""
@@ -188,8 +188,8 @@ class Contest:
         incumbents = tuple(
             as_it_is(self.catalog, *incumbent, tested) for incumbent in self.incumbents.items()
         )
-        shortfalls = tuple(compare_paired(challenger, one, self.worth) for one in incumbents)
-        return Comparison(self.by, challenger, incumbents, shortfalls)
+        gaps = tuple(compare_paired(challenger, one, self.worth) for one in incumbents)
+        return Comparison(self.by, challenger, incumbents, gaps)
 
 
 def contest_of(selection: Selection, incumbents: Sequence[ModelVersion]) -> Contest:
@@ -373,7 +373,7 @@ def odd_gain(registry: Registry, selection: Selection, champion: ModelVersion) -
     if on_new.rmse_deg <= ODD * on_old.rmse_deg:
         return None
     found = contest.on(groups, old)
-    (shortfall,) = found.shortfalls
+    (shortfall,) = found.gaps
     if shortfall.negligible:
         return None
     return (

@@ -100,7 +100,7 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageMo
     drives = served.drives["drive_id"].to_pylist()
     hashed = FOLDS if len(set(drives)) > FOLDS else None
     assignment = assign_folds(drives, "drive", FOLDS)
-    folds = CohortFolds.of([served.table], assignment).serving(signals, label)
+    folds = CohortFolds.from_tables([served.table], assignment).serving(signals, label)
     unit = catalog.input_scales[label] / Fraction(about["scale"])
     columns = [
         catalog.definition(name) or catalog.rows([name]).get(name) or Definition(of=name)

@@ -23,7 +23,7 @@ from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.folding import Folding, FoldKey
-from fleet_slip.regression.choice import DEFAULT_WORTH, Worth
+from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.orders import METHODS, RANKINGS
 from fleet_slip.regression.subsets import CRITERIA
@@ -210,10 +210,10 @@ class SelectionRequest:
             )
 
 
-def parse_worth(text: str | None) -> Worth:
+def parse_worth(text: str | None) -> Tolerance:
     """Return a gain from text such as `0.025deg` or `2%`, or the usual one. Raises `UsageError`."""
     if text is None:
-        return DEFAULT_WORTH
+        return DEFAULT_TOLERANCE
     found = _WORTH.fullmatch(text.strip())
     if found is None:
         raise UsageError(
@@ -221,7 +221,11 @@ def parse_worth(text: str | None) -> Worth:
             "2%."
         )
     amount = float(found[1])
-    return Worth(amount / 100, relative=True) if found[2] == "%" else Worth(math.radians(amount))
+    return (
+        Tolerance(amount / 100, relative=True)
+        if found[2] == "%"
+        else Tolerance(math.radians(amount))
+    )
 
 
 # Model lists: the candidates that a selection compares, read from `configs/models/*.toml`.

@@ -10,15 +10,15 @@ from fleet_slip.grams.cohort import Cohort, drive_folds
 from fleet_slip.grams.folding import Folding
 from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
-    ANY_WORTH,
     CROSS_VALIDATION,
-    DEFAULT_WORTH,
+    DEFAULT_TOLERANCE,
     FEWEST_FOLDS,
+    ZERO_TOLERANCE,
     NestedChoice,
     NestedDistances,
     Rule,
+    Tolerance,
     Winner,
-    Worth,
     choose,
     cross_validate_nested,
     cross_validate_selection,
@@ -118,7 +118,7 @@ def select_inputs(
         choice = SearchChoice(rule, chosen.evidence, nested=chosen, honest=honest)
         size = chosen.size
     by_folds = rule.criterion == CROSS_VALIDATION
-    winner = choose(models, rule.worth) if by_folds else _winner(models, size, choice)
+    winner = choose(models, rule.tolerance) if by_folds else _winner(models, size, choice)
     return SearchResult(tuple(models), winner, choice)
 
 
@@ -216,13 +216,13 @@ def searching(label: str, found: SearchedModels, size: int, *, intercept: bool) 
 
 
 def choose_by(
-    search: Search | None, models: Sequence[CrossValidation], asked: Worth | None = None
+    search: Search | None, models: Sequence[CrossValidation], asked: Tolerance | None = None
 ) -> Winner:
     """Return the winner by the rule of a search; a worth that was asked for precedes it."""
     if search is None or search.rule == "worth" or asked is not None:
-        return choose(models, asked or DEFAULT_WORTH)
+        return choose(models, asked or DEFAULT_TOLERANCE)
     if search.rule == "standard error":
-        return choose(models, ANY_WORTH)
+        return choose(models, ZERO_TOLERANCE)
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     reason = (
         f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "

@@ -46,7 +46,7 @@ from fleet_slip.models.search import (
     try_distances,
 )
 from fleet_slip.models.summary import summarize
-from fleet_slip.regression.choice import NestedDistances, Rule, Winner, Worth
+from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winner
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.folds import (
     CrossValidation,
@@ -62,7 +62,7 @@ from fleet_slip.warehouse.tables import Warehouse
 def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
     """Return the drives that `robust` counts less, the most unusual first."""
     table = served.table if intercept else served.table.about_origin()
-    weights = robust_weights(DriveMoments.of(table), intercept=intercept)
+    weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
     less = np.flatnonzero(weights.parts < FULL).tolist()
     names = served.drives["drive_id"].to_pylist()
     return {names[i]: weights.of(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))}
@@ -171,7 +171,7 @@ class Selection(Answer):
             "drives_weighed": document_of(self.weighed),
             "label_noise_deg": self.label_noise_deg,
         }
-        for model, shortfall in zip(document["models"], self.winner.shortfalls, strict=False):
+        for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
             model["shortfall"] = shortfall.as_dict()
         nested = {"left_out": self.distances} if isinstance(self.distances, str) else self.distances
         found = {
@@ -195,7 +195,7 @@ def select(
     cohort: Cohort,
     candidates: Sequence[CandidateModel],
     folds: Folding,
-    worth: Worth | None = None,
+    worth: Tolerance | None = None,
     searches: Sequence[Search] = (),
     inputs: Sequence[str] = (),
     *,

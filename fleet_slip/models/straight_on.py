@@ -22,8 +22,9 @@ from fleet_slip.errors import DataError
 from fleet_slip.grams.calibration import Calibration, calibrate
 from fleet_slip.grams.reader import DriveSums, collect_sums, open_grams
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit, solve
+from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit
 from fleet_slip.warehouse.condition import Condition
 from fleet_slip.warehouse.tables import Warehouse
 
@@ -170,7 +171,7 @@ def _of_car(
     def read(at: Sequence[Fraction]) -> float | None:
         """Return minus the model where the plane is read: both sides solved at once."""
         rows = [[*(exact(a, b) for b in plane), one] for a, one in zip(plane, at, strict=True)]
-        if (shares := solve(rows)) is None:
+        if (shares := solve_rational(rows)) is None:
             return None
         parts = (
             weight * share * exact(of, name)

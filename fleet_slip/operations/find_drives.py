@@ -19,7 +19,7 @@ from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 
 # Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
@@ -116,7 +116,7 @@ _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 """Temporary names of the Delta library, in a file system."""
 
 
-def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
+def rows_of(rows: pa.Table, subject: ErasureSubject) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
         return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
@@ -125,7 +125,7 @@ def rows_of(rows: pa.Table, subject: Forgettable) -> pa.ChunkedArray:
 
 
 def quarantined_of(
-    rows: pa.Table, subject: Forgettable, drives: Collection[str]
+    rows: pa.Table, subject: ErasureSubject, drives: Collection[str]
 ) -> pa.ChunkedArray:
     """Return which rows of the quarantine are of a subject, or of drives that are known to be.
 
@@ -153,7 +153,7 @@ class Located:
     drives: Mapping[str, frozenset[str]]
 
 
-def locate(grams: Snapshot, subject: Forgettable) -> Located:
+def locate(grams: Snapshot, subject: ErasureSubject) -> Located:
     """Look for a subject's drives in the Gram rows."""
     known: set[str] = set()
     drives: dict[str, set[str]] = {}
@@ -171,7 +171,7 @@ def locate(grams: Snapshot, subject: Forgettable) -> Located:
 
 
 def drives_by_file(
-    logs: Snapshot, subject: Forgettable, located: Located
+    logs: Snapshot, subject: ErasureSubject, located: Located
 ) -> dict[str, frozenset[str]]:
     """Return the drives concerned by log file, opening only files without Gram rows."""
     found = {}
@@ -186,7 +186,9 @@ def drives_by_file(
     return found
 
 
-def remove_uncommitted(warehouse: Warehouse, subject: Forgettable, drives: Collection[str]) -> None:
+def remove_uncommitted(
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
+) -> None:
     """Delete files with a car, or drives of it, that no version has had: none can land any more.
 
     Gram rows that landed ahead of a log file are then of one that is gone. Log files go last: they
@@ -211,7 +213,7 @@ def find_in_file(
     warehouse: Warehouse,
     table: Table,
     file: StoredFile,
-    subject: Forgettable,
+    subject: ErasureSubject,
     drives: Collection[str],
 ) -> set[str] | None:
     """Return a subject's drives in a file; None if no row, and no dictionary, has the subject."""
@@ -226,7 +228,7 @@ def find_in_file(
 
 
 def find_remains(
-    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> Iterator[str]:
     """Yield the files that are in no table and have rows of a subject, or cannot be read.
 
@@ -258,7 +260,7 @@ def path_below(warehouse: Warehouse, file: StoredFile) -> str:
     return str(file).removeprefix(f"{warehouse.root}/")
 
 
-def digests_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> Iterator[str]:
+def digests_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> Iterator[str]:
     """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
     grams = warehouse.grams.snapshot()
     for file in grams.files:

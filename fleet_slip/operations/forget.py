@@ -2,7 +2,7 @@
 
 Rows leave `quarantine`, `logs` (files are written again, in one commit) and `grams` (reconciled) in
 this order, so that what is left tells an interrupted job what to do. The record
-(`warehouse/forgotten.py`) is written first, then quarantine and logs are fenced: commits
+(`warehouse/erasure_log.py`) is written first, then quarantine and logs are fenced: commits
 that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
 logs. What such jobs have written is deleted by them or here.
 """
@@ -49,7 +49,7 @@ from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
-from fleet_slip.warehouse.forgotten import ALLOWED, Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 
 PENDING_SHOWN = 5
@@ -120,7 +120,7 @@ _NO_RUN = (
 
 def forget(
     warehouse: Warehouse,
-    subject: Forgettable,
+    subject: ErasureSubject,
     *,
     now: bool = False,
     progress: Progress = no_progress,
@@ -131,18 +131,18 @@ def forget(
     such drive, `StorageError`, `ConflictError`.
     """
     _require_delta_logs(warehouse)
-    audit = Audit(warehouse.root)
+    erasure_log = ErasureLog(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
     drives = _drives_of(warehouse, subject, located)
-    state = audit.state(subject)
+    state = erasure_log.state(subject)
     if not drives and state is None and subject.kind != "before":
         raise QuestionError(
             f"no drive has {subject.column} {subject.value!r}. See: "
             'fleet-slip sql "SELECT drive_id, vehicle_id, day FROM drives"'
         )
-    models = audit.models_of(subject)
+    models = erasure_log.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
-        models = _begin(warehouse, audit, subject, drives, located)
+        models = _begin(warehouse, erasure_log, subject, drives, located)
     for name in (cleared := warehouse.root / "cleared").names():
         cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
     for table in (warehouse.quarantine, warehouse.logs):
@@ -151,11 +151,11 @@ def forget(
     landed = _drives_of(warehouse, subject, located)
     if not landed <= drives:  # they landed before the fence
         drives |= landed
-        models = _begin(warehouse, audit, subject, drives, located)
+        models = _begin(warehouse, erasure_log, subject, drives, located)
     if drives:
         _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
-    if not audit.names_are_exact:
+    if not erasure_log.names_are_exact:
         drop_unused_names(warehouse)
     if drives or state:
         warehouse.grams.fence()
@@ -167,7 +167,7 @@ def forget(
     look = (drives or state) and subject.kind != "before"  # such drives may be landing
     tables = list(_tables_with(warehouse, subject, drives)) if look else []
     if not tables and (drives or state in ("begun", ALLOWED)):
-        audit.end(subject, warehouse.grams.snapshot().version)
+        erasure_log.end(subject, warehouse.grams.snapshot().version)
     pending: list[str] = []
     if drives or state:
         pending = [*tables, *_find_pending(warehouse, subject, drives, now=now)]
@@ -184,7 +184,7 @@ def forget(
 
 
 def _tables_with(
-    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> Iterator[str]:
     """Yield the tables whose newest version still has rows of a subject."""
     located = locate(warehouse.grams.snapshot(), subject)
@@ -200,7 +200,7 @@ def _tables_with(
 
 
 def _find_pending(
-    warehouse: Warehouse, subject: Forgettable, drives: Collection[str], *, now: bool
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str], *, now: bool
 ) -> list[str]:
     """Return runs, and files outside the tables, that have or may have rows of a subject.
 
@@ -231,8 +231,8 @@ def _require_delta_logs(warehouse: Warehouse) -> None:
 
 def _begin(
     warehouse: Warehouse,
-    audit: Audit,
-    subject: Forgettable,
+    erasure_log: ErasureLog,
+    subject: ErasureSubject,
     drives: Collection[str],
     located: Located,
 ) -> list[str]:
@@ -240,11 +240,11 @@ def _begin(
     judged = {name: max(registry.versions(name), default=0) for name in registry.names()}
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
-    audit.begin(subject, len(drives), models, judged, set(known))
+    erasure_log.begin(subject, len(drives), models, judged, set(known))
     return models
 
 
-def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> frozenset[str]:
+def _drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
     """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
     in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
     found: set[str] = set().union(*in_logs.values(), *located.drives.values())
@@ -257,7 +257,7 @@ def _drives_of(warehouse: Warehouse, subject: Forgettable, located: Located) -> 
 
 @retrying
 def _rewrite_logs(
-    warehouse: Warehouse, subject: Forgettable, located: Located, progress: Progress
+    warehouse: Warehouse, subject: ErasureSubject, located: Located, progress: Progress
 ) -> tuple[int, int, int]:
     logs = warehouse.logs.snapshot()
     drives = drives_by_file(logs, subject, located)
@@ -278,7 +278,7 @@ def _rewrite_logs(
 
 @retrying
 def _forget_quarantined(
-    warehouse: Warehouse, subject: Forgettable, drives: Collection[str]
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> None:
     snapshot = warehouse.quarantine.snapshot()
     add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
@@ -346,6 +346,6 @@ def retain(
             f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
             "be forgotten, which leaves none. Check the clock, or drives_days of the retention."
         )
-    forgotten = forget(warehouse, Forgettable("before", before.isoformat()), progress=progress)
+    forgotten = forget(warehouse, ErasureSubject("before", before.isoformat()), progress=progress)
     vacuumed = vacuum(warehouse, retention.replaced_files_hours)
     return RetentionReport(before, forgotten, vacuumed)

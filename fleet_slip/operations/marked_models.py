@@ -15,13 +15,13 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import Hashes, hash_names
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.tables import Warehouse
 
 
 def marked_models(warehouse: Warehouse) -> frozenset[str]:
     """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
-    entries = Audit(warehouse.root).entries()
+    entries = ErasureLog(warehouse.root).entries()
     found = {name for entry in entries for name in entry.get("models", ())}
     judged: dict[str, dict[str, int]] = {}
     without: dict[str, int | None] = {}

@@ -40,7 +40,7 @@ from fleet_slip.storage.table import (
     retrying,
     scales_of,
 )
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -182,7 +182,7 @@ def drop_unused_names(warehouse: Warehouse) -> int:
 
 
 @retrying
-def forget_received(warehouse: Warehouse, subject: Forgettable) -> int:
+def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
     """Commit the Gram rows without those that came without a log; return how many rows."""
     snapshot = warehouse.grams.snapshot()
     concerned: list[TableFile] = []

@@ -33,7 +33,7 @@ from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
-from fleet_slip.warehouse.erased import find_erased
+from fleet_slip.warehouse.erasure_log import find_erased
 from fleet_slip.warehouse.tables import Warehouse
 
 SECONDS_PER_HOUR = 3600

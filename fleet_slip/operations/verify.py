@@ -53,7 +53,7 @@ from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
-from fleet_slip.warehouse.forgotten import Audit
+from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.tables import Warehouse
 
 DamageKind: TypeAlias = Literal[
@@ -230,17 +230,19 @@ def verify_names(
     """Look for forgotten cars; for forgotten drives too with `full`."""
     unused = frozenset(name for one in _all(read) for name in _unused(one))
     cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
-    audit = Audit(warehouse.root)
+    erasure_log = ErasureLog(warehouse.root)
     try:
-        barred = audit.barred(cars | unused, (drives if full else frozenset()) | unused, ended=True)
+        erased = erasure_log.erased(
+            cars | unused, (drives if full else frozenset()) | unused, ended=True
+        )
     except StorageError:  # a lost or damaged document, which is reported as such
         return
-    wrong = {"vehicle_id": barred.vehicles, "drive_id": barred.drives}
+    wrong = {"vehicle_id": erased.vehicles, "drive_id": erased.drives}
     for table, files in read.items():
         for one in files:
             if any(not wrong[name].isdisjoint(_used([one], name)) for name in wrong):
                 problem = "has rows of a car or drive that was forgotten; give forget again"
-            elif not (barred.vehicles | barred.drives).isdisjoint(_unused(one)):
+            elif not (erased.vehicles | erased.drives).isdisjoint(_unused(one)):
                 problem = (
                     "has the name of a car or drive that was forgotten; run: fleet-slip migrate"
                 )

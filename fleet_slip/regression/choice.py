@@ -12,9 +12,8 @@ import numpy as np
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record
-from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.regression.drives import DriveMoments
-from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,
@@ -26,7 +25,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
-from fleet_slip.regression.least_squares import Fit, Scales, dependence, fit_leading, moments
+from fleet_slip.regression.least_squares import Fit, Scales, fit_moments, moments
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_size, criterion_values
 
@@ -45,7 +44,7 @@ from fleet_slip.regression.subsets import best_size, criterion_values
 
 
 @dataclass(frozen=True)
-class Worth:
+class Tolerance:
     """The smallest gain that is worth a signal.
 
     Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a part of the best's.
@@ -65,49 +64,50 @@ class Worth:
         return f"{math.degrees(self.amount):.4g} deg"
 
 
-DEFAULT_WORTH = Worth(math.radians(0.025))
+DEFAULT_TOLERANCE = Tolerance(math.radians(0.025))
 """A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
 
 
-ANY_WORTH = Worth(0.0)
+ZERO_TOLERANCE = Tolerance(0.0)
 """Any gain that is larger than its standard error."""
 
 
 @dataclass(frozen=True)
-class Shortfall:
+class RmseGap:
     """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
 
-    `square` is the difference of mean squared errors, rad^2; `worthless` if not worth having.
+    `square` is the difference of mean squared errors, rad^2. A gap `within_tolerance` is too small
+    to be worth a signal.
     """
 
     model: CrossValidation
     rmse: float
     standard_error: float
     square: float
-    worthless: bool
+    within_tolerance: bool
 
     @property
-    def lacks(self) -> float:
+    def independent_error(self) -> float:
         """What the model lacks, in rad, without the noise of the label; 0 if it is the better."""
         return math.sqrt(max(self.square, 0.0))
 
     @property
-    def real(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether it is larger than its standard error."""
         return self.rmse > self.standard_error
 
     @property
     def negligible(self) -> bool:
         """Whether the best model is no reason to do without this one."""
-        return self.worthless or not self.real
+        return self.within_tolerance or not self.is_significant
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
         return {
             "rmse_deg": math.degrees(self.rmse),
             "standard_error_deg": math.degrees(self.standard_error),
-            "lacks_deg": math.degrees(self.lacks),
-            "real": self.real,
+            "lacks_deg": math.degrees(self.independent_error),
+            "real": self.is_significant,
             "negligible": self.negligible,
         }
 
@@ -117,15 +117,15 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Winner:
-    """The chosen model, the best-correlated one, the reason, and the shortfalls of all if any."""
+    """The chosen model, the best-correlated one, the reason, and the gaps of all if any."""
 
     model: CrossValidation
     best: CrossValidation
     reason: str
-    shortfalls: tuple[Shortfall, ...] = ()
+    gaps: tuple[RmseGap, ...] = ()
 
 
-def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> Winner:
+def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOLERANCE) -> Winner:
     """Return the winner of cross-validated models, given in their declared order.
 
     Among those negligibly worse than the best pooled correlation the fewest signals win, then the
@@ -134,85 +134,90 @@ def choose(models: Sequence[CrossValidation], worth: Worth = DEFAULT_WORTH) -> W
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
     best = max(models, key=lambda model: model.sums.signed_r_squared)
-    shortfalls = tuple(fall_short(model, best, worth) for model in models)
-    near = [one for one in shortfalls if one.model is best or one.negligible]
-    fewest = min(len(one.model.signals) for one in near)
-    smallest = [one for one in near if len(one.model.signals) == fewest]
-    winner = max(smallest, key=lambda one: one.model.sums.signed_r_squared)
-    reason = _reason(winner, best, len(near), len(models), worth)
-    return Winner(winner.model, best, reason, shortfalls)
+    gaps = tuple(measure_gap(model, best, tolerance) for model in models)
+    contenders = [gap for gap in gaps if gap.model is best or gap.negligible]
+    min_size = min(len(gap.model.signals) for gap in contenders)
+    smallest = [gap for gap in contenders if len(gap.model.signals) == min_size]
+    winner = max(smallest, key=lambda gap: gap.model.sums.signed_r_squared)
+    reason = _reason(winner, best, len(contenders), len(models), tolerance)
+    return Winner(winner.model, best, reason, gaps)
 
 
-def fall_short(model: CrossValidation, best: CrossValidation, worth: Worth) -> Shortfall:
+def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolerance) -> RmseGap:
     """Return how much larger a model's RMSE is than another's, over the same folds."""
     difference, square = _differences(model, best)
-    worthless = square < worth.squared(best.pooled.rmse)
-    return Shortfall(model, difference, _standard_error(model, best), square, worthless)
+    within_tolerance = square < tolerance.squared(best.pooled.rmse)
+    return RmseGap(model, difference, _standard_error(model, best), square, within_tolerance)
 
 
 def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
     """Return how much larger a model's pooled RMSE is than another's, and its square."""
-    one, two = model.pooled.rmse, other.pooled.rmse
-    return one - two, (one - two) * (one + two)
+    first, second = model.pooled.rmse, other.pooled.rmse
+    return first - second, (first - second) * (first + second)
 
 
-def _standard_error(one: CrossValidation, other: CrossValidation) -> float:
+def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
     """Return the standard error of the difference of RMSEs over folds, paired where rows agree."""
-    first, second = ([fold.rmse for fold in model.folds] for model in (one, other))
-    rows = [[fold.rows for fold in model.folds] for model in (one, other)]
-    if one.fold_names == other.fold_names and rows[0] == rows[1]:
+    first, second = ([fold.rmse for fold in model.folds] for model in (candidate, other))
+    rows = [[fold.rows for fold in model.folds] for model in (candidate, other)]
+    if candidate.fold_names == other.fold_names and rows[0] == rows[1]:
         return error_of_mean([a - b for a, b in zip(first, second, strict=True)])
     return math.hypot(error_of_mean(first), error_of_mean(second))
 
 
-def _reason(winner: Shortfall, best: CrossValidation, near: int, total: int, worth: Worth) -> str:
-    if winner.model is best and near == total == 1:
+def _reason(
+    winner: RmseGap, best: CrossValidation, contenders: int, total: int, tolerance: Tolerance
+) -> str:
+    if winner.model is best and contenders == total == 1:
         return f"Model {best.name} is the only one."
     rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
     if winner.model is best:
-        others = "every other model" if near == 1 else "every model with fewer signals"
-        larger = f"{worth} or more, and by " if worth.amount else ""
+        rivals = "every other model" if contenders == 1 else "every model with fewer signals"
+        larger = f"{tolerance} or more, and by " if tolerance.amount else ""
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
-            f"with {rmse}. The gain over {others} is {larger}more than one standard error, so it "
+            f"with {rmse}. The gain over {rivals} is {larger}more than one standard error, so it "
             "is significant."
         )
-    if not worth.amount:
+    if not tolerance.amount:
         return (
             f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of "
-            f"the {near} models within one standard error of the best. The gain of model "
+            f"the {contenders} models within one standard error of the best. The gain of model "
             f"{best.name} ({len(best.signals)} signals, {rmse}), {winner}, is not significant."
         )
     real = (
         "significant, but less than the required"
-        if winner.real
+        if winner.is_significant
         else "not significant; required are"
     )
-    lacks_deg = math.degrees(winner.lacks)
+    lacks_deg = math.degrees(winner.independent_error)
     lacking = (
-        "" if worth.relative else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
+        ""
+        if tolerance.relative
+        else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
     )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
-        f"{near} models that are about as good as model {best.name}, the best "
-        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} {worth}."
+        f"{contenders} models that are about as good as model {best.name}, the best "
+        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} "
+        f"{tolerance}."
     )
 
 
-def compare_paired(model: CrossValidation, other: CrossValidation, worth: Worth) -> Shortfall:
+def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: Tolerance) -> RmseGap:
     """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
     rows = _common_rows(model, other)
     differences = [
-        n * (one.rmse - two.rmse) * (one.rmse + two.rmse)
-        for n, one, two in zip(rows, model.folds, other.folds, strict=True)
+        n * (first.rmse - second.rmse) * (first.rmse + second.rmse)
+        for n, first, second in zip(rows, model.folds, other.folds, strict=True)
     ]
     ratio, groups = math.fsum(differences) / sum(rows), len(rows)
     square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
     error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
     both = model.pooled.rmse + other.pooled.rmse
     rmse, lacking = _differences(model, other)
-    worthless = lacking < worth.squared(other.pooled.rmse)
-    return Shortfall(model, rmse, error / both if both else 0.0, lacking, worthless)
+    within_tolerance = lacking < tolerance.squared(other.pooled.rmse)
+    return RmseGap(model, rmse, error / both if both else 0.0, lacking, within_tolerance)
 
 
 def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
@@ -225,13 +230,36 @@ def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
 def nested_fits(
     gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
 ) -> list[Fit]:
-    """Return the exact fits of the first 0..k signals. Raises `DataError` for dependent ones."""
-    part = gram.restrict([*order, label])
-    triangle = eliminate(moments(part, intercept=intercept))
-    if triangle.singular is not None:
-        raise DataError(dependence(part, order, intercept=intercept))
-    sizes = range(len(order) + 1)
-    return [fit_leading(part, triangle, size, intercept=intercept) for size in sizes]
+    """Fit the nested models of an order of signals exactly.
+
+    Parameters
+    ----------
+    gram : Gram
+        Sums and products of counts, of at least the order and the label.
+    order : sequence of str
+        The k signals; model j has the first j of them.
+    label : str
+    intercept : bool
+
+    Returns
+    -------
+    list of Fit
+        k + 1 fits, of 0 to k signals.
+
+    Raises
+    ------
+    DataError
+        If signals are linearly dependent, or the Gram has no rows.
+    """
+    matrix = moments(gram.restrict([*order, label]), intercept=intercept)
+
+    def fit_first(size: int) -> Fit:
+        at = [*range(size), len(order)]
+        part = gram.restrict([*order[:size], label])
+        return fit_moments(part, [[matrix[i][j] for j in at] for i in at], intercept=intercept)
+
+    full = fit_first(len(order))  # names all dependent signals
+    return [*(fit_first(size) for size in range(len(order))), full]
 
 
 CROSS_VALIDATION = "cross-validation"
@@ -248,7 +276,7 @@ class Rule:
 
     ranking: str
     criterion: str
-    worth: Worth = DEFAULT_WORTH
+    tolerance: Tolerance = DEFAULT_TOLERANCE
 
 
 @dataclass(frozen=True)
@@ -325,7 +353,7 @@ def select_nested(
     evidence = training.evidence(fits)
     if rule.criterion == CROSS_VALIDATION:
         models = cross_validate_nested(training, order, label)
-        size = len(choose(models, rule.worth).model.signals)
+        size = len(choose(models, rule.tolerance).model.signals)
         values = tuple(-model.correlation for model in models)
     else:
         size = best_size(rule.criterion, evidence)
@@ -362,9 +390,9 @@ def cross_validate_selection(
     folds = training.folds
     tests = []
     for number, test in enumerate(folds.grams):
-        rest = _without(training, fold, number)
-        model = select_nested(rest, inputs, label, rule).fit.model
-        tests.append(held_out_errors(model, rest.folds.total, test))
+        inner = _without(training, fold, number)
+        model = select_nested(inner, inputs, label, rule).fit.model
+        tests.append(held_out_errors(model, inner.folds.total, test))
     chosen = select_nested(training, inputs, label, rule).fit.model
     return assemble(name, folds, tests, chosen, training.scales)
 
@@ -372,5 +400,5 @@ def cross_validate_selection(
 def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
     if len(training.folds.grams) < FEWEST_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
-    rest = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return replace(training, folds=rest, drives=training.drives.take(fold != number))
+    remaining = training.folds.without(number, int(np.count_nonzero(fold != number)))
+    return replace(training, folds=remaining, drives=training.drives.take(fold != number))

@@ -27,7 +27,7 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
     )
 
 
-def serving_drives(
+def complete_cases(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
     """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
@@ -54,7 +54,7 @@ class DriveMoments:
     Attributes:
         centre: mean count of each signal over all drives, rounded to an integer.
         spread: standard deviation of each signal's counts; 1 for a constant.
-        each: moments of u, shape (drives, k+1, k+1).
+        moments: of u, shape (drives, k+1, k+1).
         cluster: number of each drive's piece of evidence, shape (drives,); None: its own.
         unit: what a piece of evidence is: drives of a car share its biases and tyres.
     """
@@ -62,12 +62,12 @@ class DriveMoments:
     signals: tuple[str, ...]
     centre: tuple[int, ...]
     spread: FloatArray
-    each: FloatArray
+    moments: FloatArray
     cluster: IntArray | None = None
     unit: ClusterUnit = "drive"
 
     @classmethod
-    def of(
+    def from_table(
         cls, table: GramTable, cluster: IntArray | None = None, unit: ClusterUnit = "drive"
     ) -> "DriveMoments":
         """Scale a table of drives. Raises `DataError` without rows."""
@@ -75,19 +75,21 @@ class DriveMoments:
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
         centre = tuple(round(s / total.n) for s in total.sums)
-        squares = np.array([row[i] for i, row in enumerate(total.centred())], dtype=np.float64)
+        squares = np.array(
+            [row[i] for i, row in enumerate(total.centered_products())], dtype=np.float64
+        )
         spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
         unit_of_u = np.array([1.0, *spread])
-        each = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)
-        return cls(table.signals, centre, spread, each, cluster, unit)
+        moments = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)
+        return cls(table.signals, centre, spread, moments, cluster, unit)
 
     def __len__(self) -> int:
-        return len(self.each)
+        return len(self.moments)
 
     def take(self, rows: NDArray[Any]) -> "DriveMoments":
         """Return the drives at an index array or a mask, with the same centre and spread."""
         cluster = None if self.cluster is None else self.cluster[rows]
-        return replace(self, each=self.each[rows], cluster=cluster)
+        return replace(self, moments=self.moments[rows], cluster=cluster)
 
     @property
     def clusters(self) -> int:

@@ -70,14 +70,16 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
     if len(assignment.names) <= count:
         return assignment
     bands = np.array_split(np.arange(len(assignment.names)), count)
-    band = np.repeat(np.arange(count), [len(one) for one in bands])
-    names = tuple(f"{assignment.names[one[0]]} to {assignment.names[one[-1]]}" for one in bands)
+    band = np.repeat(np.arange(count), [len(members) for members in bands])
+    names = tuple(
+        f"{assignment.names[members[0]]} to {assignment.names[members[-1]]}" for members in bands
+    )
     return FoldAssignment(band[assignment.fold].astype(np.int64), names)
 
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, their names and numbers of drives; rows `beside` are always trained on.
+    """One Gram a fold, their names and numbers of drives; rows `auxiliary` are always trained on.
 
     These have an intercept of their own: what they tell is how columns and label change together.
     """
@@ -85,31 +87,33 @@ class Folds:
     grams: tuple[Gram, ...]
     names: tuple[str, ...]
     drives: int
-    beside: Gram | None = None
+    auxiliary: Gram | None = None
     weight: Fraction = Fraction(1)
 
     @cached_property
     def total(self) -> Gram:
         """The Gram of all that a model is trained on, in whole parts of a row's weight."""
-        own = sum(self.grams[1:], self.grams[0]).times(self._times)
-        if self.beside is None or not self.weight:
-            return own
-        about_mean = self.beside.about_mean()
-        return own + about_mean.times(self.weight.numerator * self._times // self._divisor)
+        scaled_total = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
+        if self.auxiliary is None or not self.weight:
+            return scaled_total
+        centered = self.auxiliary.centered()
+        return scaled_total + centered.scaled(
+            self.weight.numerator * self._row_factor // self._divisor
+        )
 
     @property
     def _divisor(self) -> int:
-        return self.weight.denominator * (self.beside.n if self.beside else 1)
+        return self.weight.denominator * (self.auxiliary.n if self.auxiliary else 1)
 
     @cached_property
-    def _times(self) -> int:
+    def _row_factor(self) -> int:
         """How often each row counts, so that all weights are whole."""
         return self._divisor // math.gcd(self.weight.numerator, self._divisor)
 
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
         """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
         for fold in self.grams:
-            yield self.total - fold.times(self._times), fold
+            yield self.total - fold.scaled(self._row_factor), fold
 
     def without(self, number: int, drives: int) -> "Folds":
         """Return the other folds, which hold so many drives."""
@@ -123,17 +127,17 @@ class CohortFolds:
     """The folds of a cohort whose drives may have different signals: `tables` of Grams by set.
 
     `count_drives` tells how many drives have a row in some of the tables, by their places; for
-    `beside` and `weight` see `Folds`.
+    `auxiliary` and `weight` see `Folds`.
     """
 
     names: tuple[str, ...]
     tables: tuple[tuple[Gram, ...], ...]
     count_drives: Callable[[Sequence[int]], int]
-    beside: tuple[Gram, ...] = ()
+    auxiliary: tuple[Gram, ...] = ()
     weight: Fraction = Fraction(1)
 
     @classmethod
-    def of(
+    def from_tables(
         cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
     ) -> "CohortFolds":
         """Add up each fold's Gram rows; `drives` numbers their drives, by default one each."""
@@ -163,8 +167,8 @@ class CohortFolds:
         signals = (*inputs, label)
         served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
         if not served:
-            known = sorted({name for grams in self.tables for name in grams[0].signals})
-            require_signals(known, signals)
+            available = sorted({name for grams in self.tables for name in grams[0].signals})
+            require_signals(available, signals)
             raise missing_signals_error(signals)
         folds = tuple(
             sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
@@ -180,9 +184,11 @@ class CohortFolds:
                 f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
                 "fewer folds, another key to fold by, or fewer signals."
             )
-        others = [one.restrict(signals) for one in self.beside if set(signals) <= set(one.signals)]
-        beside = sum(others[1:], others[0]) if others else None
-        return Folds(folds, names, self.count_drives(served), beside, self.weight)
+        matching = [
+            gram.restrict(signals) for gram in self.auxiliary if set(signals) <= set(gram.signals)
+        ]
+        auxiliary = sum(matching[1:], matching[0]) if matching else None
+        return Folds(folds, names, self.count_drives(served), auxiliary, self.weight)
 
 
 # Cross-validation from one Gram a fold: train on the total minus it; pool all sums (Table I).

@@ -81,21 +81,21 @@ class Gram:
     def __sub__(self, other: "Gram") -> "Gram":
         """Return the Gram of the other rows. Raises `DataError` if `other` was no part of it."""
         self._require_same_signals(other)
-        rest = Gram(
+        difference = Gram(
             self.signals,
             self.n - other.n,
             tuple(map(operator.sub, self.sums, other.sums)),
             tuple(map(operator.sub, self.products, other.products)),
         )
-        squares = [rest.products[packed_position(i, i)] for i in range(len(self.signals))]
-        if rest.n < 0 or min(squares, default=0) < 0:
+        squares = [difference.products[packed_position(i, i)] for i in range(len(self.signals))]
+        if difference.n < 0 or min(squares, default=0) < 0:
             raise DataError(
                 "cannot subtract a Gram that is not part of the total: a sum of squares would be "
                 "negative. Rebuild the Gram rows from the logs."
             )
-        return rest
+        return difference
 
-    def times(self, count: int) -> "Gram":
+    def scaled(self, count: int) -> "Gram":
         """Return the Gram in which each row counts so many times."""
         return Gram(
             self.signals,
@@ -118,13 +118,17 @@ class Gram:
         """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
-    def about_mean(self) -> "Gram":
+    def centered(self) -> "Gram":
         """Return n times the Gram of the rows less their mean, as of no rows: no part of a mean."""
         return Gram(
             self.signals,
             0,
             (0,) * len(self.sums),
-            tuple(product for i, row in enumerate(self.centred()) for product in row[: i + 1]),
+            tuple(
+                product
+                for i, row in enumerate(self.centered_products())
+                for product in row[: i + 1]
+            ),
         )
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
@@ -161,15 +165,15 @@ class Gram:
         """Return the k x k matrix of product sums about zero, as integers."""
         return _mirrored([self._packed_row(i) for i in range(len(self.signals))])
 
-    def centred(self) -> list[list[int]]:
+    def centered_products(self) -> list[list[int]]:
         """Return n S_ab = n sum(a b) - sum(a) sum(b), with S the product sums about the means."""
         return _mirrored(
             [
                 [
-                    self.n * product - own * other
-                    for product, other in zip(self._packed_row(i), self.sums, strict=False)
+                    self.n * product - row_sum * column_sum
+                    for product, column_sum in zip(self._packed_row(i), self.sums, strict=False)
                 ]
-                for i, own in enumerate(self.sums)
+                for i, row_sum in enumerate(self.sums)
             ]
         )
 
@@ -192,19 +196,19 @@ def _mirrored(lower: Sequence[Sequence[int]]) -> list[list[int]]:
 NAMES_SHOWN = 4
 
 
-def require_signals(signals: Sequence[str], wanted: Sequence[str]) -> None:
+def require_signals(signals: Sequence[str], required: Sequence[str]) -> None:
     """Raise `DataError` for a wanted signal that is absent."""
-    missing = [name for name in wanted if name not in signals]
+    missing = [name for name in required if name not in signals]
     if missing:
         more = len(missing) - NAMES_SHOWN
-        *some, last = missing if more <= 1 else [*missing[:NAMES_SHOWN], f"{more} more"]
-        raise DataError(f"these drives lack {', '.join(some)}{' and ' if some else ''}{last}.")
+        *shown, last = missing if more <= 1 else [*missing[:NAMES_SHOWN], f"{more} more"]
+        raise DataError(f"these drives lack {', '.join(shown)}{' and ' if shown else ''}{last}.")
 
 
-def positions(signals: Sequence[str], wanted: Sequence[str]) -> list[int]:
+def positions(signals: Sequence[str], required: Sequence[str]) -> list[int]:
     """Return the index of each wanted signal. Raises `DataError` for an absent one."""
-    require_signals(signals, wanted)
-    return [signals.index(name) for name in wanted]
+    require_signals(signals, required)
+    return [signals.index(name) for name in required]
 
 
 @cache
@@ -213,8 +217,8 @@ def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
     places = np.array(at, dtype=np.int64)
     row, column = np.tril_indices(len(at))
     larger = np.maximum(places[row], places[column])
-    found = packed_size(larger) + np.minimum(places[row], places[column])
-    return tuple(found.tolist())
+    packed = packed_size(larger) + np.minimum(places[row], places[column])
+    return tuple(packed.tolist())
 
 
 # Gram matrices of many drives side by side, and their exact sums.
@@ -286,12 +290,12 @@ class GramTable:
     def moments(self) -> FloatArray:
         """Return the sums of the products of (1, signals) of each drive, (drives, k+1, k+1)."""
         k = len(self.signals)
-        found = np.empty((len(self), k + 1, k + 1))
-        found[:, 0, 0] = self.n
-        found[:, 0, 1:] = found[:, 1:, 0] = self.sums
+        moments = np.empty((len(self), k + 1, k + 1))
+        moments[:, 0, 0] = self.n
+        moments[:, 0, 1:] = moments[:, 1:, 0] = self.sums
         i, j = np.tril_indices(k)
-        found[:, i + 1, j + 1] = found[:, j + 1, i + 1] = self.products
-        return found
+        moments[:, i + 1, j + 1] = moments[:, j + 1, i + 1] = self.products
+        return moments
 
     def restrict(self, signals: Sequence[str]) -> "GramTable":
         """Return the drives with some of the signals. Raises `DataError` if one is missing."""
@@ -325,8 +329,8 @@ def exact_sum(values: IntArray) -> list[int]:
     wrapped = values.sum(axis=0)
     totals: list[int] = [int(total) for total in wrapped.tolist()]
     if values.dtype != object:
-        near = values.sum(axis=0, dtype=np.float64)
-        turns = np.rint((near - wrapped.astype(np.float64)) / _MODULUS)
+        approximate = values.sum(axis=0, dtype=np.float64)
+        turns = np.rint((approximate - wrapped.astype(np.float64)) / _MODULUS)
         for at in np.flatnonzero(turns).tolist():
             totals[at] += int(turns[at]) * _MODULUS
     return totals

@@ -18,7 +18,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.drives import DriveMoments
-from fleet_slip.regression.exact import inverse_matrix
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
@@ -47,9 +46,9 @@ def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, 
     """
     at, first = _columns(fitted, drives), int(not fitted.has_intercept)
     chosen = at[first:]
-    each = drives.by_cluster(drives.each)[:, chosen][:, :, chosen]
-    back = np.linalg.inv(np.linalg.cholesky(each.sum(axis=0)))
-    leverage = back @ each @ back.T
+    cluster_moments = drives.by_cluster(drives.moments)[:, chosen][:, :, chosen]
+    back = np.linalg.inv(np.linalg.cholesky(cluster_moments.sum(axis=0)))
+    leverage = back @ cluster_moments @ back.T
     values, vectors = np.linalg.eigh(np.eye(len(back)) - leverage)
     inverse = np.where(values > SINGULAR, 1 / np.sqrt(np.maximum(values, SINGULAR)), 0.0)
     root = (vectors * inverse[:, None, :]) @ vectors.swapaxes(1, 2)
@@ -62,7 +61,7 @@ def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, 
     trace = (single - shared).sum(axis=1)
     square = (single**2 - 2 * single * shared).sum(axis=1)
     square += ((pairs.swapaxes(1, 2) @ pairs) ** 2).sum(axis=(1, 2))
-    clusters = np.full(len(trace), len(each) - 1.0)
+    clusters = np.full(len(trace), len(cluster_moments) - 1.0)
     degrees = np.divide(trace**2, square, out=clusters, where=square > 0)
     return ((scale @ scores.T) ** 2).sum(axis=1), degrees
 
@@ -110,14 +109,15 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     inputs, gram = fitted.model.signals, fitted.gram
     scale = gram.n if fitted.has_intercept else 1
     part = gram.restrict(inputs)
-    inverse = inverse_matrix(moments(part, intercept=fitted.has_intercept))
-    slopes = [variance * scale * inverse[i][i] for i in range(fitted.size)]
+    inverse, denominator = exact.invert(moments(part, intercept=fitted.has_intercept))
+    unit = variance * scale / denominator
+    slopes = [unit * inverse[i][i] for i in range(fitted.size)]
     if not fitted.has_intercept:
         return slopes
     k = range(fitted.size)
     # S^-1 = n N^-1 and m = sums / n, so m'S^-1 m = sums'N^-1 sums / n.
     form = sum(part.sums[i] * inverse[i][j] * part.sums[j] for i in k for j in k)
-    return [variance * (1 + form) / gram.n, *slopes]
+    return [variance * (1 + Fraction(form, denominator)) / gram.n, *slopes]
 
 
 def infer_classically(fitted: Fit, scales: Scales) -> Inference:
@@ -155,7 +155,7 @@ def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
     """Return each cluster's sum of (1, inputs) times residual, standardised, (clusters, k+1)."""
-    scores = -(drives.each @ drives.direction(fitted.model))[:, _columns(fitted, drives)]
+    scores = -(drives.moments @ drives.direction(fitted.model))[:, _columns(fitted, drives)]
     return drives.by_cluster(scores)
 
 
@@ -172,8 +172,11 @@ def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
     if relations:
         raise DataError(relations)
     matrix = moments(gram.restrict(inputs))
-    inverse = inverse_matrix(matrix)
-    return {name: float(matrix[i][i] * inverse[i][i]) for i, name in enumerate(inputs)}
+    inverse, denominator = exact.invert(matrix)
+    return {
+        name: matrix[i][i] * inverse[i][i] / denominator  # two integers: one rounding
+        for i, name in enumerate(inputs)
+    }
 
 
 def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:
@@ -192,7 +195,7 @@ def _inference(
     sigma2: Fraction,
     errors: Sequence[float],
     degrees: int,
-    each: Sequence[float] = (),
+    coefficient_degrees: Sequence[float] = (),
 ) -> Inference:
     model = fitted.model.physical(scales)
     names = [INTERCEPT] if fitted.has_intercept else []
@@ -202,7 +205,7 @@ def _inference(
         [*names, *model.signals],
         [*values, *model.weights.values()],
         errors,
-        each or [float(degrees)] * len(errors),
+        coefficient_degrees or [float(degrees)] * len(errors),
         strict=True,
     ):
         t = value / error if error else math.copysign(math.inf, value)
@@ -254,7 +257,7 @@ class Evidence:
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = _columns(full, drives)
-        total = drives.each.sum(axis=0)[np.ix_(at, at)]
+        total = drives.moments.sum(axis=0)[np.ix_(at, at)]
         scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]
         unit = float(drives.spread[-1]) ** 2
@@ -368,14 +371,14 @@ def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
         steep = squares - weights + weights**2 / weights.sum()
         return 1 + between / 2 * float(steep.sum())
 
-    most = math.log(float(np.ptp(values)) ** 2 * len(values) + float(variances.max()) * 16)
-    log_between = _root(slope, math.log(float(variances.min())) - 16, most)
+    high = math.log(float(np.ptp(values)) ** 2 * len(values) + float(variances.max()) * 16)
+    log_between = _root(slope, math.log(float(variances.min())) - 16, high)
     information = (slope(log_between - _STEP) - slope(log_between + _STEP)) / (2 * _STEP)
     weights = 1 / (variances + math.exp(log_between))
     mean, drawn = _mean(values, weights), variances * weights
     mean_variance = 1 / float(weights.sum())
-    left = drawn * (1 - drawn)
-    of_drawn = left**2 / (information + left)
+    binomial = drawn * (1 - drawn)
+    of_drawn = binomial**2 / (information + binomial)
     squares = variances * (1 - drawn) + drawn**2 * mean_variance + of_drawn * (values - mean) ** 2
     spread = math.exp(log_between / 2)
     return Pooled(
@@ -392,8 +395,8 @@ def _mean(values: FloatArray, weights: FloatArray) -> float:
     return float((weights * values).sum() / weights.sum())
 
 
-def _root(falling: Callable[[float], float], least: float, most: float) -> float:
+def _root(falling: Callable[[float], float], low: float, high: float) -> float:
     for _ in range(_HALVINGS):
-        middle = (least + most) / 2
-        least, most = (middle, most) if falling(middle) > 0 else (least, middle)
-    return (least + most) / 2
+        middle = (low + high) / 2
+        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
+    return (low + high) / 2

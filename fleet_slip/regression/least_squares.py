@@ -14,16 +14,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record, number_of
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
-from fleet_slip.regression.exact import (
-    Elimination,
-    eliminate,
-    solve_by_lifting,
-    symmetric_eigenvalues,
-)
 from fleet_slip.regression.gram import Gram
-
-MANY_INPUTS = 40
-"""From so many on, lifting is faster than elimination; both give the same fractions."""
 
 Scales = Mapping[str, Fraction]
 """Physical value of one count of each signal: `Catalog.input_scales`."""
@@ -99,46 +90,49 @@ class Fit:
 
 
 def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True) -> Fit:
-    """Fit the label by exact least squares. Raises `DataError` that names dependent signals."""
+    """Fit a label by ordinary least squares, exactly: equation (4) of the paper.
+
+    Parameters
+    ----------
+    gram : Gram
+        Sums and products of counts, of at least the inputs and the label.
+    inputs : sequence of str
+        Signals to fit on, k of them; none for the mean.
+    label : str
+        Signal to estimate.
+    intercept : bool
+        Estimate a constant term as well.
+
+    Returns
+    -------
+    Fit
+        Coefficients in counts, and the residual sum of squares in counts^2.
+
+    Raises
+    ------
+    DataError
+        If the Gram has no rows, or if inputs are linearly dependent. The message names them.
+    """
     part = gram.restrict([*inputs, label])
-    matrix = moments(part, intercept=intercept)
-    if len(inputs) >= MANY_INPUTS and (lifted := _lifted(part, matrix, intercept=intercept)):
-        return lifted
-    triangle = eliminate(matrix)
-    if triangle.singular is not None:
-        raise DataError(dependence(part, inputs, intercept=intercept))
-    return fit_leading(part, triangle, len(inputs), intercept=intercept)
+    return fit_moments(part, moments(part, intercept=intercept), intercept=intercept)
 
 
-def fit_leading(gram: Gram, triangle: Elimination, size: int, *, intercept: bool = True) -> Fit:
-    """Return the fit of the first `size` inputs of an eliminated Gram (label last)."""
-    part = gram.restrict([*gram.signals[:size], gram.signals[-1]])
-    return _fit_of(part, *triangle.solve(size), triangle.residual(size), intercept=intercept)
-
-
-def _lifted(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit | None:
-    """Return the same fit from p-adic lifting; None if inputs are linearly dependent."""
+def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
+    """Fit the last signal of a Gram on all others, from its `moments`. Raises `DataError`."""
+    *inputs, label = part.signals
     right = matrix[-1][:-1]
-    solution = solve_by_lifting([row[:-1] for row in matrix[:-1]], right)
+    solution = exact.solve([row[:-1] for row in matrix[:-1]], right)
     if solution is None:
-        return None
+        raise DataError(dependence(part, inputs, intercept=intercept))
     numerators, denominator = solution
     explained = sum(x * b for x, b in zip(numerators, right, strict=True))
     residual = matrix[-1][-1] - Fraction(explained, denominator)
-    return _fit_of(part, numerators, denominator, residual, intercept=intercept)
-
-
-def _fit_of(
-    part: Gram, numerators: Sequence[int], denominator: int, residual: Fraction, *, intercept: bool
-) -> Fit:
-    """Return the fit of a Gram (label last) whose equations have this solution and residual."""
-    inputs, label = part.signals[:-1], part.signals[-1]
-    coefficients = tuple(Fraction(x, denominator) for x in numerators)
     offset = Fraction(0)
     if intercept:
-        explained = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
-        offset = Fraction(denominator * part.sums[-1] - explained, denominator * part.n)
-    model = LinearModel(inputs, label, coefficients, offset)
+        predicted = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
+        offset = Fraction(denominator * part.sums[-1] - predicted, denominator * part.n)
+    coefficients = tuple(Fraction(x, denominator) for x in numerators)
+    model = LinearModel(tuple(inputs), label, coefficients, offset)
     return Fit(part, model, residual / (part.n if intercept else 1), intercept)
 
 
@@ -146,45 +140,66 @@ def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
     """Return n S about the means, or raw products. Raises `DataError` if there are no rows."""
     if gram.n == 0:
         raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
-    return gram.centred() if intercept else gram.raw()
+    return gram.centered_products() if intercept else gram.raw()
 
 
 def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> str:
-    """Say which inputs are linearly dependent, and how, exactly; empty if none is."""
-    independent: list[str] = []
-    found = []
-    for name in inputs:
-        part = gram.restrict([*independent, name])
-        triangle = eliminate(moments(part, intercept=intercept))
-        if triangle.corners[-1] == 0:
-            size = len(independent)
-            found.append(_relation(fit_leading(part, triangle, size, intercept=intercept)))
-        else:
-            independent.append(name)
-    if not found:
+    """Describe how inputs depend linearly on each other.
+
+    Parameters
+    ----------
+    gram : Gram
+        Sums and products of counts, of at least the inputs.
+    inputs : sequence of str
+        Signals in the order in which a dependent one is looked for.
+    intercept : bool
+        Count a constant signal as dependent.
+
+    Returns
+    -------
+    str
+        Sentences for a message; empty if the inputs are independent.
+
+    Raises
+    ------
+    DataError
+        If the Gram has no rows.
+    """
+    part = gram.restrict(inputs)
+    relations = [
+        _relation(part, column, weights, intercept=intercept)
+        for column, weights in exact.dependent_columns(moments(part, intercept=intercept)).items()
+    ]
+    if not relations:
         return ""
     rows = f" There are only {number_of(gram.n, 'row')}." if gram.n <= len(inputs) else ""
-    relations = "; ".join(found)
-    return f"the model has no unique solution: {relations}.{rows} Leave out one signal of each."
+    return (
+        f"the model has no unique solution: {'; '.join(relations)}.{rows} Leave out one signal of "
+        "each."
+    )
 
 
-def _relation(fitted: Fit) -> str:
-    model = fitted.model
-    terms = {name: b for name, b in zip(model.signals, model.coefficients, strict=True) if b != 0}
-    if not terms:
-        return f"{model.label} is constant ({model.intercept} counts)"
-    text = f"{model.label} is a linear combination of {', '.join(terms)}"
-    numbers = [*terms.values(), model.intercept]
-    if len(terms) <= 3 and all(b.denominator <= 1000 for b in numbers):
+def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction], *, intercept: bool) -> str:
+    """Describe a signal as a combination of others, with its coefficients if they are simple."""
+    name = gram.signals[column]
+    constant = Fraction(0)
+    if intercept:
+        level = gram.sums[column] - sum(b * gram.sums[i] for i, b in weights.items())
+        constant = Fraction(level) / gram.n
+    if not weights:
+        return f"{name} is constant ({constant} counts)"
+    terms = {gram.signals[i]: b for i, b in weights.items()}
+    text = f"{name} is a linear combination of {', '.join(terms)}"
+    if len(terms) <= 3 and all(b.denominator <= 1000 for b in (*terms.values(), constant)):
         right = " + ".join(f"{b} {other}" if b != 1 else other for other, b in terms.items())
-        constant = f" + {model.intercept}" if model.intercept else ""
-        text += f" (in counts: {model.label} = {right}{constant})".replace("+ -", "- ")
+        level_text = f" + {constant}" if constant else ""
+        text += f" (in counts: {name} = {right}{level_text})".replace("+ -", "- ")
     return text
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:
     """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
-    centred = gram.centred()
+    centred = gram.centered_products()
     correlations = np.zeros((len(centred), len(centred)))
     for i, row in enumerate(centred):
         for j in range(i + 1):
@@ -194,12 +209,23 @@ def correlation_matrix(gram: Gram) -> FloatArray:
 
 
 def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
-    """Return the 2-norm condition number of correlations, within k of the best scaling's."""
-    if not inputs:
-        return 1.0
-    eigenvalues = symmetric_eigenvalues(correlation_matrix(gram.restrict(inputs)))
-    smallest, largest = eigenvalues[0], eigenvalues[-1]
-    return largest / smallest if smallest > 0 else float("inf")
+    """Return the 2-norm condition number of the inputs' correlation matrix.
+
+    It is within a factor k of the lowest that any scaling of k inputs reaches (van der Sluis 1969,
+    Numerische Mathematik 14:14).
+
+    Parameters
+    ----------
+    gram : Gram
+        Sums and products of counts, of at least the inputs.
+    inputs : sequence of str
+
+    Returns
+    -------
+    float
+        1 without inputs; infinity if they are dependent.
+    """
+    return exact.condition_number(gram.restrict(inputs).centered_products()) if inputs else 1.0
 
 
 # Relations that hold on average, from sums of products: exactly, and how single drives move them.
@@ -235,13 +261,13 @@ class Relation:
     @classmethod
     def least_squares(
         cls,
-        of: str,
+        response: str,
         by: tuple[str, ...],
         noise: Mapping[tuple[int, int], Product] = MappingProxyType({}),
     ) -> "Relation":
         """Return that of a term by others, which are the instruments themselves."""
-        left = tuple(tuple((a, b) for b in by) for a in by)
-        return cls(by, left, tuple((of, a) for a in by), noise)
+        products = tuple(tuple((a, b) for b in by) for a in by)
+        return cls(by, products, tuple((response, a) for a in by), noise)
 
     def system(
         self, sums: Callable[[str, str], Any], variance: Fraction | float
@@ -265,13 +291,15 @@ class ExactSums:
     def __init__(self, gram: Gram, terms: Terms) -> None:
         """Raises `DataError` for a column that the Gram lacks."""
         self._factors = {
-            name: lcm(*(weight.denominator for weight in one.values()))
-            for name, one in terms.items()
+            name: lcm(*(weight.denominator for weight in weights.values()))
+            for name, weights in terms.items()
         }
         self.gram = gram.combine(
             {
-                name: {column: int(weight * self._factors[name]) for column, weight in one.items()}
-                for name, one in terms.items()
+                name: {
+                    column: int(weight * self._factors[name]) for column, weight in weights.items()
+                }
+                for name, weights in terms.items()
             }
         )
 
@@ -295,27 +323,12 @@ class ExactSums:
 
     def residual_variance(self, name: str, inputs: Sequence[str]) -> Fraction | None:
         """Return what least squares on other terms leave of a variance; None if undetermined."""
-        about = self.gram.restrict((*inputs, name)).centred()
-        found = eliminate(about)
-        if found.singular is not None:
+        matrix = self.gram.restrict((*inputs, name)).centered_products()
+        inner = exact.determinant([row[:-1] for row in matrix[:-1]])
+        if inner == 0:
             return None
-        return found.residual(len(inputs)) / (self.gram.n * self._factors[name]) ** 2
-
-
-def solve(rows: Sequence[Sequence[Fraction]]) -> tuple[Fraction, ...] | None:
-    """Return the solution of equations whose rows end with the right side; None if singular."""
-    work = [list(row) for row in rows]
-    for at in range(len(work)):
-        pivot = next((i for i in range(at, len(work)) if work[i][at]), None)
-        if pivot is None:
-            return None
-        work[at], work[pivot] = work[pivot], work[at]
-        lead = work[at][at]
-        work[at] = [value / lead for value in work[at]]
-        for i, row in enumerate(work):
-            if i != at and row[at]:
-                work[i] = [x - row[at] * y for x, y in zip(row, work[at], strict=True)]
-    return tuple(row[-1] for row in work)
+        residual = Fraction(exact.determinant(matrix), inner)
+        return residual / (self.gram.n * self._factors[name]) ** 2
 
 
 def influence(
@@ -330,16 +343,16 @@ def influence(
     the equations A_g of a drive, A of all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g
     theta); its share is h'Z_g'Z_g h.
     """
-    each = _stacked(relation.system(sums, noise))
-    left, right = each[:, :, :-1], each[:, :, -1]
-    total = left.sum(axis=0)
+    equations = _stacked(relation.system(sums, noise))
+    coefficients, right = equations[:, :, :-1], equations[:, :, -1]
+    summed = coefficients.sum(axis=0)
     try:
-        unknowns = np.linalg.solve(total, right.sum(axis=0))
-        h = np.linalg.solve(total.T, np.asarray(gradient))
+        unknowns = np.linalg.solve(summed, right.sum(axis=0))
+        h = np.linalg.solve(summed.T, np.asarray(gradient))
     except np.linalg.LinAlgError:
         return None
     squares = _stacked([[sums(a, b) for b in relation.instruments] for a in relation.instruments])
-    return (right - left @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
+    return (right - coefficients @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
 
 
 class DriveTermSums:
@@ -350,15 +363,15 @@ class DriveTermSums:
         self._at = {name: i for i, name in enumerate((ONE, *terms))}
         turn = np.zeros((len(self._at), moments.shape[1]))
         turn[0, 0] = 1.0
-        for name, one in terms.items():
-            for column, weight in one.items():
+        for name, weights in terms.items():
+            for column, weight in weights.items():
                 turn[self._at[name], 1 + columns.index(column)] = float(weight)
         self._sums = turn @ moments @ turn.T
 
     def __call__(self, a: str, b: str) -> FloatArray:
         """Return the sum of the products of two terms in each drive."""
-        found: FloatArray = self._sums[:, self._at[a], self._at[b]]
-        return found
+        sums: FloatArray = self._sums[:, self._at[a], self._at[b]]
+        return sums
 
 
 def _stacked(rows: Sequence[Sequence[Any]]) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.exact import eliminate, inverse_matrix
+from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import dependence, moments
 
@@ -36,9 +36,10 @@ def correlation(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...
 def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
     """Order by |t| in the full model, largest first: b_i^2 / (S^-1)_ii."""
     matrix = _moments(gram, inputs, label)
-    inverse = inverse_matrix([row[:-1] for row in matrix[:-1]])
+    inverse, denominator = exact.invert([row[:-1] for row in matrix[:-1]])
     slopes = [sum(a * b for a, b in zip(row, matrix[-1], strict=False)) for row in inverse]
-    return _descending(inputs, [b**2 / inverse[i][i] for i, b in enumerate(slopes)])
+    scores = [Fraction(b**2, inverse[i][i] * denominator) for i, b in enumerate(slopes)]
+    return _descending(inputs, scores)
 
 
 def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
@@ -68,17 +69,17 @@ def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str,
 
 
 def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
-    matrix = moments(gram.restrict([*inputs, label]))
-    if eliminate(matrix).singular is not None:
-        raise DataError(dependence(gram, inputs))
-    return matrix
+    relations = dependence(gram, inputs)
+    if relations:
+        raise DataError(relations)
+    return moments(gram.restrict([*inputs, label]))
 
 
 def _stepwise(gram: Gram, inputs: Sequence[str], label: str, method: str) -> tuple[str, ...]:
     """Return the order of a search, behind it what is as good as dependent, as declared."""
     _moments(gram, inputs, label)
-    found = stepwise_order(gram, inputs, label, method, len(inputs))
-    order = found[-1] if found else ()
+    sets = stepwise_order(gram, inputs, label, method, len(inputs))
+    order = sets[-1] if sets else ()
     return (*order, *(name for name in inputs if name not in order))
 
 
@@ -107,22 +108,22 @@ METHODS: Final = ("forward", "backward", "exchange")
 
 
 def stepwise_order(
-    gram: Gram, inputs: Sequence[str], label: str, method: str, most: int
+    gram: Gram, inputs: Sequence[str], label: str, method: str, max_size: int
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the chosen inputs of sizes 1, 2, ... up to `most`; all but exchange's are nested.
+    """Return the chosen inputs of sizes 1, 2, ... up to `max_size`; all but exchange's are nested.
 
     Raises `QuestionError` for an unknown method, `DataError` for no rows.
     """
     if method not in METHODS:
         raise QuestionError(f"unknown search {method!r}. Known: {', '.join(METHODS)}.")
     search = _Search(gram.restrict([*inputs, label]))
-    most = min(most, len(search.usable))
+    max_size = min(max_size, len(search.usable))
     steps: dict[str, Callable[[int], list[list[int]]]] = {
         "forward": search.forward,
         "backward": search.backward,
         "exchange": partial(search.forward, exchanging=True),
     }
-    return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](most))
+    return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](max_size))
 
 
 def sweep(matrix: LongArray, pivot: int) -> LongArray:
@@ -146,7 +147,12 @@ class _Search:
         # An integer to 64 bits or more: its float, and what that leaves.
         half = [x for i, row in enumerate(self.exact) for x in row[: i + 1]]
         high = np.array([float(x) for x in half])
-        low = np.array([float(x - int(near)) for x, near in zip(half, high.tolist(), strict=True)])
+        low = np.array(
+            [
+                float(x - int(approximate))
+                for x, approximate in zip(half, high.tolist(), strict=True)
+            ]
+        )
         matrix = np.empty((size, size), dtype=np.longdouble)
         matrix[np.tril_indices(size)] = high.astype(np.longdouble) + low.astype(np.longdouble)
         matrix.T[np.tril_indices(size)] = matrix[np.tril_indices(size)]
@@ -162,18 +168,18 @@ class _Search:
             return list(range(self.inputs))
         work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
         buffer, taken = np.empty_like(work), list[int]()
-        left = np.ones(self.inputs, dtype=np.bool_)
-        while left.any():
-            best = int(np.argmax(np.where(left, work.diagonal(), -1)))
+        remaining = np.ones(self.inputs, dtype=np.bool_)
+        while remaining.any():
+            best = int(np.argmax(np.where(remaining, work.diagonal(), -1)))
             if work[best, best] < DEPENDENT:
                 break
             np.multiply.outer(work[:, best], work[best] / work[best, best], out=buffer)
             work -= buffer
             taken.append(int(names[best]))
-            left[best] = False
-            if 8 * left.sum() < 7 * len(left):  # what was taken is not looked at again
-                work, names = work[np.ix_(left, left)], names[left]
-                buffer, left = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
+            remaining[best] = False
+            if 8 * remaining.sum() < 7 * len(remaining):  # what was taken is not looked at again
+                work, names = work[np.ix_(remaining, remaining)], names[remaining]
+                buffer, remaining = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
         return sorted(taken)
 
     def _far_from_dependent(self) -> bool:
@@ -188,10 +194,10 @@ class _Search:
             return False
         return True
 
-    def forward(self, most: int, *, exchanging: bool = False) -> list[list[int]]:
+    def forward(self, max_size: int, *, exchanging: bool = False) -> list[list[int]]:
         work, chosen = self.matrix.copy(), list[int]()
         sets = []
-        for _ in range(most):
+        for _ in range(max_size):
             best = self._best_entry(work.diagonal(), work[:, -1], chosen)
             if best is None:
                 break
@@ -202,7 +208,7 @@ class _Search:
             sets.append(list(chosen))
         return sets
 
-    def backward(self, most: int) -> list[list[int]]:
+    def backward(self, max_size: int) -> list[list[int]]:
         work, chosen = self.matrix.copy(), list(self.usable)
         for i in chosen:
             work = sweep(work, i)
@@ -213,32 +219,32 @@ class _Search:
             chosen.remove(worst)
             removed.append(worst)
         order = removed[::-1]
-        return [order[:size] for size in range(1, most + 1)]
+        return [order[:size] for size in range(1, max_size + 1)]
 
     def _best_entry(
         self, variance: LongArray, with_label: LongArray, chosen: Sequence[int]
     ) -> int | None:
         """Return the input that explains most beside those chosen, from what these leave."""
-        there = np.zeros(len(variance), dtype=np.bool_)
-        there[self.usable] = True
-        there[chosen] = False
-        free = np.flatnonzero(there & (variance >= DEPENDENT))
+        eligible = np.zeros(len(variance), dtype=np.bool_)
+        eligible[self.usable] = True
+        eligible[chosen] = False
+        free = np.flatnonzero(eligible & (variance >= DEPENDENT))
         if not len(free):
             return None
         gains = with_label[free] ** 2 / variance[free]
-        near: list[int] = free[gains >= gains.max() * (1 - ROUNDING)].tolist()
-        if len(near) == 1:
-            return near[0]
-        return min(near, key=lambda i: (self._rss([*chosen, i]), i))
+        tied: list[int] = free[gains >= gains.max() * (1 - ROUNDING)].tolist()
+        if len(tied) == 1:
+            return tied[0]
+        return min(tied, key=lambda i: (self._rss([*chosen, i]), i))
 
     def _least_loss(self, work: LongArray, chosen: Sequence[int]) -> int:
         """Return the chosen input whose loss costs least; of equals, the later declared."""
         losses = work[chosen, -1] ** 2 / -work.diagonal()[chosen]
         cheap = np.flatnonzero(losses <= losses.min() * (1 + ROUNDING))
-        near = [chosen[int(place)] for place in cheap]
-        if len(near) == 1:
-            return near[0]
-        return min(near, key=lambda i: (self._rss([j for j in chosen if j != i]), -i))
+        tied = [chosen[int(place)] for place in cheap]
+        if len(tied) == 1:
+            return tied[0]
+        return min(tied, key=lambda i: (self._rss([j for j in chosen if j != i]), -i))
 
     def _exchanged(self, work: LongArray, chosen: list[int]) -> LongArray:
         """Exchange chosen inputs, in place, while that lowers the residual sum of squares."""
@@ -251,8 +257,8 @@ class _Search:
                 variance = work.diagonal() - work[:, old] * row
                 with_label = work[:, -1] - work[:, old] * row[-1]
                 variance[old], with_label[old] = -1 / work[old, old], row[-1]
-                others = [*chosen[:position], *chosen[position + 1 :]]
-                new = self._best_entry(variance, with_label, others)
+                other_inputs = [*chosen[:position], *chosen[position + 1 :]]
+                new = self._best_entry(variance, with_label, other_inputs)
                 if new is None or new == old:
                     continue
                 gain = with_label[new] ** 2 / variance[new]
@@ -262,6 +268,8 @@ class _Search:
         return work
 
     def _rss(self, chosen: Sequence[int]) -> Fraction:
-        at = [*chosen, self.inputs]
-        found = eliminate([[self.exact[i][j] for j in at] for i in at])
-        return found.residual(len(found.rows))
+        bordered, inner = (
+            exact.determinant([[self.exact[i][j] for j in columns] for i in columns])
+            for columns in ([*chosen, self.inputs], chosen)
+        )
+        return Fraction(bordered, inner)

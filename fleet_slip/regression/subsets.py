@@ -81,8 +81,8 @@ def _criterion(name: str) -> Callable[[Problem], FloatArray]:
     try:
         return CRITERIA[name]
     except KeyError:
-        known = ", ".join(CRITERIA)
-        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.") from None
+        names = ", ".join(CRITERIA)
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {names}.") from None
 
 
 MOST_INPUTS = 22
@@ -129,8 +129,8 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
     matrix = correlation_matrix(part)
     if matrix[-1, -1] == 0:
         raise DataError(f"{label} is constant: there is nothing to explain.")
-    found = candidates(matrix, count + _SPARE)
-    return [_exact_best(part, inputs, label, masks, count) for masks in found]
+    masks_by_size = candidates(matrix, count + _SPARE)
+    return [_exact_best(part, inputs, label, masks, count) for masks in masks_by_size]
 
 
 def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
@@ -169,13 +169,13 @@ def all_rss(matrix: FloatArray) -> FloatArray:
     order = [len(matrix) - 1, *range(len(matrix) - 1)]
     work = work[np.ix_(order, order)]
     while len(work) > 1:
-        row, rest = work[-1, :-1], work[:-1, :-1]
-        size = len(rest)
+        row, trailing = work[-1, :-1], work[:-1, :-1]
+        size = len(trailing)
         doubled = np.empty((size, size, 2 * work.shape[2]))
-        doubled[:, :, 0::2] = rest
+        doubled[:, :, 0::2] = trailing
         scaled = row / work[-1, -1]
         for i in range(size):
-            doubled[i, : i + 1, 1::2] = rest[i, : i + 1] - scaled[i] * row[: i + 1]
+            doubled[i, : i + 1, 1::2] = trailing[i, : i + 1] - scaled[i] * row[: i + 1]
             doubled[: i + 1, i, 1::2] = doubled[i, : i + 1, 1::2]
         work = doubled
     return np.asarray(np.maximum(work[0, 0], 0.0))

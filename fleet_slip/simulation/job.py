@@ -29,7 +29,7 @@ from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measureme
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.parameters import PERFECT
-from fleet_slip.warehouse.forgotten import Audit, skipped_drives
+from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 # From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts.
@@ -411,13 +411,13 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
 
 
 def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
-    barred = Audit(warehouse.root).barred(
+    erased = ErasureLog(warehouse.root).erased(
         {drive.vehicle_id for drive in drives}, {drive.drive_id for drive in drives}
     )
     return tuple(
         drive
         for drive in drives
-        if drive.vehicle_id not in barred.vehicles and drive.drive_id not in barred.drives
+        if drive.vehicle_id not in erased.vehicles and drive.drive_id not in erased.drives
     )
 
 

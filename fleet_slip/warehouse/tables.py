@@ -30,7 +30,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.table import SCALE, Snapshot, Table, absent_columns
 from fleet_slip.warehouse.connections import ConnectionCache
 from fleet_slip.warehouse.database import database_errors, open_database
-from fleet_slip.warehouse.erased import find_erased, names_by_column, without_erased
+from fleet_slip.warehouse.erasure_log import find_erased, without_erased
 
 QUARANTINE_SCHEMA = pa.schema(
     [
@@ -366,7 +366,7 @@ def open_tables(
         for name in sources.keys() - {"stored_quarantine"}:
             sources[name] = f"(FROM {sources[name]} WHERE {of})"
     erased = find_erased(warehouse.root, warehouse.grams, snapshots)
-    for column, names in names_by_column(erased).items():
+    for column, names in erased.by_column.items():
         database.execute(f"SET VARIABLE erased_{column} = $names", {"names": names})
     sources = {name: without_erased(rows, erased) for name, rows in sources.items()}
     columns = _generated_columns(signals)

@@ -1,6 +1,6 @@
 """What is installed is what was pinned, fits together, and may be used.
 
-Known vulnerabilities are looked up by `pip-audit`, which needs a network; this does not.
+Known vulnerabilities are looked up by `pip-erasure_log`, which needs a network; this does not.
 """
 
 import re

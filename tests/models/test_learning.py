@@ -191,7 +191,7 @@ def test_counts_of_another_grain_need_another_line(
 
 def test_a_line_that_was_changed_is_refused(fleet: Fleet, own_set: Path) -> None:
     line = the_line(fleet)
-    file = Path(str(fleet.warehouse.stacked_models.folder)) / line.digest / "1.json"
+    file = Path(str(fleet.root)) / "lines" / line.digest / "1.json"
     file.write_text(file.read_text().replace('"drives": ', '"drives": 1', 1))
     with pytest.raises(StorageError, match="SHA-256"):
         published(fleet_slip.open(fleet.root, own_set))

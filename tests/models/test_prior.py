@@ -76,8 +76,8 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
     signals = (*INPUTS.split(","), SIGNALS.label)
     (simulated,) = prior.tables
     real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total().restrict(signals)
-    both = with_mark(real, 1).times(weight.denominator)
-    both += with_mark(simulated.total().restrict(signals), 0).times(weight.numerator)
+    both = with_mark(real, 1).scaled(weight.denominator)
+    both += with_mark(simulated.total().restrict(signals), 0).scaled(weight.numerator)
     assert 0 < weight < 1
     assert found.as_dict()["prior"] == {"campaign": few, "weight": str(weight)}
     by_hand = fit(both, [*INPUTS.split(","), "mark"], SIGNALS.label).model

@@ -147,7 +147,7 @@ def test_subsets_can_be_chosen_by_cross_validation(drives: list[Driven]) -> None
     assert set(found.winner.model.signals) == {"ay", "yaw_rate"}
     best = max(found.models, key=lambda model: model.correlation)
     assert found.winner.best is best
-    shortfall = next(s for s in found.winner.shortfalls if s.model is found.winner.model)
+    shortfall = next(s for s in found.winner.gaps if s.model is found.winner.model)
     assert shortfall.negligible
 
 

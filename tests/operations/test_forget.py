@@ -33,7 +33,7 @@ from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand
@@ -87,7 +87,7 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
     warehouse = fill(tmp_path / "with", *CARS)
     without = fill(tmp_path / "without", "alfa", "gamma")
     with_all = coefficients(warehouse)
-    report = forget(warehouse, Forgettable("vehicle", "beta"))
+    report = forget(warehouse, ErasureSubject("vehicle", "beta"))
     assert (report.drives, report.rows, report.files_rewritten) == (3, 600, 3)
     assert coefficients(warehouse) == coefficients(without)
     assert with_all != coefficients(without)
@@ -104,7 +104,7 @@ def test_a_car_is_found_in_files_with_and_without_compute_grams_and_no_other_is_
     land(warehouse, "later", drive("gamma", 8), drive("beta", 8))  # without Gram rows
     (other,) = (path for path in warehouse.logs.snapshot().paths if "other" in path)
     Path(other).write_bytes(b"no Parquet file")
-    subject = Forgettable("vehicle", "beta")
+    subject = ErasureSubject("vehicle", "beta")
     logs = warehouse.logs.snapshot()
     found = drives_by_file(logs, subject, locate(warehouse.grams.snapshot(), subject))
     assert sorted(found.values(), key=min) == [{f"beta-{number}"} for number in (0, 1, 2, 8)]
@@ -117,10 +117,10 @@ def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_version
 ) -> None:
     warehouse = fill(tmp_path, *CARS)
     compact(warehouse)  # older versions now have the car in other files
-    report = forget(warehouse, Forgettable("vehicle", "beta"))
+    report = forget(warehouse, ErasureSubject("vehicle", "beta"))
     assert report.old_files_left > 0
     assert mentions(tmp_path, "beta")
-    again = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    again = forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
     assert (again.drives, again.old_files_left) == (0, 0)
     assert again.old_files_deleted == report.old_files_left
     assert not mentions(tmp_path, "beta")
@@ -138,10 +138,10 @@ def test_what_a_killed_job_left_goes_at_once_and_files_of_other_cars_stay_for_co
         left.append(warehouse.quarantine.write_file(f"left{number}", table))
     warehouse.quarantine.fence()
     other = warehouse.logs.write_file("other", drive("alfa", 7), date(2024, 5, 1))
-    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
+    assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).pending
     assert not mentions(tmp_path, "beta"), left
     os.utime(tmp_path / "logs" / other.path, (0, 0))  # where clocks differ, a job may be writing it
-    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
+    assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).pending
     assert (tmp_path / "logs" / other.path).exists()
     assert vacuum(warehouse).files
     assert not (tmp_path / "logs" / other.path).exists()
@@ -158,45 +158,45 @@ def test_where_a_delta_log_was_lost_nothing_is_deleted(
     for file in files if old else ():
         os.utime(file, (0, 0))
     with pytest.raises(StorageError, match="files without a Delta log"):
-        forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+        forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
     assert sorted(tmp_path.rglob("*.parquet")) == files
 
 
 def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> None:
     ids = ["log", "log-1", "log-10", "log2", None]
     rows = pa.table({"drive_id": ids, "vehicle_id": ["a", None, "b", "a", "a"]})
-    drive = Forgettable("drive", "log-1")
+    drive = ErasureSubject("drive", "log-1")
     assert quarantined_of(rows, drive, set()).to_pylist() == [True, True, False, False, False]
-    by_car = quarantined_of(rows, Forgettable("vehicle", "a"), {"log-10"}).to_pylist()
+    by_car = quarantined_of(rows, ErasureSubject("vehicle", "a"), {"log-10"}).to_pylist()
     assert by_car == [True, False, True, True, True]
 
 
 def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, *CARS)
-    audit = Audit(LocalFolder(tmp_path))
-    forget(warehouse, Forgettable("drive", "beta-1"))
-    assert [entry["event"] for entry in audit.entries()] == ["begun", "done"]
-    assert "beta" not in json.dumps(audit.entries())
-    assert audit.state(Forgettable("drive", "beta-1")) == "done"
-    assert audit.state(Forgettable("vehicle", "beta-1")) is None
-    assert not forget(warehouse, Forgettable("drive", "beta-1"), now=True).drives
+    erasure_log = ErasureLog(LocalFolder(tmp_path))
+    forget(warehouse, ErasureSubject("drive", "beta-1"))
+    assert [entry["event"] for entry in erasure_log.entries()] == ["begun", "done"]
+    assert "beta" not in json.dumps(erasure_log.entries())
+    assert erasure_log.state(ErasureSubject("drive", "beta-1")) == "done"
+    assert erasure_log.state(ErasureSubject("vehicle", "beta-1")) is None
+    assert not forget(warehouse, ErasureSubject("drive", "beta-1"), now=True).drives
     with pytest.raises(QuestionError, match="no drive has vehicle_id 'delta'"):
-        forget(warehouse, Forgettable("vehicle", "delta"))
+        forget(warehouse, ErasureSubject("vehicle", "delta"))
 
 
 def test_whoever_forgets_first_at_the_same_moment_is_found_in_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    audit = Audit(LocalFolder(tmp_path))
-    one, other = (Forgettable("vehicle", name) for name in ("alfa", "beta"))
-    audit.begin(one, 1, [])
+    erasure_log = ErasureLog(LocalFolder(tmp_path))
+    one, other = (ErasureSubject("vehicle", name) for name in ("alfa", "beta"))
+    erasure_log.begin(one, 1, [])
     with monkeypatch.context() as patch:
-        patch.setattr(Audit, "entries", lambda _: [])  # as they were a moment ago
-        audit.begin(other, 2, ["m@1"])
-    assert [audit.state(subject) for subject in (one, other)] == ["begun"] * 2
-    audit.end(other)
-    assert [audit.state(subject) for subject in (one, other)] == ["begun", "done"]
-    assert audit.models_of(other) == ["m@1"]
+        patch.setattr(ErasureLog, "entries", lambda _: [])  # as they were a moment ago
+        erasure_log.begin(other, 2, ["m@1"])
+    assert [erasure_log.state(subject) for subject in (one, other)] == ["begun"] * 2
+    erasure_log.end(other)
+    assert [erasure_log.state(subject) for subject in (one, other)] == ["begun", "done"]
+    assert erasure_log.models_of(other) == ["m@1"]
 
 
 def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
@@ -209,7 +209,7 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
     def overtaken(*arguments: Any) -> list[pa.Table]:
         rows = list(compute_grams(*arguments))
         monkeypatch.undo()
-        forget(warehouse, Forgettable("vehicle", "beta"))
+        forget(warehouse, ErasureSubject("vehicle", "beta"))
         return rows
 
     monkeypatch.setattr(job, "compute_grams", overtaken)
@@ -230,7 +230,7 @@ def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: 
     update_grams(warehouse)
     (path,) = warehouse.quarantine.snapshot().paths
     (name,) = pq.read_table(path)["drive_id"].unique().to_pylist()
-    chosen = Forgettable(subject, name if subject == "drive" else "secretive")
+    chosen = ErasureSubject(subject, name if subject == "drive" else "secretive")
     before = warehouse.logs.snapshot()
     report = forget(warehouse, chosen, now=True)
     assert (report.drives, report.rows) == (1, 0)
@@ -252,7 +252,7 @@ def test_a_refused_row_of_no_drive_goes_with_its_car_and_counts_as_none(
     assert pq.read_table(path).select(["drive_id", "vehicle_id"]).to_pylist() == [
         {"drive_id": None, "vehicle_id": "car"}
     ]
-    assert forget(warehouse, Forgettable("vehicle", "car"), now=True).drives == 1
+    assert forget(warehouse, ErasureSubject("vehicle", "car"), now=True).drives == 1
     assert not warehouse.quarantine.snapshot().files
 
 
@@ -306,14 +306,14 @@ def test_erasure_does_not_depend_on_the_clock(
     compact(warehouse)  # older versions have the car in other files
     warehouse.logs.write_file("left", drive("beta", 7), date(2024, 5, 1))
     set_clock(monkeypatch, shift_s)
-    report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    report = forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
     assert not report.pending
     assert not mentions(tmp_path, "beta")
     assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM grams ORDER BY 1") == [
         ("alfa",),
         ("gamma",),
     ]
-    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).changed
+    assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).changed
     monkeypatch.undo()
     assert not verify(warehouse, full=True).damage
 
@@ -326,11 +326,11 @@ def test_files_that_a_clock_ahead_has_replaced_go_too(
     with monkeypatch.context() as patch:
         set_clock(patch, ahead_s)  # then the commits, too, are dated otherwise
         compact(warehouse)
-        forget(warehouse, Forgettable("vehicle", "beta"))
+        forget(warehouse, ErasureSubject("vehicle", "beta"))
     for file in tmp_path.rglob("*.parquet"):
         moment = time.time() + ahead_s
         os.utime(file, (moment, moment))
-    report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+    report = forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
     assert not report.pending
     assert report.old_files_deleted
     assert not mentions(tmp_path, "beta")
@@ -355,9 +355,9 @@ def test_temporary_files_of_killed_jobs_go_at_any_age_and_those_of_a_run_are_nam
     os.utime(half, (time.time() - age_s,) * 2)
     with monkeypatch.context() as patch:
         patch.setattr("fleet_slip.operations.forget.runs_under_way", lambda _: ["night"])
-        report = forget(warehouse, Forgettable("vehicle", "beta"), now=True)
+        report = forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
     assert report.pending == (folder, "the run night")
-    assert not forget(warehouse, Forgettable("vehicle", "beta"), now=True).pending
+    assert not forget(warehouse, ErasureSubject("vehicle", "beta"), now=True).pending
     assert not mentions(tmp_path, "beta")
 
 
@@ -385,10 +385,10 @@ def test_an_erasure_that_left_rows_in_a_table_is_not_done(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warehouse = fill(tmp_path, "alfa", "beta")
-    beta = Forgettable("vehicle", "beta")
+    beta = ErasureSubject("vehicle", "beta")
     with monkeypatch.context() as patch:
         patch.setattr("fleet_slip.operations.forget.reconcile", lambda _: [])
         assert forget(warehouse, beta, now=True).pending == ("grams",)
-    assert Audit(warehouse.root).state(beta) == "begun"
+    assert ErasureLog(warehouse.root).state(beta) == "begun"
     assert not forget(warehouse, beta, now=True).pending
-    assert Audit(warehouse.root).state(beta) == "done"
+    assert ErasureLog(warehouse.root).state(beta) == "done"

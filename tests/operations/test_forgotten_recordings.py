@@ -25,7 +25,7 @@ from fleet_slip.operations.verify import verify
 from fleet_slip.storage import encoding
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.forgotten import FOLDER, Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import FOLDER, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, recording
 
@@ -46,7 +46,7 @@ def after_it_was_forgotten(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    assert forget(warehouse, Forgettable("drive", name), now=True).drives == 1
+    assert forget(warehouse, ErasureSubject("drive", name), now=True).drives == 1
     return tmp_path / "data"
 
 
@@ -92,7 +92,7 @@ def test_a_car_that_stands_is_known_by_its_name_and_day(
     ingest_file(warehouse, write(tmp_path, standing), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
-    forget(warehouse, Forgettable("drive", name))
+    forget(warehouse, ErasureSubject("drive", name))
     again = write(tmp_path, standing, "again.csv")
     assert ingest_file(warehouse, again, a_mapping(name="other")).drives_forgotten == 1
     other = a_mapping(drive={"vehicle_id": "other"})
@@ -112,11 +112,11 @@ def test_a_forgotten_car_does_not_come_back_under_another_name(
 ) -> None:
     file = write(tmp_path, recording())
     ingest_file(warehouse, file, a_mapping())
-    car = Forgettable("vehicle", "car")
+    car = ErasureSubject("vehicle", "car")
     forget(warehouse, car)
     renamed = a_mapping(drive={"vehicle_id": "renamed"})
     assert ingest_file(warehouse, file, renamed).drives_forgotten == 1
-    Audit(warehouse.root).allow(car)
+    ErasureLog(warehouse.root).allow(car)
     again = a_mapping(name="again", drive={"vehicle_id": "renamed"})
     assert ingest_file(warehouse, file, again).counts.drives == 1
 
@@ -130,7 +130,7 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     land = load.commit_batch
 
     def overtaken(*written: Any) -> Any:
-        forget(warehouse, Forgettable("drive", name), now=True)
+        forget(warehouse, ErasureSubject("drive", name), now=True)
         return land(*written)
 
     monkeypatch.setattr(load, "commit_batch", overtaken)
@@ -146,13 +146,13 @@ def test_what_an_earlier_release_forgot_stays_away_by_name(
     """It kept salted scrypt hashes; this one of the vehicle "car", with this salt."""
     hashed = hashlib.scrypt(b"vehicle:car", salt=bytes(16), n=2**14, r=8, p=1, dklen=32).hex()
     old = {"kind": "vehicle", "subject": hashed, "salt": "00" * 16, "at": "2026-11-01T00:00:00"}
-    audit = Audit(warehouse.root)
+    erasure_log = ErasureLog(warehouse.root)
     for event in ({"event": "begun", "drives": 1, "models": []}, {"event": "done"}):
-        audit._folder.append({**old, **event})
-    file, car = write(tmp_path, recording()), Forgettable("vehicle", "car")
+        erasure_log._folder.append({**old, **event})
+    file, car = write(tmp_path, recording()), ErasureSubject("vehicle", "car")
     assert ingest_file(warehouse, file, a_mapping()).drives_forgotten == 1
-    assert audit.state(car) == "done"
-    audit.allow(car)
+    assert erasure_log.state(car) == "done"
+    erasure_log.allow(car)
     assert ingest_file(warehouse, file, a_mapping()).counts.drives == 1
     forget(warehouse, car, now=True)
     assert ingest_file(warehouse, file, a_mapping(name="again")).drives_forgotten == 1
@@ -163,7 +163,7 @@ def test_names_of_other_cars_that_an_earlier_release_listed_go(
 ) -> None:
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (warehouse.root / "cleared").create("1.txt", b"car")
-    forget(warehouse, Forgettable("vehicle", "car"), now=True)
+    forget(warehouse, ErasureSubject("vehicle", "car"), now=True)
     assert (warehouse.root / "cleared").names() == []
 
 
@@ -192,11 +192,11 @@ def test_names_are_compared_after_normalization_and_case_folding(
     columns = recording() | {"car": ["Stra\u00dfe 1"] * ROWS}
     ingest_file(warehouse, write(tmp_path, columns), mapping)
     other = recording(2) | {"car": [name] * ROWS}
-    assert forget(warehouse, Forgettable("vehicle", name)).drives == 1
+    assert forget(warehouse, ErasureSubject("vehicle", name)).drives == 1
     assert is_empty(warehouse)
     file = write(tmp_path, other, "tuesday.csv")
     assert ingest_file(warehouse, file, mapping).drives_forgotten == 1
-    Audit(warehouse.root).allow(Forgettable("vehicle", "strasse 1"))
+    ErasureLog(warehouse.root).allow(ErasureSubject("vehicle", "strasse 1"))
     again = write(tmp_path, recording(3) | {"car": [name] * ROWS}, "wednesday.csv")
     assert ingest_file(warehouse, again, mapping).counts.drives == 1
 
@@ -204,18 +204,18 @@ def test_names_are_compared_after_normalization_and_case_folding(
 def test_entries_of_names_as_they_were_typed_bar_that_name_until_it_is_allowed(
     tmp_path: Path,
 ) -> None:
-    audit, key = Audit(LocalFolder(tmp_path / "data")), "00" * 32
+    erasure_log, key = ErasureLog(LocalFolder(tmp_path / "data")), "00" * 32
     typed = hashlib.blake2b(b"vehicle:CAR", key=bytes(32), digest_size=32).hexdigest()
     for event in ("begun", "done"):
         entry: dict[str, Any] = {"kind": "vehicle", "subject": typed, "key": key, "event": event}
-        DocumentFolder(audit.root / FOLDER).append(entry)
-    assert audit.barred({"CAR", " CAR", "car"}, ()).vehicles == {"CAR", " CAR"}
-    assert audit.state(Forgettable("vehicle", "CAR")) == "done"
-    audit.begin(Forgettable("vehicle", "car"), 1, [])
-    audit.end(Forgettable("vehicle", "car"))
-    assert audit.barred({"CAR", "car"}, ()).vehicles == {"CAR", "car"}
-    audit.allow(Forgettable("vehicle", "CAR"))
-    assert not audit.barred({"CAR", "car"}, ())
+        DocumentFolder(erasure_log.root, FOLDER).append(entry)
+    assert erasure_log.erased({"CAR", " CAR", "car"}, ()).vehicles == {"CAR", " CAR"}
+    assert erasure_log.state(ErasureSubject("vehicle", "CAR")) == "done"
+    erasure_log.begin(ErasureSubject("vehicle", "car"), 1, [])
+    erasure_log.end(ErasureSubject("vehicle", "car"))
+    assert erasure_log.erased({"CAR", "car"}, ()).vehicles == {"CAR", "car"}
+    erasure_log.allow(ErasureSubject("vehicle", "CAR"))
+    assert not erasure_log.erased({"CAR", "car"}, ())
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])
@@ -224,20 +224,20 @@ def test_the_rows_of_what_was_forgotten_are_left_out(
 ) -> None:
     drives, refused = two_cars(tmp_path)
     of_a, of_b = drives
-    audit = Audit(LocalFolder(tmp_path / "data"))
-    audit.begin(Forgettable(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
-    assert keep_drives(drives, audit) == [of_b]
+    erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
+    erasure_log.begin(ErasureSubject(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
+    assert keep_drives(drives, erasure_log) == [of_b]
     assert cars(refused) == {"a", "b"}
-    assert cars(keep_refused(refused, audit)) == {"b"}
+    assert cars(keep_refused(refused, erasure_log)) == {"b"}
 
 
 def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
     _, refused = two_cars(tmp_path)
     stretch = f"{refused['drive_id'][0]}-2"
-    audit = Audit(LocalFolder(tmp_path / "data"))
-    audit.begin(Forgettable("drive", stretch), 1, [], {})
-    assert cars(keep_refused(refused, audit, {stretch})) == {"b"}
-    assert cars(keep_refused(refused, audit)) == {"a", "b"}
+    erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
+    erasure_log.begin(ErasureSubject("drive", stretch), 1, [], {})
+    assert cars(keep_refused(refused, erasure_log, {stretch})) == {"b"}
+    assert cars(keep_refused(refused, erasure_log)) == {"a", "b"}
 
 
 GONE = ("WVWGONE", "track-gone", "gone.csv", "lap-gone")
@@ -300,10 +300,10 @@ def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Warehouse:
 
 
 @pytest.mark.parametrize(
-    "subject", [Forgettable("vehicle", GONE[0]), Forgettable("before", "2024-05-02")]
+    "subject", [ErasureSubject("vehicle", GONE[0]), ErasureSubject("before", "2024-05-02")]
 )
 def test_a_forgotten_car_is_named_nowhere_though_it_landed_beside_another(
-    subject: Forgettable, tmp_path: Path
+    subject: ErasureSubject, tmp_path: Path
 ) -> None:
     warehouse = ingest_two_days(tmp_path / "data", tmp_path)
     files = warehouse.logs.snapshot().files
@@ -320,7 +320,7 @@ def test_forgetting_in_a_root_of_an_earlier_version_takes_names_of_other_files_a
     old: Warehouse, tmp_path: Path
 ) -> None:
     before = update_grams(old)
-    assert not forget(old, Forgettable("vehicle", GONE[0]), now=True).pending
+    assert not forget(old, ErasureSubject("vehicle", GONE[0]), now=True).pending
     assert named(tmp_path / "data", GONE) == set()
     assert named(tmp_path / "data", STAYS) == set(STAYS)
     assert not before.rows_read
@@ -333,17 +333,17 @@ def test_a_car_that_an_earlier_version_forgot_is_found_by_verify_and_taken_away_
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr("fleet_slip.operations.forget.drop_unused_names", lambda _: 0)
-        patch.setattr(Audit, "names_are_exact", False)
+        patch.setattr(ErasureLog, "names_are_exact", False)
         patch.setattr("fleet_slip.storage.table.Table.has_unused_names", lambda *_: False)
         patch.setattr(encoding, "_only_used_values", lambda rows: rows)
-        forget(old, Forgettable("vehicle", GONE[0]), now=True)
+        forget(old, ErasureSubject("vehicle", GONE[0]), now=True)
     assert named(tmp_path / "data", GONE) == set(GONE)
     compact(old)
     assert {f.kind for f in verify(old).damage} == {"name"}
     assert migrate(old).files_without_names == 1
     assert not migrate(old).changed
     assert not verify(old, full=True).damage
-    assert forget(old, Forgettable("vehicle", GONE[0]), now=True).old_files_deleted
+    assert forget(old, ErasureSubject("vehicle", GONE[0]), now=True).old_files_deleted
     assert named(tmp_path / "data", GONE) == set()
 
 
@@ -355,10 +355,10 @@ def test_rows_of_what_was_forgotten_are_found_if_a_copy_brings_them_back(
     column = {"vehicle": "vehicle_id", "drive": "drive_id"}[kind]
     (file, _) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)[column].used
-    audit = Audit(warehouse.root)
-    audit.begin(Forgettable(kind, name), 1, [], {})  # type: ignore[arg-type]
+    erasure_log = ErasureLog(warehouse.root)
+    erasure_log.begin(ErasureSubject(kind, name), 1, [], {})  # type: ignore[arg-type]
     assert not verify(warehouse, full=True).damage  # it is being forgotten
-    audit.end(Forgettable(kind, name))  # type: ignore[arg-type]
+    erasure_log.end(ErasureSubject(kind, name))  # type: ignore[arg-type]
     assert {f.kind for f in verify(warehouse, full=True).damage} == {"name"}
-    audit.allow(Forgettable(kind, name))  # type: ignore[arg-type]
+    erasure_log.allow(ErasureSubject(kind, name))  # type: ignore[arg-type]
     assert not verify(warehouse, full=True).damage

@@ -34,7 +34,7 @@ from fleet_slip.simulation.job import simulate_batches
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from fleet_slip.storage.table import Change, Snapshot, Table
-from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.operations.test_forget import CARS, drive, fill, mentions
 from tests.support.catalog import CATALOG
@@ -42,7 +42,7 @@ from tests.support.commands import RunCommand, run
 from tests.support.logs import ask, land, path_of
 from tests.support.measured import SIGNALS, a_mapping, csv_text, good_columns, ingest_file
 
-BETA = Forgettable("vehicle", "beta")
+BETA = ErasureSubject("vehicle", "beta")
 
 
 def just_before_its_commit(
@@ -163,11 +163,11 @@ def test_nor_does_a_later_ingest_until_the_car_is_allowed_again(tmp_path: Path) 
     file = measured(tmp_path, "beta")
     assert not ingest_file(warehouse, file, mapping).new
     assert cars_in(warehouse, "log") == {"alfa"}
-    Audit(warehouse.root).allow(BETA)
+    ErasureLog(warehouse.root).allow(BETA)
     assert ingest_file(warehouse, file, mapping).new
     assert cars_in(warehouse, "log") == {"alfa", "beta"}
     assert forget(warehouse, BETA, now=True).drives == 1
-    assert Audit(warehouse.root).state(BETA) == "done"
+    assert ErasureLog(warehouse.root).state(BETA) == "done"
 
 
 def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
@@ -177,10 +177,10 @@ def test_a_simulation_under_way_does_not_bring_a_forgotten_drive_back(
     campaign = load_campaign("smoke", SHIPPED_CONFIGS)
     batches = campaign.batches(campaign.days()[0])
     gone = batches[0].drives[0]
-    audit = Audit(warehouse.root)
+    erasure_log = ErasureLog(warehouse.root)
 
     def forget_meanwhile() -> None:
-        audit.begin(Forgettable("drive", gone.drive_id), 1, [])
+        erasure_log.begin(ErasureSubject("drive", gone.drive_id), 1, [])
         warehouse.logs.fence()
 
     just_before_its_commit(monkeypatch, forget_meanwhile)
@@ -285,13 +285,13 @@ def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it
     tmp_path: Path,
 ) -> None:
     warehouse = fill(tmp_path, *CARS)
-    Audit(warehouse.root).begin(BETA, 3, [], {"beta": 0})
+    ErasureLog(warehouse.root).begin(BETA, 3, [], {"beta": 0})
     answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
     publish_challenger(
         Registry(warehouse.root, CATALOG), manifest_of(answer, "beta"), answer, force=True
     )
     assert marked_models(warehouse) == {"beta@1"}
-    Audit(warehouse.root).end(BETA, grams_version=0)
+    ErasureLog(warehouse.root).end(BETA, grams_version=0)
     assert not marked_models(warehouse)
 
 

@@ -27,7 +27,7 @@ from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
@@ -216,7 +216,7 @@ def decided(warehouse: Warehouse) -> None:
     rng = np.random.default_rng(0)
     for car in "ab":
         land(warehouse, car, log_rows(car, random_counts(rng, 30), vehicle_id=f"car-{car}"))
-    forget(warehouse, Forgettable("vehicle", "car-b"))
+    forget(warehouse, ErasureSubject("vehicle", "car-b"))
     registry = Registry.of(warehouse)
     for number in (1, 2):
         publish(registry, manifest(Fraction(number)))
@@ -283,7 +283,7 @@ def compact_and_vacuum(warehouse: Warehouse) -> None:
 
 
 def forget_now(warehouse: Warehouse) -> None:
-    forget(warehouse, Forgettable("vehicle", "car-1"), now=True)
+    forget(warehouse, ErasureSubject("vehicle", "car-1"), now=True)
 
 
 JOBS = pytest.mark.parametrize(

@@ -36,9 +36,10 @@ from fleet_slip.grams.car_estimates import (
 from fleet_slip.grams.job import update_grams
 from fleet_slip.grams.reader import DriveSums, collect_sums
 from fleet_slip.operations.forget import forget
+from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import ExactSums, fit, solve
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.regression.least_squares import ExactSums, fit
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support import cars
 from tests.support.catalog import CATALOG, SIGNALS
@@ -165,7 +166,7 @@ def test_least_squares_is_the_exact_fit() -> None:
     gram = Gram.from_counts(names, rng.integers(-3000, 3000, (50, 3)))
     expected = fit(gram, names[1:], "yaw_rate").model
     scales = {name: CATALOG.input_scales[name] for name in names}
-    found = solve(FLAT.system(ExactSums(gram, {n: {n: scales[n]} for n in names}), 0))
+    found = solve_rational(FLAT.system(ExactSums(gram, {n: {n: scales[n]} for n in names}), 0))
     assert found is not None
     assert found[0] == expected.intercept * scales["yaw_rate"]
     for slope, coefficient, name in zip(found[1:], expected.coefficients, names[1:], strict=True):
@@ -358,7 +359,7 @@ def test_a_warehouse_says_what_is_missing_and_forgets(warehouse: Warehouse) -> N
     with pytest.raises(DataError, match="no drive of"):
         calibrate(warehouse, "vehicle_id = 'delta'")
 
-    forget(warehouse, Forgettable("vehicle", "beta"))
+    forget(warehouse, ErasureSubject("vehicle", "beta"))
     after = calibrate(warehouse)
     assert set(after.cars) == {"alfa", "gamma"}
     assert {c: after.cars[c]["ay_offset"].value for c in after.cars} == {

@@ -110,7 +110,7 @@ def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) ->
         assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
     assert training.folds.total.n == 20 * 80
     table = cohort.serving(INPUTS).table
-    assert np.array_equal(training.drives.each, DriveMoments.of(table).each)
+    assert np.array_equal(training.drives.moments, DriveMoments.from_table(table).moments)
 
 
 def test_drives_without_a_signal_are_left_out_and_without_any_that_is_told() -> None:
@@ -198,22 +198,22 @@ def drives_of(seed: int, lost: dict[int, float], drives: int = 40, rows: int = 1
 
 def fitted(table: GramTable, found: DriveWeights) -> np.ndarray:
     """Slopes of the exactly weighted sum."""
-    m = DriveMoments.of(weighted(table, found.parts))
-    matrix = m.each.sum(axis=0)
+    m = DriveMoments.from_table(weighted(table, found.parts))
+    matrix = m.moments.sum(axis=0)
     slopes = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])[1:]
     return np.asarray(slopes * m.spread[-1] / m.spread[:-1])
 
 
 def test_honest_drives_keep_all_of_their_weight() -> None:
     for seed in range(20):
-        assert (robust_weights(DriveMoments.of(drives_of(seed, {}))).parts == FULL).all()
+        assert (robust_weights(DriveMoments.from_table(drives_of(seed, {}))).parts == FULL).all()
 
 
 def test_lost_drives_count_next_to_nothing() -> None:
     """As good as knowing which they are: slopes within the noise of the others."""
     for seed in range(10):
         table = drives_of(seed, {3: -1.0, 17: 4.0})
-        found = robust_weights(DriveMoments.of(table))
+        found = robust_weights(DriveMoments.from_table(table))
         assert set(np.flatnonzero(found.parts < FULL).tolist()) == {3, 17}
         assert found.parts[[3, 17]].max() <= 2
         known = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL)
@@ -225,7 +225,7 @@ def test_lost_drives_count_next_to_nothing() -> None:
 
 def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
-    found = robust_weights(DriveMoments.of(table))
+    found = robust_weights(DriveMoments.from_table(table))
     lost = (table.n * (FULL - found.parts)).sum() / (FULL * table.n.sum())
     assert 0 < lost <= MOST_LOST
 
@@ -233,14 +233,16 @@ def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
 def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     table = drives_of(2, {5: -1.0})
     order = np.random.default_rng(3).permutation(len(table))
-    parts = robust_weights(DriveMoments.of(table)).parts
-    assert np.array_equal(robust_weights(DriveMoments.of(table.take(order))).parts, parts[order])
-    origin = robust_weights(DriveMoments.of(table.about_origin()), intercept=False)
+    parts = robust_weights(DriveMoments.from_table(table)).parts
+    assert np.array_equal(
+        robust_weights(DriveMoments.from_table(table.take(order))).parts, parts[order]
+    )
+    origin = robust_weights(DriveMoments.from_table(table.about_origin()), intercept=False)
     assert np.array_equal(origin.parts, parts)
 
 
 def test_each_weight_has_its_reason() -> None:
-    found = robust_weights(DriveMoments.of(drives_of(4, {7: 5.0})))
+    found = robust_weights(DriveMoments.from_table(drives_of(4, {7: 5.0})))
     assert "times that of the median drive: robust gives it the weight 0.0" in found.of(7).reason
 
 

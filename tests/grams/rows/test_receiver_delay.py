@@ -24,7 +24,7 @@ from fleet_slip.grams.receiver_delay import (
     with_types,
 )
 from fleet_slip.warehouse.condition import parse_condition
-from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from tests.support.catalog import SIGNALS
 
 CAMPAIGN = """
@@ -217,7 +217,7 @@ def test_an_erased_car_has_no_delay(late_fleet: LateFleet, tmp_path: Path) -> No
     grams = warehouse.grams.snapshot()
     active = frozenset(file.path for file in warehouse.logs.snapshot().files)
     (car,) = course_delays(warehouse, grams, active)
-    Audit(warehouse.root).begin(Forgettable("vehicle", car), 1, [])
+    ErasureLog(warehouse.root).begin(ErasureSubject("vehicle", car), 1, [])
     assert not course_delays(warehouse, grams, active)
 
 

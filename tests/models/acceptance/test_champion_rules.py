@@ -19,13 +19,13 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import models_trained_on
-from fleet_slip.regression.choice import ANY_WORTH
+from fleet_slip.regression.choice import ZERO_TOLERANCE
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.forgotten import Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import land, log_rows
@@ -198,7 +198,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules.Floor, "worth", ANY_WORTH)
+    monkeypatch.setattr(champion_rules.Floor, "worth", ZERO_TOLERANCE)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = answer_request(warehouse, SelectionRequest(model=every))
@@ -345,7 +345,7 @@ def test_a_version_keeps_which_drives_made_it(champion: Warehouse) -> None:
     made = [registry.trained_drives(registry.load("beta", one).manifest) for one in (1, 2)]
     assert [len(one.salted) for one in made if one] == [48, 48]
     # The question of the first cohort, asked anew, would now have the other drives, too.
-    assert forget(champion, Forgettable("drive", "more-3")).models == ("beta@2",)
+    assert forget(champion, ErasureSubject("drive", "more-3")).models == ("beta@2",)
 
 
 def test_drives_that_are_gone_or_damaged_count_as_trained_on(champion: Warehouse) -> None:

@@ -38,8 +38,8 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
 def training_of(drives: list[np.ndarray]) -> tuple[TrainingFolds, np.ndarray]:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([i % 5 for i in range(len(drives))])
-    folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
-    return TrainingFolds(folds, DriveMoments.of(table), unit_scales(5)), assignment.fold
+    folds = CohortFolds.from_tables([table], assignment).serving(INPUTS, "y")
+    return TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5)), assignment.fold
 
 
 @pytest.mark.parametrize("ranking", ["forward", "backward", "t"])
@@ -76,8 +76,10 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
     for number in range(5):
         rest = [drive for drive, f in zip(drives, fold, strict=True) if f != number]
         table = table_of([gram_of(counts) for counts in rest])
-        folds = CohortFolds.of([table], by_value([i % 4 for i in range(16)]))
-        inner = TrainingFolds(folds.serving(INPUTS, "y"), DriveMoments.of(table), unit_scales(5))
+        folds = CohortFolds.from_tables([table], by_value([i % 4 for i in range(16)]))
+        inner = TrainingFolds(
+            folds.serving(INPUTS, "y"), DriveMoments.from_table(table), unit_scales(5)
+        )
         model = select_nested(inner, INPUTS, "y", rule).fit.model
         tests.append(error_sums(model, training.folds.grams[number]))
     pooled = sum(tests[1:], tests[0])
@@ -99,8 +101,8 @@ def test_inner_cross_validation_needs_folds() -> None:
     drives = sparse_drives(4, drives=6)
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([0, 0, 0, 1, 1, 1])
-    folds = CohortFolds.of([table], assignment).serving(INPUTS, "y")
-    training = TrainingFolds(folds, DriveMoments.of(table), unit_scales(5))
+    folds = CohortFolds.from_tables([table], assignment).serving(INPUTS, "y")
+    training = TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5))
     with pytest.raises(QuestionError, match="at least three folds"):
         cross_validate_selection(
             "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)

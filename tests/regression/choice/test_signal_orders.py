@@ -155,7 +155,7 @@ def test_likelihood_criteria_equal_their_textbook_form() -> None:
 def test_evidence_over_drives_is_of_fewer_rows() -> None:
     drives = random_drives(6, drives=20, noise=200)
     gram = gram_of(np.concatenate(drives))
-    moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
+    moments = DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram, names(4)[:-1], "y")
     evidence = Evidence.clustered(fits, moments)
     assert evidence.kind == "drives"
@@ -168,7 +168,7 @@ def test_independent_rows_have_about_as_many_effective_rows() -> None:
     drives = [np.rint(rng.normal(size=(30, 4)) * 500).astype(int) for _ in range(300)]
     for counts in drives:
         counts[:, 3] += counts[:, 0]
-    moments = DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
+    moments = DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
     fits = nested_fits(gram_of(np.concatenate(drives)), ["x1", "x2", "x3"], "y")
     assert Evidence.clustered(fits, moments).design_effect == pytest.approx(1, abs=0.2)
 

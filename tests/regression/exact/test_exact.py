@@ -2,24 +2,17 @@
 
 import math
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from flint import arb
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import DataError
-from fleet_slip.regression import exact as elimination
-from fleet_slip.regression import least_squares as exact
+from fleet_slip.regression import exact
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.exact import (
-    PRIME,
-    eliminate,
-    inverse_matrix,
-    solve_by_lifting,
-    sqrt,
-    symmetric_eigenvalues,
-)
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import (
     condition_number,
@@ -120,29 +113,34 @@ def test_too_few_rows_and_none() -> None:
 
 
 @given(st.lists(st.integers(-50, 50), min_size=9, max_size=9))
-def test_elimination_gives_determinants_and_inverse(entries: list[int]) -> None:
+def test_determinant_and_inverse_are_exact(entries: list[int]) -> None:
     a = np.array(entries).reshape(3, 3)
     matrix = (a @ a.T + np.eye(3, dtype=int)).tolist()
-    steps = eliminate([*([*row, 0] for row in matrix), [0, 0, 0, 1]])
-    for size in range(1, 4):
-        minor = np.linalg.det(np.array(matrix)[:size, :size])
-        assert steps.minors[size] == pytest.approx(minor, rel=1e-9)
-    inverse = inverse_matrix(matrix)
+    assert exact.determinant(matrix) == pytest.approx(np.linalg.det(np.array(matrix)), rel=1e-9)
+    inverse, denominator = exact.invert(matrix)
     product = [
         [sum(matrix[i][t] * inverse[t][j] for t in range(3)) for j in range(3)] for i in range(3)
     ]
-    assert product == [[int(i == j) for j in range(3)] for i in range(3)]
+    assert product == [[denominator * (i == j) for j in range(3)] for i in range(3)]
+
+
+def test_a_singular_matrix_has_no_solution() -> None:
+    singular = [[1, 2], [2, 4]]
+    assert exact.solve(singular, [1, 2]) is None
+    assert exact.solve_rational([[Fraction(1), Fraction(2), Fraction(3)]] * 2) is None
+    with pytest.raises(ZeroDivisionError):
+        exact.invert(singular)
 
 
 @given(st.fractions(min_value=0))
 def test_square_roots_are_correctly_rounded(value: Fraction) -> None:
-    root = sqrt(value)
+    root = exact.sqrt(value)
     if value == 0:
         assert root == 0
         return
-    exact = Fraction(root)
+    middle = Fraction(root)
     below, above = Fraction(np.nextafter(root, 0)), Fraction(np.nextafter(root, np.inf))
-    assert ((below + exact) / 2) ** 2 <= value <= ((exact + above) / 2) ** 2
+    assert ((below + middle) / 2) ** 2 <= value <= ((middle + above) / 2) ** 2
 
 
 def test_condition_number_is_that_of_the_correlations() -> None:
@@ -156,110 +154,83 @@ def test_condition_number_is_that_of_the_correlations() -> None:
     assert condition_number(gram, []) == 1.0
 
 
-def near_collinear(seed: int, size: int, bits: int) -> list[list[int]]:
-    """Sums of products of columns that differ little, label last."""
-    rng = np.random.default_rng(seed)
-    common = rng.integers(-(2**bits), 2**bits, size=(2 * size + 2, 1)).astype(object)
-    columns = common + rng.integers(-9, 10, size=(2 * size + 2, size + 1))
-    return [[int(entry) for entry in row] for row in columns.T @ columns]
-
-
-def lifted(matrix: list[list[int]]) -> list[Fraction] | None:
-    found = solve_by_lifting([row[:-1] for row in matrix[:-1]], [row[-1] for row in matrix[:-1]])
+def solved(matrix: list[list[int]]) -> list[Fraction] | None:
+    found = exact.solve([row[:-1] for row in matrix], [row[-1] for row in matrix])
     return None if found is None else [Fraction(x, found[1]) for x in found[0]]
 
 
 @given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 60))
-def test_lifting_gives_the_fractions_of_elimination(seed: int, size: int, bits: int) -> None:
-    matrix = near_collinear(seed, size, bits)
-    triangle = eliminate(matrix)
-    if triangle.singular is not None:
-        assert lifted(matrix) is None
-        return
-    numerators, determinant = triangle.solve(size)
-    assert lifted(matrix) == [Fraction(x, determinant) for x in numerators]
-
-
-def test_a_matrix_that_the_prime_divides_is_left_to_elimination() -> None:
-    assert lifted([[PRIME, 0, 1], [0, 3, 5], [1, 5, 0]]) is None
-
-
-@given(st.integers(0, 10**6), st.integers(2, 9))
-def test_rows_change_places_where_a_pivot_is_zero(seed: int, size: int) -> None:
+def test_solutions_of_nearly_dependent_equations_hold(seed: int, size: int, bits: int) -> None:
     rng = np.random.default_rng(seed)
-    half = rng.integers(-3, 4, size=(size, size)) * rng.integers(0, 2, size=(size, size))
-    matrix = (half + half.T + 99 * np.eye(size, dtype=np.int64)[::-1]) * (1 - np.eye(size))
-    rows, right = matrix.astype(int).tolist(), list(range(1, size + 1))
-    found = solve_by_lifting(rows, right)
-    if found is None:
-        assert abs(np.linalg.det(matrix)) < 0.5
+    common = rng.integers(-(2**bits), 2**bits, size=(2 * size + 2, 1)).astype(object)
+    columns = common + rng.integers(-9, 10, size=(2 * size + 2, size + 1))
+    moments = columns.T @ columns
+    equations = [[int(entry) for entry in row] for row in moments[:-1]]
+    solution = solved(equations)
+    if solution is None:
+        assert exact.determinant([row[:-1] for row in equations]) == 0
         return
-    numerators, denominator = found
-    assert denominator > 0
-    for row, b in zip(rows, right, strict=True):
-        assert sum(a * x for a, x in zip(row, numerators, strict=True)) == denominator * b
+    for *row, right in equations:
+        assert sum(a * x for a, x in zip(row, solution, strict=True)) == right
 
 
 def test_zeros_negative_and_huge_solutions() -> None:
     huge = 7**500
-    found = lifted([[1, 0, huge], [0, 2, -huge], [huge, -huge, 0]])
-    assert found == [Fraction(huge), Fraction(-huge, 2)]
-    assert lifted([[1, 0, 0], [0, 2, 0], [0, 0, 0]]) == [Fraction(0), Fraction(0)]
-    assert lifted([[0, 1], [1, 0]]) is None
+    assert solved([[1, 0, huge], [0, 2, -huge]]) == [Fraction(huge), Fraction(-huge, 2)]
+    assert solved([[1, 0, 0], [0, 2, 0]]) == [Fraction(0), Fraction(0)]
+    assert solved([[0, 1, 3], [1, 0, 4]]) == [Fraction(4), Fraction(3)]
+    assert solved([]) == []
 
 
-@pytest.mark.parametrize("intercept", [True, False])
-def test_a_fit_of_many_inputs_is_the_same_by_both_ways(
-    monkeypatch: pytest.MonkeyPatch, intercept: bool
-) -> None:
-    counts = np.random.default_rng(5).integers(-30000, 30000, size=(200, 42))
-    gram, inputs = gram_of(counts), names(41)[:-1]
-    fitted = exact.fit(gram, inputs, "y", intercept=intercept)
-    monkeypatch.setattr(exact, "MANY_INPUTS", 1000)
-    assert fitted == exact.fit(gram, inputs, "y", intercept=intercept)
-
-
-def test_of_many_inputs_too_a_dependent_one_is_named() -> None:
+def test_a_dependent_input_among_many_is_named() -> None:
     counts = np.random.default_rng(5).integers(-300, 300, size=(200, 42))
     counts[:, 40] = counts[:, 3] + 2 * counts[:, 4]
     with pytest.raises(DataError, match=r"x41 is a linear combination of x4, x5"):
-        exact.fit(gram_of(counts), names(41)[:-1], "y")
+        fit(gram_of(counts), names(41)[:-1], "y")
 
 
-@given(st.integers(1, 12), st.integers(0, 10**6))
-def test_they_are_those_of_lapack(k: int, seed: int) -> None:
-    factor = np.random.default_rng(seed).normal(size=(k, k))
-    matrix = factor + factor.T
-    largest = np.abs(matrix).sum()
-    expected = np.linalg.eigvalsh(matrix)
-    assert symmetric_eigenvalues(matrix) == pytest.approx(expected, rel=1e-13, abs=1e-15 * largest)
-
-
-def test_they_are_those_of_second_differences() -> None:
+def test_the_condition_number_of_second_differences() -> None:
     k = 20
-    matrix = 2 * np.eye(k) - np.eye(k, k=1) - np.eye(k, k=-1)
-    expected = [2 - 2 * math.cos(math.pi * i / (k + 1)) for i in range(1, k + 1)]
-    assert symmetric_eigenvalues(matrix) == pytest.approx(expected, rel=1e-14)
+    matrix = [[2 * (i == j) - (abs(i - j) == 1) for j in range(k)] for i in range(k)]
+    low, high = (2 - 2 * math.cos(math.pi * i / (k + 1)) for i in (1, k))
+    assert exact.condition_number(matrix) == pytest.approx(high / low, rel=1e-14)
 
 
-def test_compiled_they_have_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    columns = np.random.default_rng(3).normal(size=(60, 25))
-    matrix = np.asarray(np.corrcoef((columns + 9 * columns[:, :1]).T))
-    plain = symmetric_eigenvalues(matrix)
-    monkeypatch.setattr(elimination, "MANY", 25)
-    assert symmetric_eigenvalues(matrix) == plain
+@pytest.mark.parametrize("large", [3, 10**8, 10**20])
+def test_a_small_eigenvalue_is_correctly_rounded(large: int) -> None:
+    # Eigenvalues of the correlations: 1 + (large - 1) / large and 1 / large.
+    matrix = [[large, large - 1], [large - 1, large]]
+    assert exact.condition_number(matrix) == float(2 * large - 1)
 
 
-@pytest.mark.parametrize("small", [1e-3, 1e-8, 1e-12])
-def test_small_ones_are_accurate(small: float) -> None:
-    scale = np.diag([1.0, small, small**2])
-    matrix = scale @ np.array([[1, 0.5, 0.25], [0.5, 1, 0.5], [0.25, 0.5, 1]]) @ scale
-    # The determinant, (3/4)^2 * small^6, is the product of all.
-    product = math.prod(symmetric_eigenvalues(matrix))
-    assert product == pytest.approx(0.5625 * small**6, rel=1e-14)
+def test_the_condition_number_of_a_hilbert_matrix_is_that_of_mpmath() -> None:
+    """By mpmath's eigsy with 60 digits, of the matrix scaled to a unit diagonal."""
+    matrix = [[360360 // (i + j + 1) for j in range(8)] for i in range(8)]
+    assert exact.condition_number(matrix) == 5933993485.836007
 
 
-def test_a_diagonal_and_a_singular_matrix_are_no_trouble() -> None:
-    assert symmetric_eigenvalues(np.diag([3.0, 0.0, -1.0])) == [-1.0, 0.0, 3.0]
-    assert symmetric_eigenvalues(np.ones((4, 4))) == pytest.approx([0, 0, 0, 4], abs=1e-14)
-    assert symmetric_eigenvalues(np.zeros((2, 2))) == [0.0, 0.0]
+def test_the_last_bits_of_eigenvectors_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
+    columns = np.random.default_rng(3).integers(-9, 10, size=(60, 25))
+    columns += 9 * columns[:, :1]
+    matrix = (columns.T @ columns).tolist()
+    expected = exact.condition_number(matrix)
+    eigh = np.linalg.eigh
+
+    def eigh_of_another_machine(a: np.ndarray) -> SimpleNamespace:
+        vectors = eigh(a).eigenvectors
+        noise = np.random.default_rng(4).normal(size=vectors.shape)
+        return SimpleNamespace(eigenvectors=vectors + 1e-14 * noise)
+
+    monkeypatch.setattr(np.linalg, "eigh", eigh_of_another_machine)
+    assert exact.condition_number(matrix) == expected
+
+
+@pytest.mark.parametrize("matrix", [[[1, 1], [1, 1]], [[0, 0], [0, 0]], [[4, 6], [6, 9]]])
+def test_a_singular_matrix_has_an_infinite_condition(matrix: list[list[int]]) -> None:
+    assert exact.condition_number(matrix) == math.inf
+
+
+def test_a_number_without_a_nearest_double_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(exact, "MAX_PRECISION", 256)
+    with pytest.raises(ArithmeticError, match="256 bits"):
+        exact.round_once(lambda: arb(0, 1))

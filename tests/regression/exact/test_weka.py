@@ -17,7 +17,6 @@ import pytest
 
 from fleet_slip.regression import exact as exact_roots
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.exact import eliminate
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate
 from fleet_slip.regression.gram import Gram
@@ -85,10 +84,12 @@ def fit_penalised(
     """Solve (S + diag(penalties)) b = S_xy exactly, penalties >= 0 in counts^2, or `DataError`."""
     part = gram.restrict([*inputs, label])
     common = math.lcm(*(penalty.denominator for penalty in penalties))
-    matrix = [[common * entry for entry in row] for row in part.centred()]
+    matrix = [[common * entry for entry in row] for row in part.centered_products()]
     for i, penalty in enumerate(penalties):
         matrix[i][i] += int(part.n * common * penalty)
-    numerators, determinant = eliminate(matrix).solve(len(inputs))
+    solution = exact_roots.solve([row[:-1] for row in matrix[:-1]], matrix[-1][:-1])
+    assert solution is not None
+    numerators, determinant = solution
     slopes = [Fraction(x, determinant) for x in numerators]
     total = part.sums[-1] - sum(b * s for b, s in zip(slopes, part.sums, strict=False))
     return LinearModel(tuple(inputs), label, tuple(slopes), Fraction(total, part.n))
@@ -121,13 +122,13 @@ def standardised_penalty(gram: Gram, inputs: Sequence[str], penalty: Fraction) -
 
     (n - 1) C + penalty I for standard deviations with n - 1 is S + penalty diag(S) / (n - 1).
     """
-    matrix = gram.restrict(inputs).centred()
+    matrix = gram.restrict(inputs).centered_products()
     return [penalty * Fraction(row[i], gram.n * (gram.n - 1)) for i, row in enumerate(matrix)]
 
 
 def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
     """Return |b_j| s_j / s_y of each signal, s the standard deviations."""
-    matrix = gram.restrict([*model.signals, model.label]).centred()
+    matrix = gram.restrict([*model.signals, model.label]).centered_products()
     return {
         name: exact_roots.sqrt(b * b * matrix[i][i] / matrix[-1][-1])
         for i, (name, b) in enumerate(zip(model.signals, model.coefficients, strict=True))

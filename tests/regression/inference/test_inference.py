@@ -1,5 +1,6 @@
-"""Standard errors, Chow test and variance inflation against dense formulas and SciPy."""
+"""Standard errors, Chow test and variance inflation against dense formulas and closed forms."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -9,13 +10,12 @@ import statsmodels.api as sm
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from scipy.special import betainc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drives import DriveMoments, serving_drives
-from fleet_slip.regression.figures import incomplete_beta
+from fleet_slip.regression.drives import DriveMoments, complete_cases
+from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import (
     Evidence,
@@ -40,7 +40,7 @@ from tests.support.counts import (
 
 
 def moments_of(drives: list[np.ndarray]) -> DriveMoments:
-    return DriveMoments.of(table_of([gram_of(counts) for counts in drives]))
+    return DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
 
 
 @settings(max_examples=25)
@@ -91,23 +91,31 @@ def test_questions_without_an_answer_are_errors() -> None:
     with pytest.raises(DataError, match="2 rows are too few"):
         infer_classically(fit(few, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
-        serving_drives([moments_table()], ["x9"])
+        complete_cases([moments_table()], ["x9"])
 
 
 def moments_table() -> GramTable:
     return table_of([gram_of(random_drives(1)[0])])
 
 
-def test_serving_drives_stacks_tables() -> None:
+def test_complete_cases_stacks_tables() -> None:
     full = moments_table()
-    table, mask = serving_drives([full, full.restrict(["x1", "y"]), full], ["y", "x2"])
+    table, mask = complete_cases([full, full.restrict(["x1", "y"]), full], ["y", "x2"])
     assert len(table) == 2
     assert mask.tolist() == [True, False, True]
 
 
-@given(st.floats(0.05, 1e4), st.floats(0.05, 1e4), st.floats(0.0, 1.0))
-def test_incomplete_beta_equals_scipy(a: float, b: float, x: float) -> None:
-    assert incomplete_beta(a, b, x) == pytest.approx(betainc(a, b, x), rel=1e-8, abs=1e-12)
+@given(st.floats(-30, 30))
+def test_p_values_of_one_and_two_degrees_have_closed_forms(t: float) -> None:
+    one = 1 - 2 / math.pi * math.atan(abs(t))
+    assert student_t_two_sided(t, 1) == pytest.approx(one, rel=1e-12)
+    two = 1 - abs(t) / math.sqrt(2 + t * t)
+    assert student_t_two_sided(t, 2) == pytest.approx(two, rel=1e-10)
+
+
+def test_p_values_of_no_effect_and_of_no_error() -> None:
+    assert student_t_two_sided(0.0, 3) == student_t_two_sided(1e-200, 3) == 1
+    assert student_t_two_sided(math.inf, 3) == student_t_two_sided(1e200, 3) == 0
 
 
 AGREEMENT = 1e-9
@@ -143,7 +151,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
     model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]))
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]))
     mine, theirs = infer_classically(fitted, unit_scales(inputs)), model.fit()
     largest = np.abs(theirs.params).max()
     values = [estimate.value for estimate in mine.estimates]
@@ -179,7 +187,7 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
     counts = np.concatenate(parts)
     fitted = fit(gram_of(counts), INPUTS, "y", intercept=False)
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
     classical, clustered = (
         infer_classically(fitted, unit_scales(4)),
         infer_by_clusters(fitted, moments, unit_scales(4)),
@@ -197,7 +205,7 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
 def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
     parts = offset_drives(3)
     gram = gram_of(np.concatenate(parts))
-    moments = DriveMoments.of(table_of([gram_of(part) for part in parts]).about_origin())
+    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
     fits = nested_fits(gram, INPUTS, "y", intercept=False)
     counts = np.concatenate(parts)
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))

@@ -14,7 +14,7 @@ from scipy import stats
 
 from fleet_slip.base import hash_fold
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.regression.choice import Shortfall, Worth, choose, compare_paired
+from fleet_slip.regression.choice import RmseGap, Tolerance, choose, compare_paired
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
@@ -35,7 +35,7 @@ SCALES = {**{name: Fraction(1, 100) for name in names(6)}, "y": Fraction(1, 10_0
 
 def cohort_of(drives: list[np.ndarray], fold: list[int]) -> CohortFolds:
     table = table_of([gram_of(counts) for counts in drives])
-    return CohortFolds.of([table], by_value(fold))
+    return CohortFolds.from_tables([table], by_value(fold))
 
 
 @settings(max_examples=25)
@@ -76,7 +76,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     poor = table_of(
         [Gram.from_counts(("y", "x1", "x2"), counts[:, [4, 0, 1]]) for counts in drives[6:]]
     )
-    cohort = CohortFolds.of([full, poor], by_value([0, 1, 2] * 4))
+    cohort = CohortFolds.from_tables([full, poor], by_value([0, 1, 2] * 4))
     both = cross_validate_inputs("two", cohort, ["x1", "x2"], "y", SCALES)
     assert both.drives == 12
     assert both.pooled.rows == 12 * 60
@@ -90,7 +90,9 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
 def test_folds_lacking_a_signal_are_an_error() -> None:
     drives = random_drives(7, drives=4)
     full = table_of([gram_of(counts) for counts in drives[:2]])
-    cohort = CohortFolds.of([full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"]))
+    cohort = CohortFolds.from_tables(
+        [full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"])
+    )
     with pytest.raises(DataError, match="fold b has no rows with all of x2, y"):
         cohort.serving(["x2"], "y")
 
@@ -142,17 +144,17 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
     small = candidate("small", 3, 0.985, 1.10, 2.11)
     best = candidate("best", 5, 0.990, 1.05, 2.05)
     lacks = math.sqrt(1.605**2 - 1.55**2)
-    assert choose([small, best], Worth(1.01 * lacks)).model is small
-    chosen = choose([small, best], Worth(0.99 * lacks))
+    assert choose([small, best], Tolerance(1.01 * lacks)).model is small
+    chosen = choose([small, best], Tolerance(0.99 * lacks))
     assert (chosen.model, chosen.best) == (best, best)
-    shortfall = chosen.shortfalls[0]
+    shortfall = chosen.gaps[0]
     assert shortfall.rmse == pytest.approx(0.055)
-    assert shortfall.lacks == pytest.approx(lacks)
-    assert shortfall.real
+    assert shortfall.independent_error == pytest.approx(lacks)
+    assert shortfall.is_significant
     assert not shortfall.negligible
-    assert choose([small, best], Worth(0.04, relative=True)).model is small
-    assert choose([small, best], Worth(0.03, relative=True)).model is best
-    reason = choose([small, best], Worth(0.5)).reason
+    assert choose([small, best], Tolerance(0.04, relative=True)).model is small
+    assert choose([small, best], Tolerance(0.03, relative=True)).model is best
+    reason = choose([small, best], Tolerance(0.5)).reason
     assert "fewest signals (3) of the 2 models that are about as good" in reason
     assert "as if an independent error of 24 deg were added), is significant, but less" in reason
 
@@ -161,14 +163,14 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
 def test_what_a_model_lacks_does_not_depend_on_the_noise_of_the_label(noise: float) -> None:
     small = candidate("small", 3, 0.985, *(math.hypot(0.5, noise) for _ in range(2)))
     best = candidate("best", 5, 0.990, *(math.hypot(0.4, noise) for _ in range(2)))
-    assert choose([small, best], Worth(0.301)).model is small
-    assert choose([small, best], Worth(0.299)).model is best
+    assert choose([small, best], Tolerance(0.301)).model is small
+    assert choose([small, best], Tolerance(0.299)).model is best
 
 
 def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
     small = candidate("small", 3, 0.985, 1.00, 2.50)
     best = candidate("best", 5, 0.990, 1.05, 2.05)
-    chosen = choose([small, best], Worth(0.001))
+    chosen = choose([small, best], Tolerance(0.001))
     assert chosen.model is small
     assert "is not significant" in chosen.reason
 
@@ -177,7 +179,7 @@ def test_the_standard_error_of_a_shortfall_is_that_of_a_paired_t_test() -> None:
     cohort = cohort_of(random_drives(1, inputs=6), [0, 1, 2] * 4)
     one, other = (cross_validate_inputs(str(k), cohort, names(6)[:k], "y", SCALES) for k in (3, 5))
     chosen = choose([one, other])
-    rest = next(s for s in chosen.shortfalls if s.model is not chosen.best)
+    rest = next(s for s in chosen.gaps if s.model is not chosen.best)
     a, b = ([fold.rmse for fold in m.folds] for m in (rest.model, chosen.best))
     expected = np.mean(np.subtract(a, b)) / stats.ttest_rel(a, b).statistic
     assert rest.standard_error == pytest.approx(expected, rel=1e-9)
@@ -187,8 +189,8 @@ def test_models_of_other_rows_are_compared_without_pairs() -> None:
     best = candidate("best", 5, 0.990, 1.05, 2.05)
     other = candidate("other", 3, 0.985, 1.10, 2.10)
     fewer = tuple(replace(fold, rows=fold.rows - 1) for fold in other.folds)
-    chosen = choose([replace(other, folds=fewer), best], Worth(0.001))
-    assert chosen.shortfalls[0].standard_error == pytest.approx(math.hypot(0.5, 0.5))
+    chosen = choose([replace(other, folds=fewer), best], Tolerance(0.001))
+    assert chosen.gaps[0].standard_error == pytest.approx(math.hypot(0.5, 0.5))
     assert chosen.model.name == "other"
 
 
@@ -256,8 +258,8 @@ def predict(slopes: Sequence[int], groups: Sequence[np.ndarray]) -> CrossValidat
     return assemble("m", folds, [error_sums(model, g) for g in folds.grams], model, OF_ONE)
 
 
-def compare(groups: Sequence[np.ndarray]) -> Shortfall:
-    return compare_paired(predict((2, 0), groups), predict((2, 1), groups), Worth(0.0))
+def compare(groups: Sequence[np.ndarray]) -> RmseGap:
+    return compare_paired(predict((2, 0), groups), predict((2, 1), groups), Tolerance(0.0))
 
 
 def draw(rng: np.random.Generator, groups: int) -> list[np.ndarray]:
@@ -286,11 +288,11 @@ def test_rows_of_a_group_are_not_taken_for_independent() -> None:
 
 def test_the_same_model_falls_short_of_itself_by_nothing() -> None:
     one = predict((1, 1), draw(np.random.default_rng(3), 5))
-    shortfall = compare_paired(one, one, Worth(0.0))
+    shortfall = compare_paired(one, one, Tolerance(0.0))
     assert (shortfall.rmse, shortfall.standard_error) == (0.0, 0.0)
 
 
 def test_other_rows_cannot_be_paired() -> None:
     rng = np.random.default_rng(4)
     with pytest.raises(ValueError, match="same rows"):
-        compare_paired(predict((1, 0), draw(rng, 4)), predict((1, 0), draw(rng, 4)), Worth(0.0))
+        compare_paired(predict((1, 0), draw(rng, 4)), predict((1, 0), draw(rng, 4)), Tolerance(0.0))

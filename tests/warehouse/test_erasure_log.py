@@ -15,7 +15,7 @@ from fleet_slip.operations.forget import forget
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Table
-from fleet_slip.warehouse.forgotten import Audit, Forgettable
+from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.tables import TABLE_VIEWS, Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts
@@ -37,7 +37,7 @@ def filled(root: Path, *, grams: bool = True) -> Warehouse:
     return warehouse
 
 
-def restored(root: Path, subject: Forgettable, *, grams: bool = True) -> Warehouse:
+def restored(root: Path, subject: ErasureSubject, *, grams: bool = True) -> Warehouse:
     """Return a warehouse whose tables are older than the erasure of a subject."""
     warehouse = filled(root / "data", grams=grams)
     for table in ("logs", "grams"):
@@ -55,12 +55,12 @@ def restored(root: Path, subject: Forgettable, *, grams: bool = True) -> Warehou
 @pytest.mark.parametrize(
     ("subject", "remaining"),
     [
-        (Forgettable("vehicle", "beta"), {"alfa-0", "alfa-1"}),
-        (Forgettable("drive", "beta-1"), {"alfa-0", "alfa-1", "beta-0"}),
+        (ErasureSubject("vehicle", "beta"), {"alfa-0", "alfa-1"}),
+        (ErasureSubject("drive", "beta-1"), {"alfa-0", "alfa-1", "beta-0"}),
     ],
 )
 def test_no_view_has_an_erased_subject_of_restored_tables(
-    tmp_path: Path, subject: Forgettable, remaining: set[str], grams: bool
+    tmp_path: Path, subject: ErasureSubject, remaining: set[str], grams: bool
 ) -> None:
     warehouse = restored(tmp_path, subject, grams=grams)
     for view in ("log_counts", "log", "drives", *(["grams"] if grams else [])):
@@ -69,7 +69,7 @@ def test_no_view_has_an_erased_subject_of_restored_tables(
 
 
 def test_a_cohort_of_restored_tables_is_without_the_erased_car(tmp_path: Path) -> None:
-    warehouse = restored(tmp_path, Forgettable("vehicle", "beta"))
+    warehouse = restored(tmp_path, ErasureSubject("vehicle", "beta"))
     assert set(load_cohort(warehouse).drives["vehicle_id"].to_pylist()) == {"alfa"}
     with pytest.raises(DataError, match="no drive"):
         load_cohort(warehouse, "vehicle_id = 'beta'")
@@ -82,7 +82,7 @@ def test_rows_without_a_name_of_a_car_stay(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     land(warehouse, "a", log_rows("anonymous", random_counts(rng, 50), vehicle_id=None))
     land(warehouse, "b", log_rows("beta-0", random_counts(rng, 50), vehicle_id="beta"))
-    Audit(warehouse.root).begin(Forgettable("vehicle", "beta"), 1, [])
+    ErasureLog(warehouse.root).begin(ErasureSubject("vehicle", "beta"), 1, [])
     assert ask(warehouse.root, "SELECT drive_id FROM drives") == [("anonymous",)]
 
 
@@ -92,14 +92,14 @@ def test_refused_rows_of_an_erased_car_are_not_shown(tmp_path: Path) -> None:
     table = pa.Table.from_pylist(rows, schema=warehouse.quarantine.schema)
     action = warehouse.quarantine.write_file("refused", table)
     warehouse.quarantine.snapshot().commit(Change(add=[action]))
-    Audit(warehouse.root).begin(Forgettable("vehicle", "beta"), 2, [])
+    ErasureLog(warehouse.root).begin(ErasureSubject("vehicle", "beta"), 2, [])
     assert ask(warehouse.root, "SELECT vehicle_id FROM quarantine") == [(None,)]
 
 
 def test_status_reports_restored_rows_until_they_are_erased_again(
     tmp_path: Path, run_command: RunCommand
 ) -> None:
-    restored(tmp_path, Forgettable("vehicle", "beta"))
+    restored(tmp_path, ErasureSubject("vehicle", "beta"))
     found = run_command("status")
     assert found.exit_code == 10
     command = "fleet-slip forget --vehicle beta --now"
@@ -111,7 +111,7 @@ def test_status_reports_restored_rows_until_they_are_erased_again(
 
 def test_an_erasure_that_is_under_way_is_hidden_and_no_problem(tmp_path: Path) -> None:
     warehouse = filled(tmp_path)
-    Audit(warehouse.root).begin(Forgettable("vehicle", "beta"), 2, [])
+    ErasureLog(warehouse.root).begin(ErasureSubject("vehicle", "beta"), 2, [])
     assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM drives") == [("alfa",)]
     assert not any("erased" in problem for problem in status_of(warehouse).problems)
 
