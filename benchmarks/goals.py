@@ -24,11 +24,10 @@ import numpy as np
 
 import fleet_slip
 from fleet_slip.config import load_config
-from fleet_slip.evaluation.blind import BlindSet, blind_scenarios
 from fleet_slip.evaluation.evaluator import Estimator as DriveEstimator
 from fleet_slip.evaluation.evaluator import evaluate, pooled_statistics
 from fleet_slip.evaluation.scenario_evaluation import train_competitors
-from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
+from fleet_slip.evaluation.test_drives import BlindSet, TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.resources import SHIPPED_CONFIGS

@@ -22,8 +22,8 @@ from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
-from fleet_slip.evaluation.gaussian_state import independent_state
 from fleet_slip.evaluation.identify import tune
+from fleet_slip.evaluation.kalman import independent_state
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     Axles,

@@ -11,7 +11,7 @@ correct it. With the lateral forces F of the axles:
     ṙ  = (a Ff cos δ − b Fr)/I             z3 = (Ff cos δ + Fr)/m + b
     ḃ  = 0
 
-The bias of the gyroscope is a state of the filter before it, `yaw_rate_filter`. A drive may begin
+The bias of the gyroscope is a state of the filter before it, `estimate_yaw_rate`. A drive may begin
 in a bend: at first the rear wheels roll without slip, vy = b r. From vy = 0 the rear tyres would
 slide there, where their force has no slope that leads back.
 """
@@ -25,10 +25,12 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
-from fleet_slip.evaluation import yaw_rate_filter
-from fleet_slip.evaluation.gaussian_state import (
+from fleet_slip.evaluation.kalman import (
+    YAW_RATE_TUNABLE,
     GaussianState,
     Row,
+    YawRateNoise,
+    estimate_yaw_rate,
     independent_state,
     measurement_update,
     predict_covariance,
@@ -45,7 +47,6 @@ from fleet_slip.evaluation.single_track import (
     rates,
     sideslip_angle,
 )
-from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 INITIAL_STD = (1.0, 1.0, 0.1)
@@ -105,7 +106,7 @@ TUNABLE = (
     "ay_bias_std_mps2",
     "stiffness_front_factor",
     "stiffness_rear_factor",
-    *yaw_rate_filter.TUNABLE,
+    *YAW_RATE_TUNABLE,
 )
 """The parameters that `identify.tune` should search."""
 
@@ -224,7 +225,7 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Fl
 def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> Inputs:
     """Return the inputs of the filter for a drive, gaps bridged. Raises `MissingSignalError`."""
     drive = noise.sensors.corrected(drive, car)
-    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(drive, car, noise.yaw_rate)
+    yaw_rate_rad_s, _ = estimate_yaw_rate(drive, car, noise.yaw_rate)
     vx_mps = measured_speed_mps(drive, car)
     ax_mps2, ay_mps2 = hold_last(drive.ax_mps2, "ax"), hold_last(drive.ay_mps2, "ay")
     return Inputs(

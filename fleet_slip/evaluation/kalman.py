@@ -1,29 +1,188 @@
-"""The paper's Kalman filter: GPS velocity fused with the accelerometers, Section IV.
+"""The paper's Kalman filter (Section IV), the filter of its yaw rate, and the updates of both.
 
-The state is x = [u_x, b_x, u_y, b_y]: velocity of the centre of gravity in the car's frame and the
-biases a_x,bias and a_y,bias of the accelerometers. The paper's (6b) prints the term ψ̇ u_x Δt with a
-plus; (5b), from which it follows, and the mechanics ask for a minus, which stands here.
+Updates change a state in place: a filter takes millions of steps and allocates nothing in them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.compiling import kernel
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
-from fleet_slip.evaluation import yaw_rate_filter
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.gaussian_state import (
-    GaussianState,
-    independent_state,
-    measurement_update,
-    predict_covariance,
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    DriveSignals,
+    hold_last,
+    sideslip_angle,
+    undriven_axle,
 )
-from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, hold_last, sideslip_angle
-from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.vehicle.parameters import VehicleParameters
+
+Row = tuple[Any, ...]
+"""A row of a matrix, of a length that the compiler sees: it unrolls the loops over it."""
+
+
+class GaussianState(NamedTuple):
+    """Mean x, shape (n,), covariance P, shape (n, n), and a buffer for F P."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    buffer: FloatArray
+
+
+@equation
+def independent_state(mean: Row, variances: Row) -> GaussianState:
+    """Return a state of independent components."""
+    n = len(mean)
+    state = GaussianState(np.empty(n), np.zeros((n, n)), np.empty((n, n)))
+    for i in range(n):
+        state.mean[i] = mean[i]
+        state.covariance[i, i] = variances[i]
+    return state
+
+
+@equation
+def predict_covariance(state: GaussianState, f: tuple[Row, ...], q: Row) -> None:
+    """Update the covariance by one time step, P ← F P Fᵀ + diag(q)."""
+    p, fp = state.covariance, state.buffer
+    n = len(q)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += f[i][k] * p[k, j]
+            fp[i, j] = total
+    for i in range(n):
+        for j in range(i, n):
+            total = 0.0
+            for k in range(n):
+                total += fp[i, k] * f[j][k]
+            p[i, j] = total
+            p[j, i] = total
+        p[i, i] += q[i]
+
+
+@equation
+def measurement_update(state: GaussianState, h: Row, innovation: float, variance: float) -> float:
+    """Update by one measurement with the row H, in Joseph's form; return the innovation's variance.
+
+        K = P Hᵀ / (H P Hᵀ + R)
+        x ← x + K (z − H x)
+        P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ
+
+    With u = P Hᵀ, P becomes P − K uᵀ + (K R − (u − K H u)) Kᵀ, whose last term is zero but for
+    rounding. P (I − K H) alone would lose symmetry and definiteness to it. Measurements with
+    independent noises may come one after the other.
+    """
+    x, p, u = state.mean, state.covariance, state.buffer[0]
+    n = len(h)
+    predicted = 0.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += p[i, j] * h[j]
+        u[i] = total
+        predicted += h[i] * total
+    for i in range(n):
+        gain = u[i] / (predicted + variance)
+        residual = gain * variance - (u[i] - gain * predicted)
+        x[i] += gain * innovation
+        for j in range(i, n):
+            p[i, j] = p[i, j] - gain * u[j] + residual * (u[j] / (predicted + variance))
+            p[j, i] = p[i, j]
+    return predicted + variance
+
+
+# Yaw rate, which the paper's filter takes as given.
+#
+# The state is x = [r, b]: yaw rate and bias of the gyroscope, which Bevly, Ryu and Gerdes estimate
+# against an absolute reference ("Integrating INS sensors with GPS measurements for continuous
+# estimation of vehicle sideslip, roll, and tire cornering stiffness", IEEE Transactions on
+# Intelligent Transportation Systems 7, 2006). The reference here is the difference of wheel speeds
+# (`AxleSpeeds`): a log may lack the GPS heading, and no tunnel interrupts the wheels.
+#
+#     r(k) = r(k−1) + Δt w_r        gyroscope   z_g = r + b + w_g
+#     b(k) = b(k−1)                 wheels      z_w = r + w_w
+#
+# Wheels that brake in a corner slip more on the unloaded side: rows of braking have no z_w.
+
+INITIAL_STD_RAD_S = 1.0
+"""Standard deviation of the yaw rate before the first measurement: uninformative."""
+
+BRAKING_MPS2 = -0.5
+"""Longitudinal acceleration below which wheels brake; a coasting car stays above."""
+
+
+class YawRateNoise(Config):
+    """Standard deviations of the yaw rate filter; the defaults are the paper's initial noise."""
+
+    gyro_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
+    gyro_bias_std_rad_s: FiniteFloat = Field(default=0.01, gt=0)
+    """Bias before the drive."""
+    wheel_yaw_rate_std_rad_s: FiniteFloat = Field(default=0.006, gt=0)
+    """Yaw rate from wheel speeds: √2 R σ_ω / track with σ_ω of 0.02 rad/s."""
+    yaw_acceleration_std_rad_s2: FiniteFloat = Field(default=0.5, gt=0)
+    """Change of the yaw rate per second."""
+
+
+YAW_RATE_TUNABLE = (
+    "yaw_rate.gyro_std_rad_s",
+    "yaw_rate.wheel_yaw_rate_std_rad_s",
+    "yaw_rate.yaw_acceleration_std_rad_s2",
+)
+"""Parameters to tune of a filter's `yaw_rate: YawRateNoise`."""
+
+
+@kernel
+def _filter_yaw_rate(
+    gyro: FloatArray,
+    wheels: FloatArray,
+    bias_var: float,
+    gyro_var: float,
+    wheel_var: float,
+    step_var: float,
+) -> FloatArray:
+    estimates = np.empty((2, len(gyro)))
+    x = independent_state((0.0, 0.0), (INITIAL_STD_RAD_S**2, bias_var))
+    for k in range(len(gyro)):
+        x.covariance[0, 0] += step_var
+        if not np.isnan(gyro[k]):
+            measurement_update(x, (1.0, 1.0), gyro[k] - x.mean[0] - x.mean[1], gyro_var)
+        if not np.isnan(wheels[k]):
+            measurement_update(x, (1.0, 0.0), wheels[k] - x.mean[0], wheel_var)
+        estimates[:, k] = x.mean
+    return estimates
+
+
+def estimate_yaw_rate(
+    drive: DriveSignals, car: VehicleParameters, noise: YawRateNoise
+) -> FloatArray:
+    """Estimate yaw rate and bias of the gyroscope in rad/s at every row, shape (2, rows).
+
+    Gaps are bridged. Where one speed stands in for both wheels, only standstill is a measurement.
+    """
+    axle = undriven_axle(drive, car)
+    rolling = drive.ax_mps2 > BRAKING_MPS2
+    if np.array_equal(axle.left_mps, axle.right_mps, equal_nan=True):
+        rolling &= axle.left_mps == 0
+    return _filter_yaw_rate(
+        drive.yaw_rate_rad_s,
+        np.where(rolling, axle.yaw_rate_rad_s, np.nan),
+        noise.gyro_bias_std_rad_s**2,
+        noise.gyro_std_rad_s**2,
+        noise.wheel_yaw_rate_std_rad_s**2,
+        (STEP_S * noise.yaw_acceleration_std_rad_s2) ** 2,
+    )
+
+
+# Fusion of the GPS velocity with the accelerometers.
+#
+# The state is x = [u_x, b_x, u_y, b_y]: velocity of the centre of gravity in the car's frame, and
+# the biases a_x,bias and a_y,bias of the accelerometers. The paper's (6b) prints the term ψ̇ u_x Δt
+# with a plus. It follows from (5b) with a minus, as do the mechanics, and has a minus here.
 
 
 class FilterNoise(Config):
@@ -46,7 +205,7 @@ TUNABLE = (
     "gps_vx_std_mps",
     "gps_vy_std_mps",
     "bias_std_mps2",
-    *yaw_rate_filter.TUNABLE,
+    *YAW_RATE_TUNABLE,
 )
 """The parameters of Q, R and the first P that `identify.tune` should search."""
 
@@ -159,6 +318,6 @@ def estimate(drive: DriveSignals, car: VehicleParameters, noise: FilterNoise) ->
     compiled and releases the interpreter's lock: many drives run on threads, as in
     `executor.map(partial(estimate, car=car, noise=noise), drives)`.
     """
-    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(drive, car, noise.yaw_rate)
+    yaw_rate_rad_s, _ = estimate_yaw_rate(drive, car, noise.yaw_rate)
     vx_mps, _, vy_mps, _ = fuse(drive, yaw_rate_rad_s, noise)
     return sideslip_angle(vx_mps, vy_mps)

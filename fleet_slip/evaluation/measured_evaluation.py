@@ -17,7 +17,6 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation import yaw_rate_filter
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     evaluate,
@@ -43,6 +42,7 @@ from fleet_slip.evaluation.held_out import (
     read_measured_drives,
 )
 from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Identified, Measured, identify
+from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
 from fleet_slip.evaluation.single_track import (
     STEP_S,
     DriveSignals,
@@ -388,8 +388,7 @@ def on_signals(estimate: Callable[..., FloatArray], *parameters: object) -> Esti
 
 def rolling_sideslip(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
     """Return side-slip in rad of rear wheels that roll without slip, arctan(b r / vx)."""
-    noise = yaw_rate_filter.YawRateNoise()
-    yaw_rate_rad_s, _ = yaw_rate_filter.estimate(signals, vehicle, noise)
+    yaw_rate_rad_s, _ = estimate_yaw_rate(signals, vehicle, YawRateNoise())
     lateral_mps = vehicle.body.rear_axle_m * yaw_rate_rad_s
     angle_rad: FloatArray = np.arctan2(lateral_mps, measured_speed_mps(signals, vehicle))
     return angle_rad

@@ -11,7 +11,6 @@ from fleet_slip.evaluation.claims import Status, evaluate_claims
 from fleet_slip.evaluation.evaluation_document import evaluations_of
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import LinearEstimate, restore_filter, train_models
-from fleet_slip.evaluation.ranking import MIN_COVERAGE
 from fleet_slip.evaluation.report_data import (
     DRAWN_FILTERS,
     PAPER_TABLE_TWO,
@@ -20,6 +19,7 @@ from fleet_slip.evaluation.report_data import (
     compare_orders,
     latest_evaluation,
 )
+from fleet_slip.evaluation.scenario_evaluation import MIN_COVERAGE
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.drawing import Drawn, draw

@@ -1,6 +1,6 @@
 """Evaluation on simulated drives: of the scenarios, and blind."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict
 from importlib.metadata import version as package_version
@@ -8,8 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.evaluation.blind import evaluate_blind_drives
-from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.evaluation.evaluator import (
+    Estimator,
+    EvaluatedDrive,
+    evaluate,
+    pooled_statistics,
+)
 from fleet_slip.evaluation.filters import (
     EstimatorBank,
     TrainedModels,
@@ -17,11 +22,16 @@ from fleet_slip.evaluation.filters import (
     filter_bank,
     train_models,
 )
-from fleet_slip.evaluation.ranking import compare_models, rank
-from fleet_slip.evaluation.test_drives import TestDrive, find_stretches, simulate_drives
+from fleet_slip.evaluation.test_drives import (
+    TestDrive,
+    blind_scenarios,
+    find_stretches,
+    simulate_drives,
+)
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -141,3 +151,130 @@ def _truth_document(drive: TestDrive) -> dict[str, Any]:
         "lateral_offset_max_m": float(np.abs(drive.lateral_offset_m).max()),
         "lateral_acceleration_p99_mps2": float(np.nanquantile(np.abs(ay), 0.99)),
     }
+
+
+def evaluate_blind_drives(
+    catalog: Catalog, sha256: str, estimators: Mapping[str, Estimator[TestDrive]]
+) -> list[dict[str, Any]]:
+    """Evaluate estimators on the blind drives of a model version.
+
+    Returns `results` by estimator over all drives together, then by class of road, by weather and
+    by drive. The reference is the simulator's own, not quantised as in a log.
+    """
+    drives = simulate_drives(catalog.signals, blind_scenarios(sha256, catalog.configs))
+    runs = evaluate(drives, estimators)
+    groups = {"all": list(runs)}
+    for word in (0, -1):
+        for run in runs:
+            groups.setdefault(run.name.split("_")[word], []).append(run)
+    groups |= {run.name: [run] for run in runs}
+    return [_group_document(name, group) for name, group in groups.items()]
+
+
+def _group_document(name: str, runs: Sequence[EvaluatedDrive[TestDrive]]) -> dict[str, Any]:
+    truth = np.concatenate([run.drive.sideslip_rad[run.rows] for run in runs])
+    errors = pooled_statistics(runs)
+    return {
+        "name": name,
+        "drives": len(runs),
+        "sideslip_std_deg": float(np.degrees(truth.std())),
+        "results": {estimator: asdict(statistics) for estimator, statistics in errors.items()},
+    }
+
+
+# Ranking of estimators on test drives, and comparison of models trained on two cohorts.
+
+MIN_COVERAGE = 0.99
+"""Share of a drive's rows with an estimate below which an estimator does not compete."""
+
+CLOSE = 1.25
+"""Ratio to the winner's RMSE up to which a lost drive counts as close."""
+
+
+def rank(
+    runs: Sequence[EvaluatedDrive[TestDrive]], estimator: str, gps: Collection[str]
+) -> dict[str, Any]:
+    """Rank an estimator on every drive against all that use no GPS; it wins a tie.
+
+    Returns the section of a document. Drives that differ in satellite navigation alone count once:
+    `same_as` names the first.
+    """
+    standings = [
+        {
+            "scenario": run.name,
+            **_standing(run, estimator, gps),
+            "same_as": _same_as(run.drive.scenario, runs[:number]),
+        }
+        for number, run in enumerate(runs)
+    ]
+    counted = [standing for standing in standings if standing["same_as"] is None]
+    lost = [row["ratio"] for row in counted if row["ratio"] is not None and not row["won"]]
+    return {
+        "estimator": estimator,
+        "least_coverage": MIN_COVERAGE,
+        "close_ratio": CLOSE,
+        "drives": len(counted),
+        "won": sum(row["won"] for row in counted),
+        "close": sum(ratio <= CLOSE for ratio in lost),
+        "standings": standings,
+    }
+
+
+def _standing(
+    run: EvaluatedDrive[TestDrive], estimator: str, gps: Collection[str]
+) -> dict[str, Any]:
+    """Return the best estimator of a drive (None without competitors), and this one's verdict."""
+    errors = {
+        name: statistics.rmse_deg
+        for name, statistics in run.statistics.items()
+        if name not in gps
+        and statistics.rmse_deg is not None
+        and statistics.coverage >= MIN_COVERAGE
+    }
+    rmse_deg = errors.get(estimator)
+    winner = min(errors, key=lambda name: (errors[name], name != estimator), default=None)
+    winner_deg = errors[winner] if winner else None
+    return {
+        "winner": winner,
+        "winner_rmse_deg": winner_deg,
+        "rmse_deg": rmse_deg,
+        "won": winner == estimator,
+        "ratio": rmse_deg / winner_deg if rmse_deg is not None and winner_deg else None,
+    }
+
+
+def _same_as(scenario: Scenario, runs: Sequence[EvaluatedDrive[TestDrive]]) -> str | None:
+    """Return the first of some drives that is the same to an estimator without GPS."""
+    gps = scenario.sensors.gps
+    key = _with_gps(gps, scenario)
+    return next((run.name for run in runs if _with_gps(gps, run.drive.scenario) == key), None)
+
+
+def _with_gps(gps: Gps, scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
+    """Return what of a scenario matters to an estimator without GPS, all with the same GPS."""
+    sensors = scenario.sensors.model_copy(update={"gps": gps})
+    drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
+    failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
+    return drive.digest, failures
+
+
+def compare_models(
+    runs: Sequence[EvaluatedDrive[TestDrive]],
+    one_car: Mapping[str, str],
+    fleet: Mapping[str, str],
+) -> Iterator[dict[str, Any]]:
+    """Compare the models of Table I of two cohorts, by number, wherever both have estimates."""
+    for run in runs:
+        for number in (number for number in one_car if number in fleet):
+            names = one_car[number], fleet[number]
+            one_car_deg, fleet_deg = (run.statistics[name].rmse_deg for name in names)
+            if one_car_deg is not None and fleet_deg is not None:
+                yield {
+                    "scenario": run.name,
+                    "model": number,
+                    "one_car": names[0],
+                    "fleet": names[1],
+                    "one_car_rmse_deg": one_car_deg,
+                    "fleet_rmse_deg": fleet_deg,
+                    "better": names[0] if one_car_deg <= fleet_deg else names[1],
+                }

@@ -5,16 +5,21 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import Progress, no_progress
-from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.catalog.signals import Identifier, SignalCatalog
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.job import update_grams
+from fleet_slip.resources import Configs
+from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
 from fleet_slip.simulation.job import (
     MOTION,
     DriveLog,
@@ -22,6 +27,8 @@ from fleet_slip.simulation.job import (
     simulate_batches,
     simulate_logs,
 )
+from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name
+from fleet_slip.simulation.roads import CLASSES, draw_road, random_generator
 from fleet_slip.simulation.scenario import Failure, Scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
@@ -288,3 +295,93 @@ def _runs(mask: BoolArray) -> Iterator[tuple[int, int]]:
     """Yield begin and end (exclusive) of each run of true entries."""
     edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+# Blind drives, which cannot be drawn before a model is published.
+#
+# Roads, cars, loads, tyres, weather, drivers and noise are drawn from the hash of the version under
+# test, by configs/blind.toml.
+
+
+class Weather(Config):
+    """Adhesion of the road, and the share of it that drivers use."""
+
+    adhesion: Uniform
+    friction_use: Uniform
+    """Planned lateral acceleration over μ g."""
+
+
+class BlindSet(Config):
+    """Distributions of blind drives; each road is driven once in every weather."""
+
+    campaign: Annotated[Campaign, load_by_name(load_campaign)]
+    """Campaign of the cars, tyres, sensors and road surfaces."""
+    roads: tuple[Identifier, ...] = Field(min_length=1)
+    """The class of each road."""
+    weather: dict[Identifier, Weather] = Field(min_length=1)
+    load_kg: Range
+    load_position_m: Range
+    tyre_stiffness: Uniform
+    """Stiffness of a new tyre over that of the vehicle's file."""
+    tyre_wear_days: NotNegative
+    """Maximum age of the tyres."""
+    drivers: Drivers
+
+    @property
+    def _fleet(self) -> tuple[FleetPlan, ImperfectionRanges]:
+        """The plan of the campaign's cars, and their imperfections."""
+        plan = self.campaign.plan
+        if not isinstance(plan, FleetPlan) or plan.imperfections is None:
+            raise ValueError(
+                f"{self.campaign.name} is not a campaign of a fleet with imperfections"
+            )
+        return plan, plan.imperfections
+
+    @model_validator(mode="after")
+    def _is_valid(self) -> Self:
+        _ = self._fleet
+        if unknown := [kind for kind in self.roads if kind not in CLASSES]:
+            raise ValueError(f"{unknown[0]!r} is not a class of roads: {', '.join(CLASSES)}")
+        return self
+
+    def scenarios(self, seed: int) -> tuple[Scenario, ...]:
+        """Draw the drives: one for each road and weather, in this order."""
+        return tuple(
+            self._scenario(seed, number, kind, weather)
+            for number, kind in enumerate(self.roads)
+            for weather in self.weather
+        )
+
+    def _scenario(self, seed: int, number: int, kind: str, weather: str) -> Scenario:
+        plan, flaws = self._fleet
+        name = f"{kind}_{number}_{weather}"
+        generator = random_generator(seed, "blind", name)
+        road = draw_road(kind, seed + number)
+        adhesion = self.weather[weather].adhesion.draw(generator)
+        use = self.weather[weather].friction_use.draw(generator)
+        vehicle = plan.vehicles[generator.integers(len(plan.vehicles))]
+        days = round(generator.uniform(0, self.tyre_wear_days))
+        stiffer, smaller = flaws.wear(generator, days)
+        content = {
+            "name": name,
+            "description": f"A {kind} road, {weather}",
+            "vehicle": vehicle,
+            "sprung_mass_kg": vehicle.body.sprung_mass_kg + self.load_kg.draw(generator),
+            "load_position_m": self.load_position_m.draw(generator),
+            "tyre_stiffness": self.tyre_stiffness.draw(generator) * stiffer,
+            "tyre_radius": plan.tyre_radius.draw(generator) * smaller,
+            "track": self.drivers.line(road, kind, generator),
+            "adhesion": adhesion,
+            "limits": self.drivers.limits(kind, adhesion, use, generator),
+            "laps": 1,
+            "seed": seed,
+            "sensors": plan.sensor_bias_std.draw(self.campaign.sensors, generator),
+            "imperfections": flaws.draw(generator, generator),
+        }
+        return Scenario.model_validate(content)
+
+
+def blind_scenarios(sha256: str, configs: Configs) -> tuple[Scenario, ...]:
+    """Draw the blind drives of the model version with this hash."""
+    blind_set = load_config(configs.file("blind.toml"), BlindSet, configs)
+    return blind_set.scenarios(int(sha256[:15], 16))

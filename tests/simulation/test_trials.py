@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.evaluation.blind import blind_scenarios
+from fleet_slip.evaluation.test_drives import blind_scenarios
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import job as simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign

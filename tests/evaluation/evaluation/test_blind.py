@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.cli.output import print_parts
-from fleet_slip.evaluation import blind
-from fleet_slip.evaluation.blind import blind_scenarios, evaluate_blind_drives
+from fleet_slip.evaluation import scenario_evaluation
 from fleet_slip.evaluation.evaluation_document import Evaluation
-from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
+from fleet_slip.evaluation.scenario_evaluation import evaluate_blind_drives
+from fleet_slip.evaluation.test_drives import TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import Scenario, load_scenario
@@ -68,9 +68,13 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
 ) -> None:
     """On the first road and the last, in all weathers."""
     some = (*scenarios[:3], *scenarios[-3:])
-    monkeypatch.setattr(blind, "blind_scenarios", lambda sha256, _: {HASH: some}[sha256])
+    monkeypatch.setattr(
+        scenario_evaluation, "blind_scenarios", lambda sha256, _: {HASH: some}[sha256]
+    )
     drives = simulate_drives(SIGNALS, some)
-    monkeypatch.setattr(blind, "simulate_drives", lambda _, scenarios: drives)  # the same again
+    monkeypatch.setattr(
+        scenario_evaluation, "simulate_drives", lambda _, scenarios: drives
+    )  # the same again
 
     def right(drive: TestDrive) -> np.ndarray:
         return drive.sideslip_rad

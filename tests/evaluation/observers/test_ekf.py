@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.ekf import EkfNoise, axles_of, chassis, variances
-from fleet_slip.evaluation.gaussian_state import (
+from fleet_slip.evaluation.kalman import (
     GaussianState,
     independent_state,
     measurement_update,

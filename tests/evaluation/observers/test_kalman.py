@@ -13,8 +13,15 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.gaussian_state import GaussianState, independent_state
-from fleet_slip.evaluation.kalman import FilterNoise, covariances, fuse, predict, update
+from fleet_slip.evaluation.kalman import (
+    FilterNoise,
+    GaussianState,
+    covariances,
+    fuse,
+    independent_state,
+    predict,
+    update,
+)
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle

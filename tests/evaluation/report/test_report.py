@@ -29,7 +29,6 @@ from fleet_slip.evaluation.claims import (
 )
 from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
 from fleet_slip.evaluation.evaluator import ErrorStatistics
-from fleet_slip.evaluation.ranking import MIN_COVERAGE
 from fleet_slip.evaluation.report import render, standings, table_two
 from fleet_slip.evaluation.report_data import (
     PAPER_TABLE_TWO,
@@ -38,6 +37,7 @@ from fleet_slip.evaluation.report_data import (
     blocks_won,
     compare_errors,
 )
+from fleet_slip.evaluation.scenario_evaluation import MIN_COVERAGE
 from fleet_slip.pages.drawing import draw
 from fleet_slip.pages.page import Cell, number
 from fleet_slip.resources import SHIPPED_CONFIGS

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.evaluation import yaw_rate_filter
+from fleet_slip.evaluation import kalman
+from fleet_slip.evaluation.kalman import YawRateNoise
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, undriven_axle
-from fleet_slip.evaluation.yaw_rate_filter import YawRateNoise
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, slalom
@@ -47,14 +47,14 @@ def test_agrees_with_the_textbook_filter_gaps_included() -> None:
         wheel_rl_rad_s=np.where(row // 500 == 4, np.nan, drive.wheel_rl_rad_s),
         ax_mps2=np.where(row // 400 == 1, -3.0, drive.ax_mps2),
     )
-    found = yaw_rate_filter.estimate(drive, CAR, NOISE)
+    found = kalman.estimate_yaw_rate(drive, CAR, NOISE)
     expected = textbook_filter(drive, NOISE)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
 def test_bias_is_found_and_noise_reduced() -> None:
     exact, _ = slalom(CAR, 20_000)
-    found, bias = yaw_rate_filter.estimate(noisy(exact, seed=2), CAR, NOISE)
+    found, bias = kalman.estimate_yaw_rate(noisy(exact, seed=2), CAR, NOISE)
     assert bias[-1] == pytest.approx(0.01, abs=0.001)
     error = (found - exact.yaw_rate_rad_s)[5000:]
     assert abs(error.mean()) < 0.001
@@ -66,7 +66,7 @@ def test_wheels_of_a_braking_car_are_not_believed() -> None:
     braking = replace(exact, ax_mps2=np.full(4000, -3.0))
     slipping = replace(braking, wheel_rl_rad_s=0.97 * braking.wheel_rl_rad_s)
     found, expected = (
-        yaw_rate_filter.estimate(drive, CAR, NOISE)[0] for drive in (slipping, braking)
+        kalman.estimate_yaw_rate(drive, CAR, NOISE)[0] for drive in (slipping, braking)
     )
     assert np.array_equal(found, expected)
 
