@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.night import NightReport
     from fleet_slip.operations.rewriting import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulate import SimulationReport
 
 
 class Fleet(HealthAndUpkeep):
@@ -131,7 +131,7 @@ class Fleet(HealthAndUpkeep):
         such days, `RefusedError` for one changed since it was written, and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
-        from fleet_slip.simulation.job import simulate_campaign
+        from fleet_slip.simulation.simulate import simulate_campaign
 
         chosen = campaign
         if isinstance(chosen, str):

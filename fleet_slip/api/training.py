@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.select import Selection
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulate import SimulationReport
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from fleet_slip.evaluation.evaluator import Estimator, EvaluatedDrive, evaluate,
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.drive_plans import Drivers, FleetPlan, load_by_name
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
-from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name
 from fleet_slip.simulation.roads import CLASSES, draw_road, random_generator
 from fleet_slip.simulation.scenario import Scenario
 

@@ -15,15 +15,15 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.job import update_grams
-from fleet_slip.simulation.job import (
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
+from fleet_slip.simulation.simulate import (
     MOTION,
     DriveLog,
     SimulationReport,
     simulate_batches,
     simulate_logs,
 )
-from fleet_slip.simulation.scenario import Failure, Scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 from fleet_slip.warehouse.tables import Warehouse
