@@ -108,10 +108,10 @@ class Fleet(HealthAndUpkeep):
         self,
         condition: Annotated[str, COHORT] = TRAINING_DRIVES,
         *,
-        unexamined: Annotated[bool, UNEXAMINED] = False,
+        include_faulty: Annotated[bool, UNEXAMINED] = False,
     ) -> FleetCohort:
         """Return the drives of an SQL condition, by default all but evaluation scenarios."""
-        return FleetCohort(self.warehouse, condition, unexamined)
+        return FleetCohort(self.warehouse, condition, include_faulty)
 
     # Logs, and Gram rows made of them. Whatever was done is not done again.
 

@@ -85,7 +85,7 @@ class Training:
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, which a night has examined."""
-        cohort = fleet.cohort(self.cohort, unexamined=True)
+        cohort = fleet.cohort(self.cohort, include_faulty=True)
         return cohort.select(models=self.models, worth=self.worth, label=self.label)
 
     def publish(
