@@ -59,7 +59,8 @@ class FleetCohort(Rooted):
         """Return the drives that may train a model; raises as `Fleet.quality`.
 
         Passes over simulated drives, and caches the result. Computes missing Gram rows of
-        `signals` first, as `select` does. Raises `NotScreenedError` if that takes more than seconds.
+        `signals` first, as `select` does. Raises `NotScreenedError` if that takes longer than
+        seconds.
         """
         from fleet_slip.operations.sensor_screen import SensorScreen, screen_drives
 
