@@ -22,7 +22,7 @@ from fleet_slip.evaluation.watch import DriveFrames, scenario_frames
 from fleet_slip.pages.drawing import STYLE, colour
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.job import simulate_batch
+from fleet_slip.simulation.simulate import simulate_batch
 from tests.support.catalog import SIGNALS
 
 SHOWN_S = (31.0, 66.0)

@@ -142,7 +142,7 @@ class ClusterError(FleetSlipError):
     exit_code = 11
 
 
-class UnexaminedError(FleetSlipError):
+class NotScreenedError(FleetSlipError):
     """What is to train a model could not be examined first."""
 
     exit_code = 16

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.select import Selection
-    from fleet_slip.operations.examined import Examined
+    from fleet_slip.operations.sensor_screen import SensorScreen
 
 OR_SIGNALS = Doc(
     "NAME, NAME@VERSION or NAME@ALIAS of a published model. Default: the only one that there is, "
@@ -47,26 +47,26 @@ class FleetCohort(Rooted):
     `RefusedError` for drives of evaluation scenarios.
     """
 
-    def __init__(self, warehouse: Warehouse, condition: str, unexamined: bool = False) -> None:
+    def __init__(self, warehouse: Warehouse, condition: str, include_faulty: bool = False) -> None:
         super().__init__(warehouse)
         self.condition = condition
-        self.unexamined = unexamined
+        self.include_faulty = include_faulty
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
 
-    def examine(self) -> "Examined":
+    def examine(self) -> "SensorScreen":
         """Return the drives that may train a model; raises as `Fleet.quality`.
 
-        Simulated drives are passed over; what was found is kept while the data stay. Missing Gram
-        rows of `signals` are computed first, as in `select`. Raises `UnexaminedError` if that takes
-        more than seconds.
+        Passes over simulated drives, and caches the result. Computes missing Gram rows of
+        `signals` first, as `select` does. Raises `NotScreenedError` if that takes longer than
+        seconds.
         """
-        from fleet_slip.operations.examined import Examined, find_trainable
+        from fleet_slip.operations.sensor_screen import SensorScreen, screen_drives
 
-        if self.unexamined:
-            return Examined(self.condition)
-        return find_trainable(self.warehouse, self.condition)
+        if self.include_faulty:
+            return SensorScreen(self.condition)
+        return screen_drives(self.warehouse, self.condition)
 
     @takes(SelectionRequest)
     def select(self, request: SelectionRequest) -> "Selection":

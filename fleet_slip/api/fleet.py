@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.night import NightReport
     from fleet_slip.operations.rewriting import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulate import SimulationReport
 
 
 class Fleet(HealthAndUpkeep):
@@ -108,10 +108,10 @@ class Fleet(HealthAndUpkeep):
         self,
         condition: Annotated[str, COHORT] = TRAINING_DRIVES,
         *,
-        unexamined: Annotated[bool, UNEXAMINED] = False,
+        include_faulty: Annotated[bool, UNEXAMINED] = False,
     ) -> FleetCohort:
         """Return the drives of an SQL condition, by default all but evaluation scenarios."""
-        return FleetCohort(self.warehouse, condition, unexamined)
+        return FleetCohort(self.warehouse, condition, include_faulty)
 
     # Logs, and Gram rows made of them. Whatever was done is not done again.
 
@@ -131,7 +131,7 @@ class Fleet(HealthAndUpkeep):
         such days, `RefusedError` for one changed since it was written, and `ClusterError`.
         """
         from fleet_slip.simulation.campaign import load_campaign
-        from fleet_slip.simulation.job import simulate_campaign
+        from fleet_slip.simulation.simulate import simulate_campaign
 
         chosen = campaign
         if isinstance(chosen, str):

@@ -128,9 +128,11 @@ class PublishedModels(Rooted):
         require_model_name(name)
         if choice is not None and not isinstance(choice, FleetCohort):
             return choice
-        condition, unexamined = (choice.condition, choice.unexamined) if choice else (None, False)
+        condition, include_faulty = (
+            (choice.condition, choice.include_faulty) if choice else (None, False)
+        )
         recipe = recipe_for(self.registry(), name, SelectionRequest(), condition)
-        cohort = FleetCohort(self.warehouse, recipe.cohort, unexamined)
+        cohort = FleetCohort(self.warehouse, recipe.cohort, include_faulty)
         return cohort.select(**vars(recipe.request))
 
     @record_call
@@ -262,7 +264,7 @@ class JudgedModels(PublishedModels):
             ),
         ] = None,
         *,
-        unexamined: Annotated[bool, UNEXAMINED] = False,
+        include_faulty: Annotated[bool, UNEXAMINED] = False,
     ) -> "Score":
         """Evaluate a model on the rows of a cohort; angles are in degrees.
 
@@ -272,13 +274,15 @@ class JudgedModels(PublishedModels):
         raises.
         """
         from fleet_slip.models.score import cohort_of_rows, find_seen, score
-        from fleet_slip.operations.examined import Examined, leave_out_faulty
+        from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
 
         version = self.model(model)
         asked = ALL_DRIVES if cohort is None else cohort
         signals = self.warehouse.catalog.signals
         rows = cohort_of_rows(signals, asked)
-        examined = Examined(asked) if unexamined else leave_out_faulty(self.warehouse, asked)
+        examined = (
+            SensorScreen(asked) if include_faulty else screen_computed_drives(self.warehouse, asked)
+        )
         rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
         with examined.explaining():
             seen = find_seen(self.warehouse, self.registry(), version.manifest, rows)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.ingest.load import IngestReport
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality import SensorFault
+    from fleet_slip.operations.quality_report import SensorFault
 
 SAMPLE_FILES = 4
 """Log files that a night verifies; the next night takes the next ones."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.find_drives import VacuumReport
     from fleet_slip.operations.forget import ForgetReport, RetentionReport
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality import QualityReport
+    from fleet_slip.operations.quality_report import QualityReport
     from fleet_slip.operations.rewriting import CompactionReport
     from fleet_slip.operations.status import WarehouseStatus
     from fleet_slip.operations.verify import Verification
@@ -88,7 +88,7 @@ class HealthAndUpkeep(JudgedModels):
         Drives are compared with each other, by Gram rows alone; `findings` are the faulty ones.
         Raises what `FleetCohort` raises.
         """
-        from fleet_slip.operations.quality import examine_drives
+        from fleet_slip.operations.quality_report import examine_drives
 
         return examine_drives(self.warehouse, cohort)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.select import Selection
-    from fleet_slip.simulation.job import SimulationReport
+    from fleet_slip.simulation.simulate import SimulationReport
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Training:
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, which a night has examined."""
-        cohort = fleet.cohort(self.cohort, unexamined=True)
+        cohort = fleet.cohort(self.cohort, include_faulty=True)
         return cohort.select(models=self.models, worth=self.worth, label=self.label)
 
     def publish(

@@ -102,7 +102,7 @@ def evaluate(
 # The command that identifies a car from labelled drives: identify.
 
 
-@command(Fleet.cohort, FleetCohort.identify, arguments=["name"], without=["unexamined"])
+@command(Fleet.cohort, FleetCohort.identify, arguments=["name"], without=["include_faulty"])
 def identify(
     found: "Identified",
     output: Annotated[
@@ -198,11 +198,13 @@ def explore(
     os.execv(command[0], command)  # noqa: S606 - the notebook takes the place of this process
 
 
-SOUND = ("unexamined",)
+SCREEN = ("include_faulty",)
 """Not an option of what trains no model."""
 
 
-@command(Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SOUND, echo=["condition"])
+@command(
+    Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SCREEN, echo=["condition"]
+)
 def diagnose() -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
 

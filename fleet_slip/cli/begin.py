@@ -37,7 +37,7 @@ def publish(
     name: str,
     force: bool,
     candidate: bool,
-    unexamined: bool,
+    include_faulty: bool,
     cohort: Annotated[
         str | None,
         typer.Option(
@@ -68,7 +68,7 @@ def publish(
     recipe = recipe_for(fleet.registry(), name, SelectionRequest(**asked), cohort)
     if recipe.told:
         say(f"{name}: {recipe.told}")
-    drives = fleet.cohort(recipe.cohort, unexamined=unexamined)
+    drives = fleet.cohort(recipe.cohort, include_faulty=include_faulty)
     with step("select"):
         selection = drives.select(**vars(recipe.request))
     come_to = fleet.would_publish if dry_run else fleet.publish

@@ -19,18 +19,18 @@ from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.job import update_grams
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
+from fleet_slip.simulation.drive_plans import Drivers, FleetPlan, load_by_name
 from fleet_slip.simulation.imperfections import ImperfectionRanges, NotNegative, Range, Uniform
-from fleet_slip.simulation.job import (
+from fleet_slip.simulation.roads import CLASSES, draw_road, random_generator
+from fleet_slip.simulation.scenario import Failure, Scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
+from fleet_slip.simulation.simulate import (
     MOTION,
     DriveLog,
     SimulationReport,
     simulate_batches,
     simulate_logs,
 )
-from fleet_slip.simulation.plan import Drivers, FleetPlan, load_by_name
-from fleet_slip.simulation.roads import CLASSES, draw_road, random_generator
-from fleet_slip.simulation.scenario import Failure, Scenario
-from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
 from fleet_slip.warehouse.tables import Warehouse

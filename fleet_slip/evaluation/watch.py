@@ -24,9 +24,9 @@ from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import MOTION
 from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.simulate import MOTION
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.tables import Warehouse

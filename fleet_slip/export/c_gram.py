@@ -34,7 +34,6 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
     BESIDE,
     COARSER,
-    COLUMNS,
     COURSE,
     LATE_PARTS,
     MOST_EARLY,
@@ -63,6 +62,7 @@ from fleet_slip.grams.on_board import (
 from fleet_slip.grams.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.straight_on import levels_of
+from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.gram import packed_size
 
 # Which Gram rows a car counts beside a model, and what their columns are computed by.

@@ -18,7 +18,7 @@ from fleet_slip.export.compile import Check, checks_csv, compile_program, make_c
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Angle, Input, Program, Target
-from fleet_slip.export.sql import sql_macro, sql_statement
+from fleet_slip.export.sql_statement import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.warehouse.tables import Warehouse

@@ -29,7 +29,7 @@ from fleet_slip.catalog.calibration_parameters import (
     CalibrationParameterName,
 )
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.course import COLUMNS, TURNED, turned_scale
+from fleet_slip.catalog.course import TURNED, turned_scale
 from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.car_estimates import (
@@ -51,6 +51,7 @@ from fleet_slip.grams.reader import (
     open_grams,
 )
 from fleet_slip.grams.receiver_delay import LASTING_S, NO_RECEIVERS, ReceiverDelays, receiver_delays
+from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence

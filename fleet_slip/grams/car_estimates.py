@@ -20,13 +20,8 @@ from fleet_slip.catalog.calibration_parameters import (
     CalibrationParameterName,
 )
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.course import (
-    FEWEST_CHANGES,
-    LEAST_TURNED_RAD,
-    LEVERS_M,
-    TURNED,
-    turned_scale,
-)
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.quality.course_relation import FEWEST_CHANGES, LEAST_TURNED_RAD, LEVERS_M
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms

@@ -25,7 +25,6 @@ from fleet_slip.ingest.columns import (
     reads_clock,
 )
 from fleet_slip.ingest.profile import FileProfile, Profile, sample_rate_hz
-from fleet_slip.ingest.suspicion import RADIUS_M, TURNING, WHEELS
 from fleet_slip.ingest.vocabulary import (
     best_words,
     fits_any,
@@ -36,6 +35,7 @@ from fleet_slip.ingest.vocabulary import (
     unit_called,
     vocabulary,
 )
+from fleet_slip.quality.plausibility import RADIUS_M, TURNING, WHEELS
 
 _WEAK = 0.5
 """What a word that may mean something else counts against one that does not."""

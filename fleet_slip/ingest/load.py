@@ -22,7 +22,6 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.catalog.signals import SignalCatalog, as_arrow
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
@@ -48,7 +47,8 @@ from fleet_slip.ingest.recordings import (
     tables_of,
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
-from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, retry_conflicts
 from fleet_slip.warehouse.erasure_log import ErasureLog
@@ -328,7 +328,7 @@ def _judge_longest(
     drives = [(report, drive) for report, drive in results if drive is not None]
     if drives:
         report, drive = max(drives, key=lambda pair: pair[1].ticks.size)
-        report.suspicions += tuple(find_suspicions(signals, signals_of(signals, drive)))
+        report.suspicions += tuple(check_plausibility(signals, signals_of(signals, drive)))
 
 
 class _Writer:
@@ -458,13 +458,13 @@ MOST_TICKS = 200_000
 
 
 def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
-    """Return the signals of the beginning of a drive, as `find_suspicions` takes them."""
+    """Return the signals of the beginning of a drive, as `check_plausibility` takes them."""
     selected = drive.ticks - drive.ticks[0] < MOST_TICKS
     counts = {  # by Polars: Arrow's own would load pandas
         name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[selected]
         for name, values in drive.counts.items()
     }
-    return on_every_tick(signals, drive.ticks[selected], counts)
+    return to_regular_grid(signals, drive.ticks[selected], counts)
 
 
 # Data files of bounded size. Nothing is committed yet.

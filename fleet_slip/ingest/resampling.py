@@ -20,7 +20,7 @@ from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
-from fleet_slip.ingest.suspicion import RADIUS_M, SECOND, wrapped
+from fleet_slip.quality.plausibility import RADIUS_M, SECOND, wrapped
 
 # Which fixes of a satellite receiver show where the car goes, and at which ticks.
 

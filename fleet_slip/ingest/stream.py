@@ -19,7 +19,6 @@ import pyarrow as pa
 
 from fleet_slip.base import canonical_ascii, number_of, shown
 from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
@@ -38,6 +37,7 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
+from fleet_slip.quality.checks import Fault
 from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
 
 MAX_DRIVES = 10_000

@@ -30,8 +30,12 @@ from fleet_slip.models.manifest import (
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
-from fleet_slip.models.soundness import require_in_time, require_sound_course, require_sound_drives
 from fleet_slip.models.straight_on import StraightOn, straight_on
+from fleet_slip.models.training_checks import (
+    require_in_time,
+    require_sound_course,
+    require_sound_drives,
+)
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.warehouse.condition import parse_cohort, with_all_drives

@@ -16,7 +16,7 @@ from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, load_cohort
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
-from fleet_slip.models.label_quality import WithoutLabel, label_noise_deg, without_label
+from fleet_slip.models.label_noise import WithoutLabel, label_noise_deg, without_label
 from fleet_slip.models.request import (
     COURSE_FEATURES,
     COURSE_MODELS,

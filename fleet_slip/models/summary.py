@@ -15,7 +15,7 @@ from fleet_slip.warehouse.condition import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.grams.weights import Weighed
-    from fleet_slip.models.label_quality import WithoutLabel
+    from fleet_slip.models.label_noise import WithoutLabel
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 

@@ -21,7 +21,7 @@ from fleet_slip.errors import AlarmError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.operations.peers import thresholds
+from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.figures import error_sums, student_t_quantile
 from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram

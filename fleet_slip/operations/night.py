@@ -19,7 +19,7 @@ from fleet_slip.warehouse.condition import hash_drive
 
 if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality import SensorFault
+    from fleet_slip.operations.quality_report import SensorFault
 
 NIGHTS_FOLDER = "nights"
 """Of numbered documents, two of a night: its beginning and its end."""

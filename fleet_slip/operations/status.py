@@ -24,7 +24,7 @@ from fleet_slip.errors import (
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
-from fleet_slip.operations.peers import thresholds
+from fleet_slip.quality.peers import thresholds
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.documents import find_lost

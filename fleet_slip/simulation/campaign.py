@@ -23,8 +23,7 @@ from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import Configs
-from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
-from fleet_slip.simulation.plan import (
+from fleet_slip.simulation.drive_plans import (
     CarOnRoad,
     DriveDraw,
     FleetPlan,
@@ -33,6 +32,7 @@ from fleet_slip.simulation.plan import (
     TrialPlan,
     configs_of,
 )
+from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
 from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors

@@ -15,8 +15,8 @@ from fleet_slip.catalog.signals import Identifier, load_signals
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Batch, DriveSpec, PacePoint, load_base, merged
+from fleet_slip.simulation.drive_plans import NamedTrack, NamedVehicle, Traffic, configs_of
 from fleet_slip.simulation.imperfections import NONE, Imperfections, NotNegative, Positive
-from fleet_slip.simulation.plan import NamedTrack, NamedVehicle, Traffic, configs_of
 from fleet_slip.simulation.roads import SpeedLimits, Track
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters

@@ -23,7 +23,7 @@ from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.simulation.roads import LINE_STEP_M, SLOWEST_MPS, SpeedLimits, SpeedProfile
 
 if TYPE_CHECKING:
-    from fleet_slip.simulation.plan import Traffic
+    from fleet_slip.simulation.drive_plans import Traffic
 
 gymnasium.register_envs(highway_env)
 

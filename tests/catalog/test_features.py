@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.catalog.catalog import load_catalog
-from fleet_slip.catalog.course import CourseRelation, relate
 from fleet_slip.catalog.definitions import (
     EXCHANGED,
     OFFSETS,
@@ -37,6 +36,7 @@ from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.request import load_model_list
+from fleet_slip.quality.course_relation import CourseRelation, relate
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.table import AppTransaction, Change

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from fleet_slip.ingest.suspicion import find_suspicions
+from fleet_slip.quality.plausibility import check_plausibility
 from tests.support.cars import Signals, drive, speed_of, with_course
 from tests.support.catalog import SIGNALS
 from tests.support.measured import MeasuredLog, a_mapping, physical, read_columns, read_measured
@@ -160,14 +160,16 @@ def test_a_course_that_turns_the_other_way_is_suspicious() -> None:
     time = time_s()
     course = np.where(np.arange(ROWS) % FIX == 0, np.angle(velocity(time)), np.nan)
     signals = {"yaw_rate": 0.3 + 0.2 * np.sin(time / 2), "course": course}
-    assert not [s for s in find_suspicions(SIGNALS, signals) if "course" in s.signals]
+    assert not [s for s in check_plausibility(SIGNALS, signals) if "course" in s.signals]
     (turned,) = (
-        s for s in find_suspicions(SIGNALS, {**signals, "course": -course}) if s.kind == "reversed"
+        s
+        for s in check_plausibility(SIGNALS, {**signals, "course": -course})
+        if s.kind == "reversed"
     )
     assert turned.signals == ("course",) and "-1.0" in turned.figure
     strange = np.where(np.isnan(course), np.nan, np.sin(17 * time))
     (other,) = (
-        s for s in find_suspicions(SIGNALS, {**signals, "course": strange}) if s.kind == "values"
+        s for s in check_plausibility(SIGNALS, {**signals, "course": strange}) if s.kind == "values"
     )
     assert "hardly correlates with the yaw rate" in other.figure
 
@@ -228,7 +230,7 @@ def test_a_course_that_stands_still_while_the_car_turns_is_none(tmp_path: Path) 
         "satellite_speed": speed * 0.005,
         "yaw_rate": np.array(columns["r"]),
     }
-    (found,) = (s for s in find_suspicions(SIGNALS, signals) if "course" in s.signals)
+    (found,) = (s for s in check_plausibility(SIGNALS, signals) if "course" in s.signals)
     assert "80% of its fixes repeat the last" in found.figure
 
 
@@ -252,7 +254,7 @@ def suspected(change: Callable[[Signals], None], slip: float = 1.0) -> list[tupl
     signals = with_course(drive(rng, gentleness=2), rng, slip)
     change(signals)
     satellites = {"course", "satellite_speed"}
-    found = [s for s in find_suspicions(SIGNALS, signals) if satellites & set(s.signals)]
+    found = [s for s in check_plausibility(SIGNALS, signals) if satellites & set(s.signals)]
     return [(s.kind, s.remedy) for s in found]
 
 

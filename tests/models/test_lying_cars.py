@@ -58,7 +58,7 @@ def receive(fleet: fleet_slip.Fleet, path: Path, rows: Rows) -> None:
 
 
 def select(fleet: fleet_slip.Fleet) -> Selection:
-    return fleet.cohort(unexamined=True).select(model=INPUTS)
+    return fleet.cohort(include_faulty=True).select(model=INPUTS)
 
 
 def lie(gram: Gram, gain: int = 1, offset: int = 0, times: int = 1) -> Gram:

@@ -30,7 +30,7 @@ from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.job import simulate_batches
+from fleet_slip.simulation.simulate import simulate_batches
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from fleet_slip.storage.table import Change, Snapshot, Table

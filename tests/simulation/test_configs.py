@@ -14,7 +14,7 @@ import pytest
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.plan import DriveDraw, GridPlan
+from fleet_slip.simulation.drive_plans import DriveDraw, GridPlan
 from fleet_slip.simulation.roads import load_track, random_generator
 from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 from fleet_slip.vehicle.parameters import load_vehicle

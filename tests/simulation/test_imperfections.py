@@ -10,9 +10,9 @@ from pydantic import ValidationError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Range, RoadImperfections
-from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.roads import load_track, surface
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.simulate import simulate_logs
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.catalog import SIGNALS

@@ -16,8 +16,8 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import traffic
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.imperfections import Uniform
-from fleet_slip.simulation.job import simulate_batch, simulate_logs
 from fleet_slip.simulation.roads import SLOWEST_MPS
+from fleet_slip.simulation.simulate import simulate_batch, simulate_logs
 from fleet_slip.simulation.traffic import SITES, TrafficDrive
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run

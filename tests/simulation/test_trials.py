@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.test_drives import blind_scenarios
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.simulation import job as simulate
+from fleet_slip.simulation import simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
-from fleet_slip.simulation.job import DriveLog, simulate_batch, simulate_logs, tabulate
-from fleet_slip.simulation.plan import TrialPlan
+from fleet_slip.simulation.drive_plans import TrialPlan
 from fleet_slip.simulation.roads import CLASSES, SLOWEST_MPS, Manoeuvre, load_track, road_with
 from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.simulation.simulate import DriveLog, simulate_batch, simulate_logs, tabulate
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from fleet_slip.vehicle.parameters import load_vehicle

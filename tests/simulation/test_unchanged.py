@@ -14,8 +14,8 @@ import pytest
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.job import simulate_batch
 from fleet_slip.simulation.scenario import load_scenario
+from fleet_slip.simulation.simulate import simulate_batch
 from tests.support.catalog import SIGNALS
 
 CAMPAIGNS = {

@@ -9,7 +9,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, LabelledDrive, loaded_axles
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.job import simulate_batch
+from fleet_slip.simulation.simulate import simulate_batch
 from fleet_slip.vehicle.parameters import VehicleParameters
 from tests.support.catalog import SIGNALS
 

@@ -14,8 +14,8 @@ from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.evaluation.scenario_evaluation import evaluate_blind_drives
 from fleet_slip.evaluation.test_drives import TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.simulation.job import simulate_logs
 from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.simulation.simulate import simulate_logs
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.reported import answer
 

@@ -9,11 +9,11 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.errors import DataError, RefusedError, UnexaminedError
-from fleet_slip.models import soundness
+from fleet_slip.errors import DataError, NotScreenedError, RefusedError
+from fleet_slip.models import training_checks
 from fleet_slip.models.acceptance import load_floor
-from fleet_slip.operations import examined, quality
-from fleet_slip.operations.quality import QualityReport
+from fleet_slip.operations import quality_report, sensor_screen
+from fleet_slip.operations.quality_report import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.warehouse.condition import (
     Condition,
@@ -63,14 +63,14 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     def examine_again(*_: object) -> None:
         raise AssertionError("examined again")
 
-    monkeypatch.setattr(examined, "examine_drives", examine_again)
+    monkeypatch.setattr(sensor_screen, "examine_drives", examine_again)
     assert fleet.cohort().examine() == found
     monkeypatch.undo()
     told = run_command("select", "--models", "table1")
     assert told.exit_code == 0
     assert "2 drives of 6 left out: faulty sensors (2 stuck ay)" in told.stderr
     assert "4 drives" in told.stdout
-    assert "6 drives" in run_command("select", "--models", "table1", "--unexamined").stdout
+    assert "6 drives" in run_command("select", "--models", "table1", "--include-faulty").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
     assert fleet.model("m").manifest.trained_on.drives == 4
     by_hand = fleet.cohort().select(models="table1")
@@ -78,7 +78,10 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     assert fleet.publish("m", by_hand).reason == "The champion is the same model."
     scored = run_command("score", "m")
     assert "2 drives of 6 left out: faulty sensors (2 stuck ay)" in scored.stderr
-    assert (fleet.score("m").drives, fleet.score("m", unexamined=True).drives_left_out) == (4, 4)
+    assert (fleet.score("m").drives, fleet.score("m", include_faulty=True).drives_left_out) == (
+        4,
+        4,
+    )
 
 
 def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
@@ -153,7 +156,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
     ):
         strict = load_floor(SHIPPED_CONFIGS).model_copy(update={name: bound})
-        monkeypatch.setattr(soundness, "load_floor", lambda _, strict=strict: strict)
+        monkeypatch.setattr(training_checks, "load_floor", lambda _, strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
             fleet.publish("m", asked)
         dry = fleet.would_publish("m", asked)
@@ -161,7 +164,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         assert fleet.would_publish("m", asked, candidate=True).candidate
         said = run_command(*command)
         assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
-        monkeypatch.setattr(soundness, "load_floor", load_floor)
+        monkeypatch.setattr(training_checks, "load_floor", load_floor)
     assert not fleet.models().num_rows
     assert "m would be published. " in run_command(*command).stderr
     assert fleet.publish("m", asked).new
@@ -173,7 +176,7 @@ def test_a_champion_of_more_columns_needs_drives_for_them_too(
     cohort = fleet.cohort("day = DATE '2026-10-05'")
     assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
     strict = load_floor(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
-    monkeypatch.setattr(soundness, "load_floor", lambda _: strict)
+    monkeypatch.setattr(training_checks, "load_floor", lambda _: strict)
     with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
         fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
     assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused
@@ -194,14 +197,14 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
     landed: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    real = quality.examine_drives
+    real = quality_report.examine_drives
 
     def counted(warehouse: Warehouse, condition: Condition) -> QualityReport:
         asked.append(condition.text)
         return real(warehouse, condition)
 
-    monkeypatch.setattr(examined, "examine_drives", counted)
-    monkeypatch.setattr(examined, "PIECE", 4)
+    monkeypatch.setattr(sensor_screen, "examine_drives", counted)
+    monkeypatch.setattr(sensor_screen, "PIECE", 4)
     found = fleet.cohort().examine()
     assert (found.drives, found.faults, len(asked)) == (6, {"stuck ay": 2}, 2)
     landing = Landing(landed / "landing", landed)
@@ -217,14 +220,14 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
-    monkeypatch.setattr(examined, "PIECE", 150)
+    monkeypatch.setattr(sensor_screen, "PIECE", 150)
     fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
 
     def ask(warehouse: Warehouse, condition: Condition) -> QualityReport:
         asked.append(condition.sql)
         return QualityReport(0, 0, ())
 
-    monkeypatch.setattr(examined, "examine_drives", ask)
+    monkeypatch.setattr(sensor_screen, "examine_drives", ask)
     for day in range(3):
         path = tmp_path / f"day-{day}"
         write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
@@ -242,14 +245,14 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
     """As after `gram --features`, where the rows that are examined may not be there."""
     shutil.rmtree(Path(str(fleet.root)) / "grams")
     fleet.gram("calibration")
-    told = str(examined.leave_out_faulty(fleet.warehouse, TRAINING_DRIVES))
+    told = str(sensor_screen.screen_computed_drives(fleet.warehouse, TRAINING_DRIVES))
     assert (
         told.startswith("6 measured drives not checked for faulty sensors: ")
         and "Run: fleet-slip gram" in told
     )
     with monkeypatch.context() as patch:
-        patch.setattr(examined, "READ_ON_THE_WAY", 100)
-        with pytest.raises(UnexaminedError, match=r"6 measured drives .* --unexamined"):
+        patch.setattr(sensor_screen, "READ_ON_THE_WAY", 100)
+        with pytest.raises(NotScreenedError, match=r"6 measured drives .* --include-faulty"):
             fleet.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr

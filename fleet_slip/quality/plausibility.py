@@ -14,21 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalog.course import (
-    COURSE,
-    LARGEST_RAD,
-    SATELLITE_SPEED,
-    CourseRelation,
-    relate,
-)
-from fleet_slip.catalog.faults import (
-    WITNESSES,
-    Fault,
-    MeanMoments,
-    axes_swapped,
-    find_reversed_or_swapped,
-)
+from fleet_slip.catalog.course import COURSE, LARGEST_RAD, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.course_relation import CourseRelation, relate
+from fleet_slip.quality.moments import MeanMoments
+from fleet_slip.quality.turning import WITNESSES, axes_swapped, find_reversed_or_swapped
 
 # How signals of a drive go with one another: slopes and fits.
 
@@ -202,7 +193,7 @@ _SOUND_RATIOS = {
 _FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
 
 
-def on_every_tick(
+def to_regular_grid(
     catalog: SignalCatalog, ticks: NDArray[np.int32], counts: Mapping[str, FloatArray]
 ) -> Signals:
     """Return counts at some ticks, NaN for none, in SI units on all ticks from the first."""
@@ -213,7 +204,7 @@ def on_every_tick(
     return signals
 
 
-def find_suspicions(catalog: SignalCatalog, signals: Signals) -> list[Fault]:
+def check_plausibility(catalog: SignalCatalog, signals: Signals) -> list[Fault]:
     """Return what looks wrong in the signals of one drive; little data raises few suspicions."""
     faults = list(_still(catalog, signals))
     usual = _without(signals, faults)

@@ -15,9 +15,10 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.drive_sources import RECEIVED
-from fleet_slip.catalog.faults import DriveBatches, Fault
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.operations.peers import MAD_TO_STD, QualityThresholds, solve
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.moments import DriveBatches
+from fleet_slip.quality.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import open_scratch

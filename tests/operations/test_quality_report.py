@@ -11,14 +11,19 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.job import update_grams
-from fleet_slip.operations import quality
-from fleet_slip.operations.labels import find_repeated
-from fleet_slip.operations.peers import thresholds
-from fleet_slip.operations.quality import QualityReport, examine, examine_drives, find_wrong_labels
+from fleet_slip.operations import quality_report
+from fleet_slip.operations.quality_report import (
+    QualityReport,
+    examine,
+    examine_drives,
+    find_wrong_labels,
+)
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.label_consistency import find_repeated
+from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.warehouse.condition import parse_condition
@@ -173,7 +178,7 @@ def test_drives_in_order_raise_no_alarm() -> None:
 def choose_limits(monkeypatch: pytest.MonkeyPatch, **changes: int) -> None:
     limits = thresholds(SHIPPED_CONFIGS).quality.model_copy(update=changes)
     chosen = thresholds(SHIPPED_CONFIGS).model_copy(update={"quality": limits})
-    monkeypatch.setattr(quality, "thresholds", lambda _: chosen)
+    monkeypatch.setattr(quality_report, "thresholds", lambda _: chosen)
 
 
 def test_vehicle_models_are_examined_one_after_the_other(

@@ -12,18 +12,18 @@ import pyarrow as pa
 
 from fleet_slip.base import number_of
 from fleet_slip.catalog.calibration_parameters import DELAY
-from fleet_slip.catalog.course import relate
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.reader import GramReader, open_grams
 from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.ingest.suspicion import Signals, find_suspicions, on_every_tick
 from fleet_slip.models.acceptance import find_lacks, load_floor
 from fleet_slip.models.manifest import Manifest, TrainedDrives
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.course_relation import relate
+from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
 from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
@@ -97,7 +97,7 @@ def _look(
                 f"LIMIT {MOST_TICKS}",
                 {"day": day, "drive": drive},
             ).fetchnumpy()
-            for one in find_suspicions(signals, _signals(signals, columns)):
+            for one in check_plausibility(signals, _signals(signals, columns)):
                 if one.does_harm:
                     found.setdefault((one.kind, one.signals), []).append(one)
     return found, len(chosen), measured
@@ -111,7 +111,7 @@ def _signals(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
         if name in columns
     }
     some = {name: values for name, values in counts.items() if np.isfinite(values).any()}
-    return on_every_tick(signals, np.asarray(columns["tick"], dtype=np.int32), some)
+    return to_regular_grid(signals, np.asarray(columns["tick"], dtype=np.int32), some)
 
 
 # A course that is late looks like a side-slip angle, in all figures, and so does a heading.

@@ -18,15 +18,15 @@ from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, number_of, sha256_of
 from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
-from fleet_slip.errors import DataError, NotComputedError, UnexaminedError
+from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
 from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.grams.job import ensure_grams
 from fleet_slip.grams.reader import GramReader
-from fleet_slip.operations.peers import thresholds
-from fleet_slip.operations.quality import SensorFault, examine_drives
+from fleet_slip.operations.quality_report import SensorFault, examine_drives
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.peers import thresholds
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.condition import (
@@ -61,7 +61,7 @@ CHECK_ROWS = 20_000_000
 
 
 @dataclass(frozen=True)
-class Examined:
+class SensorScreen:
     """What was found.
 
     Attributes:
@@ -98,7 +98,7 @@ class Examined:
             out = number_of(len(self.found), "drive")
             said.append(
                 f"{out} of {self.drives:,} left out: faulty sensors ({self._faults_text}). See: "
-                "fleet-slip quality. To use them anyway: --unexamined"
+                "fleet-slip quality. To use them anyway: --include-faulty"
             )
         return " ".join([*said, self.lacking]).strip()
 
@@ -121,7 +121,7 @@ class Examined:
             raise DataError(
                 f"All {number_of(self.drives, 'drive')} have faulty sensors "
                 f"({self._faults_text}); none left to train on. See: fleet-slip quality. To use "
-                "them anyway: --unexamined"
+                "them anyway: --include-faulty"
             ) from None
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
@@ -152,7 +152,7 @@ class _Piece(NamedTuple):
         return parse_condition(signals, days)
 
 
-def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
+def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     """Examine the drives of a cohort like `quality`; return it without the faulty ones.
 
     Drives without Gram rows of `signals` are not examined, and counted. Of a condition on rows all
@@ -184,20 +184,20 @@ def leave_out_faulty(warehouse: Warehouse, cohort: str) -> Examined:
     }
     kept_cohort = without_drives(cohort, NAME, found)
     examined = sum(one["examined"] for one in parts)
-    return Examined(kept_cohort, examined, found, missing)
+    return SensorScreen(kept_cohort, examined, found, missing)
 
 
-def find_trainable(warehouse: Warehouse, cohort: str) -> Examined:
-    """Return a cohort like `leave_out_faulty`, with Gram rows made first if these are missing.
+def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
+    """Screen a cohort like `screen_computed_drives`; compute missing Gram rows first.
 
-    Raises `UnexaminedError` if that takes more than seconds.
+    Raises `NotScreenedError` if that takes more than seconds.
     """
-    examined = leave_out_faulty(warehouse, cohort)
+    examined = screen_computed_drives(warehouse, cohort)
     if examined.missing:
         ensure_grams(warehouse, PLAIN, reason="the sensor check needs them", max_rows=CHECK_ROWS)
-        examined = leave_out_faulty(warehouse, cohort)
+        examined = screen_computed_drives(warehouse, cohort)
     if examined.missing:
-        raise UnexaminedError(f"{examined.lacking}, or use them unchecked: --unexamined")
+        raise NotScreenedError(f"{examined.lacking}, or use them unchecked: --include-faulty")
     return examined
 
 

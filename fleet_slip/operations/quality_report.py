@@ -11,17 +11,19 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, number_of
-from fleet_slip.catalog.course import relate
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.catalog.faults import DriveBatches, Fault, find_implausible
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.recordings import Origin
-from fleet_slip.operations.labels import find_odd_days, find_repeated, find_reversed_labels
-from fleet_slip.operations.peers import QualityThresholds, settle, thresholds
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.course_relation import relate
+from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
+from fleet_slip.quality.moments import DriveBatches
+from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
+from fleet_slip.quality.turning import find_implausible
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.condition import Condition, parse_cohort, parse_condition

@@ -13,7 +13,7 @@ from fleet_slip.base import no_progress
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
-from fleet_slip.simulation.job import SimulationReport, simulate_batches, simulate_campaign
+from fleet_slip.simulation.simulate import SimulationReport, simulate_batches, simulate_campaign
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.highway import FourWheelVehicle

@@ -12,10 +12,10 @@ import pytest
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.faults import Fault
 from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.stream import find_refusals, open_measured
-from fleet_slip.ingest.suspicion import RADIUS_M, WHEELS, find_one_sided, find_suspicions
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.plausibility import RADIUS_M, WHEELS, check_plausibility, find_one_sided
 from tests.support.catalog import SIGNALS
 from tests.support.commands import run_on
 from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
@@ -27,7 +27,7 @@ SIGNED = ("ax", "ay", "yaw_rate", "steering_wheel", "sideslip")
 
 
 def kinds(car: Car) -> set[tuple[str, tuple[str, ...]]]:
-    return {(one.kind, one.signals) for one in find_suspicions(SIGNALS, car)}
+    return {(one.kind, one.signals) for one in check_plausibility(SIGNALS, car)}
 
 
 @pytest.mark.parametrize("least_mps", [2.5, 8.0, 20.0])
@@ -88,7 +88,7 @@ def test_tyres_at_their_limit_tell_nothing_of_the_labels_sign() -> None:
 def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
     car, wheels = a_car(), [("wheel_fl", "wheel_fr"), ("wheel_rl", "wheel_rr")]
     exchanged = {a: car[b] for pair in wheels for a, b in (pair, pair[::-1])}
-    found = find_suspicions(SIGNALS, {**car, **exchanged})
+    found = check_plausibility(SIGNALS, {**car, **exchanged})
     assert {(one.kind, one.signals) for one in found} == {("swapped", pair) for pair in wheels}
     assert "SAE J670" in found[0].remedy
     few = {**car, "ay": -car["ay"], "yaw_rate": -car["yaw_rate"]}
@@ -108,7 +108,9 @@ def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
 def test_a_unit_that_lies(name: str, factor: float, hint: str) -> None:
     car = a_car()
     found = [
-        s for s in find_suspicions(SIGNALS, {**car, name: factor * car[name]}) if s.kind == "scaled"
+        s
+        for s in check_plausibility(SIGNALS, {**car, name: factor * car[name]})
+        if s.kind == "scaled"
     ]
     assert any(name in one.signals and hint in one.figure for one in found)
 
@@ -264,10 +266,12 @@ def test_a_magnitude_without_its_sign_is_told() -> None:
     car = a_car() | {"yaw_rate": np.abs(a_car()["yaw_rate"])}
     long = {name: np.tile(values, 2) for name, values in car.items()}
     found = {
-        one.signals: one.figure for one in find_suspicions(SIGNALS, long) if one.kind == "magnitude"
+        one.signals: one.figure
+        for one in check_plausibility(SIGNALS, long)
+        if one.kind == "magnitude"
     }
     assert found == {("yaw_rate",): "it is never negative in 2 min"}
-    assert not [one for one in find_suspicions(SIGNALS, a_car()) if one.kind == "magnitude"]
+    assert not [one for one in check_plausibility(SIGNALS, a_car()) if one.kind == "magnitude"]
 
 
 def test_a_car_on_an_oval_has_its_sign() -> None:

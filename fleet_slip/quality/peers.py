@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalog.faults import DriveBatches, Fault, MeanMoments
 from fleet_slip.config import Config, load_config
+from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.moments import DriveBatches, MeanMoments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import Configs
 
