@@ -36,13 +36,13 @@ def median_ms(function: Callable[[], Any]) -> float:
     return 1e3 * statistics.median(durations(function, ROUNDS))
 
 
-def main(root: str, condition: str) -> None:
+def main(root: str, predicate: str) -> None:
     warehouse = Warehouse(LocalFolder(Path(root)))
     label = SIGNALS.label
-    cohort = load_cohort(warehouse, condition)
+    cohort = load_cohort(warehouse, predicate)
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:
-        sums = load_cohort(source, condition, folding=FOLDS).folds("drive", FOLDS.count)
+        sums = load_cohort(source, predicate, folding=FOLDS).folds("drive", FOLDS.count)
         fit(sums.serving(INPUTS, label).total, INPUTS, label)
 
     with GramReader(warehouse) as reader:
@@ -52,7 +52,7 @@ def main(root: str, condition: str) -> None:
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
         "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(lambda: answer_request(warehouse, TABLE, condition)),
+        "select_ms": median_ms(lambda: answer_request(warehouse, TABLE, predicate)),
     }
     print(json.dumps(figures))
 

@@ -1,4 +1,4 @@
--- The Gram rows of a cohort, in any order. The condition may use any column of the view "drives".
+-- The Gram rows of a cohort, in any order. The predicate may use any column of the view "drives".
 -- Rows without any signal serve no model. A hash is the first 8 bytes of the SHA-256 of a name.
 SELECT
     drive_id, vehicle_id, vehicle_model, {receiver}, source, campaign, track, mass_kg, adhesion, speed_factor, saturated,
@@ -12,5 +12,5 @@ LEFT JOIN (
 {trips}
 ) AS trips USING (drive_id)
 WHERE feature_set = '{feature_set}' AND signals <> '' AND (
-    {condition}
+    {predicate}
 )

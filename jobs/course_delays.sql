@@ -5,7 +5,7 @@ SELECT
     max(coalesce(course_late, 0)) AS largest
 FROM grams
 WHERE feature_set = '{feature_set}' AND list_contains(string_split(signals, ','), '{turned}') AND (
-    {condition}
+    {predicate}
 )
 GROUP BY vehicle_id
 ORDER BY vehicle_id

@@ -1,9 +1,9 @@
 -- All rows, in the order of time, of the drives that have a row of a cohort, and which rows are of it. What looks back
--- needs the rows before, too. The condition may use the columns of the views "log" and "log_counts".
+-- needs the rows before, too. The predicate may use the columns of the views "log" and "log_counts".
 WITH counted AS (
     SELECT
         *,
-        coalesce(({condition}), false) AS chosen
+        coalesce(({predicate}), false) AS chosen
     FROM {rows}
 )
 

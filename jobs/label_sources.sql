@@ -5,7 +5,7 @@ SELECT
     sum(n)::BIGINT AS n
 FROM grams
 WHERE feature_set = '{feature_set}' AND list_contains(string_split(signals, ','), '{label}') AND (
-    {condition}
+    {predicate}
 )
 GROUP BY source, campaign
 ORDER BY source, campaign

@@ -161,7 +161,7 @@ def draw_sample(
     stride = max(1, cohort.rows // rows)
     parts: list[FloatArray] = []
     names: list[str] = []
-    files = cohort_files(warehouse, cohort.condition)
+    files = cohort_files(warehouse, cohort.predicate)
     for file in (one for one in warehouse.logs.snapshot().files if one.path in files):
         for drive in read_drives(warehouse, file, plan):
             name = str(drive.facts["drive_id"])
@@ -174,7 +174,7 @@ def draw_sample(
             names.extend([name] * len(parts[-1]))
     if not names:
         raise DataError(
-            f"no row of {cohort.condition.text!r} has all of {', '.join(with_label.names)}."
+            f"no row of {cohort.predicate.text!r} has all of {', '.join(with_label.names)}."
         )
     order = np.argsort(np.array(names), kind="stable")
     found = np.concatenate(parts)[order]

@@ -196,7 +196,7 @@ def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
 
 # What is said of parameters of several methods; with a `Doc` they are options of commands, too.
 
-COHORT = Doc("SQL condition on the view drives, such as \"track = 'waterford_hills'\".")
+COHORT = Doc("SQL predicate on the view drives, such as \"track = 'waterford_hills'\".")
 UNEXAMINED = Doc("Use drives with faulty sensors, too. By default they are left out.")
 MODEL = Doc(
     "NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. Default: "
@@ -233,7 +233,7 @@ class NightRequest:
     ]
     name: Annotated[str, Doc("Name of the model.")]
     _: KW_ONLY
-    cohort: Annotated[str, Doc("SQL condition on the view drives: which drives train it.")] = (
+    cohort: Annotated[str, Doc("SQL predicate on the view drives: which drives train it.")] = (
         TRAINING_DRIVES
     )
     models: Annotated[str, MODELS] = DEFAULT_MODELS

@@ -1,4 +1,4 @@
-"""Drives that satisfy a condition, and what Gram rows tell of them."""
+"""Drives that satisfy a predicate, and what Gram rows tell of them."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Unpack
@@ -40,20 +40,20 @@ WINDOW_ROWS = 4_000_000
 
 
 class FleetCohort(Rooted):
-    """The drives that satisfy an SQL condition on the view `drives`; `Fleet.cohort` makes one.
+    """The drives that satisfy an SQL predicate on the view `drives`; `Fleet.cohort` makes one.
 
     Each call reads the Gram rows of the newest commits, and raises `QuestionError` for an invalid
-    condition, feature set or input, `DataError` without drives or Gram rows (see `Fleet.gram`), and
+    predicate, feature set or input, `DataError` without drives or Gram rows (see `Fleet.gram`), and
     `RefusedError` for drives of evaluation scenarios.
     """
 
-    def __init__(self, warehouse: Warehouse, condition: str, include_faulty: bool = False) -> None:
+    def __init__(self, warehouse: Warehouse, predicate: str, include_faulty: bool = False) -> None:
         super().__init__(warehouse)
-        self.condition = condition
+        self.predicate = predicate
         self.include_faulty = include_faulty
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.root)!r}, {self.condition!r})"
+        return f"{type(self).__name__}({str(self.root)!r}, {self.predicate!r})"
 
     def examine(self) -> "SensorScreen":
         """Return the drives that may train a model; raises as `Fleet.quality`.
@@ -65,8 +65,8 @@ class FleetCohort(Rooted):
         from fleet_slip.operations.sensor_screen import SensorScreen, screen_drives
 
         if self.include_faulty:
-            return SensorScreen(self.condition)
-        return screen_drives(self.warehouse, self.condition)
+            return SensorScreen(self.predicate)
+        return screen_drives(self.warehouse, self.predicate)
 
     @takes(SelectionRequest)
     def select(self, request: SelectionRequest) -> "Selection":
@@ -84,7 +84,7 @@ class FleetCohort(Rooted):
 
         examined = self.examine()
         with examined.explaining():
-            request = with_line_fitted(self.warehouse, request, self.condition, examined.cohort)
+            request = with_line_fitted(self.warehouse, request, self.predicate, examined.cohort)
             plan = SelectionPlan.of(self.warehouse.catalog, request)
             if plan.request.models == DEFAULT_MODELS:
                 ensure_grams(
@@ -144,7 +144,7 @@ class FleetCohort(Rooted):
     def _load(self, feature_set: str) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort
 
-        return load_cohort(self.warehouse, self.condition, feature_set)
+        return load_cohort(self.warehouse, self.predicate, feature_set)
 
     def _opened(
         self, model: str | ModelVersion | None, signals: str | None, features: str | None

@@ -106,12 +106,12 @@ class Fleet(HealthAndUpkeep):
 
     def cohort(
         self,
-        condition: Annotated[str, COHORT] = TRAINING_DRIVES,
+        predicate: Annotated[str, COHORT] = TRAINING_DRIVES,
         *,
         include_faulty: Annotated[bool, UNEXAMINED] = False,
     ) -> FleetCohort:
-        """Return the drives of an SQL condition, by default all but evaluation scenarios."""
-        return FleetCohort(self.warehouse, condition, include_faulty)
+        """Return the drives of an SQL predicate, by default all but evaluation scenarios."""
+        return FleetCohort(self.warehouse, predicate, include_faulty)
 
     # Logs, and Gram rows made of them. Whatever was done is not done again.
 
@@ -252,7 +252,7 @@ class Fleet(HealthAndUpkeep):
         cohort: Annotated[
             str | None,
             Doc(
-                "Read only the log files that have a drive of this cohort, an SQL condition on the "
+                "Read only the log files that have a drive of this cohort, an SQL predicate on the "
                 "view drives. Default: all."
             ),
         ] = None,
@@ -267,12 +267,12 @@ class Fleet(HealthAndUpkeep):
         """
         from fleet_slip.grams.job import update_grams
         from fleet_slip.grams.reader import cohort_files
-        from fleet_slip.warehouse.condition import parse_cohort
+        from fleet_slip.warehouse.predicate import parse_cohort
 
         among = None
         if cohort:
-            condition = parse_cohort(self.warehouse.catalog.signals, cohort)
-            among = cohort_files(self.warehouse, condition)
+            predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
+            among = cohort_files(self.warehouse, predicate)
         with open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
                 within_reach(self.warehouse, executor),
@@ -340,7 +340,7 @@ class Fleet(HealthAndUpkeep):
             chosen = load_campaign(chosen, self.warehouse.configs)
         model_name = require_model_name(name or chosen.name)
         parse_worth(worth)  # before anything is written
-        condition = f"campaign = '{chosen.name}'"
+        predicate = f"campaign = '{chosen.name}'"
         with self._alone("run", chosen.name):
             with open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
@@ -350,7 +350,7 @@ class Fleet(HealthAndUpkeep):
                     workers=executor,
                     progress=of_step(progress, f"simulate {chosen.name}"),
                 )
-                training = Training(model_name, condition, models, worth)
+                training = Training(model_name, predicate, models, worth)
                 grams = training.gram(self, executor, progress)
             selection, publication, refusal = training.publish(self, replace_marked=True)
         return RunReport(

@@ -128,10 +128,10 @@ class PublishedModels(Rooted):
         require_model_name(name)
         if choice is not None and not isinstance(choice, FleetCohort):
             return choice
-        condition, include_faulty = (
-            (choice.condition, choice.include_faulty) if choice else (None, False)
+        predicate, include_faulty = (
+            (choice.predicate, choice.include_faulty) if choice else (None, False)
         )
-        recipe = recipe_for(self.registry(), name, SelectionRequest(), condition)
+        recipe = recipe_for(self.registry(), name, SelectionRequest(), predicate)
         cohort = FleetCohort(self.warehouse, recipe.cohort, include_faulty)
         return cohort.select(**vars(recipe.request))
 
@@ -259,7 +259,7 @@ class JudgedModels(PublishedModels):
         cohort: Annotated[
             str | None,
             Doc(
-                "SQL condition on the view drives. Default: what the model was not trained on, or "
+                "SQL predicate on the view drives. Default: what the model was not trained on, or "
                 "all if there is nothing else."
             ),
         ] = None,
@@ -270,7 +270,7 @@ class JudgedModels(PublishedModels):
 
         By default on all drives that it was not trained on, or all if there are no others. Drives
         that may train no model are left out as in `FleetCohort.select`. Raises `DataError` if no
-        row has the model's signals, `QuestionError` for an invalid condition, and what `model`
+        row has the model's signals, `QuestionError` for an invalid predicate, and what `model`
         raises.
         """
         from fleet_slip.models.score import cohort_of_rows, find_seen, score

@@ -16,7 +16,7 @@ from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
 from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
 from fleet_slip.storage.runs import step
-from fleet_slip.warehouse.condition import hash_drive
+from fleet_slip.warehouse.predicate import hash_drive
 from fleet_slip.warehouse.tables import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:

@@ -80,7 +80,7 @@ class HealthAndUpkeep(JudgedModels):
     def quality(
         self,
         cohort: Annotated[
-            str, Doc("SQL condition on the view drives: which drives to examine together.")
+            str, Doc("SQL predicate on the view drives: which drives to examine together.")
         ] = TRAINING_DRIVES,
     ) -> "QualityReport":
         """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors by drive.
@@ -97,20 +97,20 @@ class HealthAndUpkeep(JudgedModels):
 
         Offsets of gyroscope, accelerometer and steering with uncertainties, label or not, from the
         Gram rows of `calibration`. Raises `DataError` without these or without drives,
-        and `QuestionError` for an invalid condition.
+        and `QuestionError` for an invalid predicate.
         """
         from fleet_slip.grams.calibration import calibrate
-        from fleet_slip.warehouse.condition import parse_cohort
+        from fleet_slip.warehouse.predicate import parse_cohort
 
-        condition = parse_cohort(self.warehouse.catalog.signals, cohort)
-        return calibrate(self.warehouse, condition, receivers=True)
+        predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
+        return calibrate(self.warehouse, predicate, receivers=True)
 
     def monitor(
         self,
         model: Annotated["str | ModelVersion | None", MODEL] = None,
         cohort: Annotated[
             str | None,
-            Doc("SQL condition on the view drives. Default: the condition of its training."),
+            Doc("SQL predicate on the view drives. Default: the predicate of its training."),
         ] = None,
         *,
         since: Annotated[

@@ -56,7 +56,7 @@ def evaluate(
     cohort: Annotated[
         str | None,
         typer.Option(
-            help="Evaluate on measured drives with a label instead: SQL condition on the view "
+            help="Evaluate on measured drives with a label instead: SQL predicate on the view "
             "drives. What is fitted or tuned never saw the drives, or the part of one, that it is "
             "judged by.",
             show_default=False,
@@ -203,7 +203,7 @@ SCREEN = ("include_faulty",)
 
 
 @command(
-    Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SCREEN, echo=["condition"]
+    Fleet.cohort, FleetCohort.diagnose, arguments=["model"], without=SCREEN, echo=["predicate"]
 )
 def diagnose() -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.

@@ -30,7 +30,7 @@ from fleet_slip.storage.runs import step
     Fleet.cohort,
     FleetCohort.select,
     arguments=["name"],
-    without=["condition"],
+    without=["predicate"],
 )
 def publish(
     fleet: Fleet,
@@ -41,7 +41,7 @@ def publish(
     cohort: Annotated[
         str | None,
         typer.Option(
-            help="SQL condition on the view drives. Default: that of the model's champion; all "
+            help="SQL predicate on the view drives. Default: that of the model's champion; all "
             "drives, of a new model."
         ),
     ] = None,
@@ -176,7 +176,7 @@ def _root_option(fleet: Fleet) -> str:
 
 
 def _faster_half(fleet: Fleet, campaign: str) -> str | None:
-    """Return a condition that about half of the campaign's drives satisfy; None if none is told."""
+    """Return a predicate that about half of the campaign's drives satisfy; None if none is told."""
     medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
     speed = dict(medians).get(campaign)
     return None if speed is None else f"speed_factor > {speed:.2f}"

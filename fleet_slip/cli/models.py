@@ -13,7 +13,7 @@ from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.rendering import Part, TextTable
-from fleet_slip.warehouse.condition import describe_cohort
+from fleet_slip.warehouse.predicate import describe_cohort
 
 
 @command()

@@ -27,7 +27,7 @@ DETAILS: dict[str, dict[str, Any]] = {
 """What options need on the command line beside what is said of them in the API."""
 
 NAMES = {
-    "condition": "--cohort",
+    "predicate": "--cohort",
     "everything": "--all",
     "front_drive_share": "--front-drive",
     "rolling_radius_m": "--radius",

@@ -103,7 +103,7 @@ class TrainedModels:
         common = {
             "kind": "regression",
             "group": version.reference,
-            "cohort": self.selection.cohort.condition.text,
+            "cohort": self.selection.cohort.predicate.text,
             "drives": self.selection.cohort.drives.num_rows,
             "rows": self.selection.cohort.rows,
         }

@@ -56,7 +56,7 @@ from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.warehouse.condition import Condition, parse_condition
+from fleet_slip.warehouse.predicate import Predicate, parse_predicate
 from fleet_slip.warehouse.tables import Warehouse
 
 # What the roads of a fleet have in common: they lean to one side, and are banked in bends.
@@ -503,17 +503,17 @@ class Calibration(Answer):
         }
 
 
-def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
+def calibration_of(opened: OpenedGrams, predicate: Predicate) -> Calibration:
     """Return the numbers that Gram rows of `calibration` determine of every car of a cohort.
 
     With those of the sets that satellites determine more by, as far as there are any.
     """
-    sums = collect_sums(opened.batches(condition), KINDS, lacking=LACKING)
+    sums = collect_sums(opened.batches(predicate), KINDS, lacking=LACKING)
     catalog = opened.catalog
     for name, kinds in kinds_by_set(catalog.signals.label).items():
         if name in catalog.sets:
             satellite = replace(opened, identity=catalog.identity(name))
-            sums |= collect_sums(satellite.batches(condition), kinds)
+            sums |= collect_sums(satellite.batches(predicate), kinds)
     evidence = CarEvidence(catalog, sums)
     cars: dict[str, dict[CalibrationParameterName, CalibratedNumber]] = {}
     missing: dict[str, dict[CalibrationParameterName, str]] = {}
@@ -526,27 +526,27 @@ def calibration_of(opened: OpenedGrams, condition: Condition) -> Calibration:
 
 def calibrate(
     source: Warehouse | GramReader,
-    condition: str | Condition = ALL_DRIVES,
+    predicate: str | Predicate = ALL_DRIVES,
     *,
     receivers: bool = False,
 ) -> Calibration:
     """Return the numbers of every car that has drives of a cohort, from their Gram rows.
 
     Drives without a label count as others do; `receivers` asks how late these are, too. Raises
-    `QuestionError` for an invalid condition, and `DataError` if no drive satisfies it or the Gram
+    `QuestionError` for an invalid predicate, and `DataError` if no drive satisfies it or the Gram
     rows of `calibration` are missing.
     """
     catalog = source.catalog
-    condition = parse_condition(catalog.signals, condition)
-    with open_grams(source, CALIBRATION, condition) as opened:
-        calibration = calibration_of(opened, condition)
+    predicate = parse_predicate(catalog.signals, predicate)
+    with open_grams(source, CALIBRATION, predicate) as opened:
+        calibration = calibration_of(opened, predicate)
         if receivers and DELAY in catalog.sets:
             delays = receiver_delays(
-                replace(opened, identity=catalog.identity(DELAY)).batches(condition)
+                replace(opened, identity=catalog.identity(DELAY)).batches(predicate)
             )
             calibration = replace(calibration, receivers=delays)
     if not calibration.cars:
-        of = "" if condition.text == ALL_DRIVES else f" of {condition.shown}"
+        of = "" if predicate.text == ALL_DRIVES else f" of {predicate.quoted}"
         raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
     return calibration
 
@@ -557,7 +557,7 @@ Moments = Mapping[str, Mapping[str, FloatArray]]
 """Sums of products of 1, `COLUMNS` and the label in SI units, by car and drive, shape (6, 6)."""
 
 
-def course_moments(reader: GramReader, condition: Condition) -> Moments:
+def course_moments(reader: GramReader, predicate: Predicate) -> Moments:
     """Return the moments of each drive that has changes of the course.
 
     Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
@@ -571,10 +571,10 @@ def course_moments(reader: GramReader, condition: Condition) -> Moments:
         feature_set = catalog.feature_set(name)
         if feature_set.change_ticks and set(COLUMNS) <= set(feature_set.columns):
             try:
-                opened = reader.opened(name, condition)
+                opened = reader.opened(name, predicate)
             except DataError:  # it has not been computed, or not for all
                 continue
-            by_kind = collect_sums(opened.batches(condition), {"course": columns}, unnamed=True)
+            by_kind = collect_sums(opened.batches(predicate), {"course": columns}, unnamed=True)
             if sums := by_kind.get("course"):
                 moments = sums.table.moments() * np.outer(scales, scales)
                 return {

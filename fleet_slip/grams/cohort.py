@@ -1,4 +1,4 @@
-"""Cohorts: Gram rows of the drives that satisfy an SQL condition, each with a fold and a weight.
+"""Cohorts: Gram rows of the drives that satisfy an SQL predicate, each with a fold and a weight.
 
 What looks at single drives has all Gram rows in memory; what compares given models needs the exact
 sum of each fold alone, of any number of rows.
@@ -45,7 +45,7 @@ from fleet_slip.regression.drives import (
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.rendering import Remark
-from fleet_slip.warehouse.condition import Condition, parse_cohort
+from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -74,9 +74,9 @@ class Cohort:
 
     Attributes:
         catalog: what the columns of the Gram rows are.
-        condition: which drives, by the columns of the view `drives`.
+        predicate: which drives, by the columns of the view `drives`.
         logs_version, grams_version, feature_set: what was read.
-        left_out: drives of the condition that have no such Gram rows: their cars sent no log.
+        left_out: drives of the predicate that have no such Gram rows: their cars sent no log.
         drives: a line for each Gram row: whose it is, its signals, and of how many rows.
         tables: the Gram rows in the order of `drives`, by signals; none if only sums were kept.
         sums, folding: the Gram of each fold, if only these were kept, and what the folds are of.
@@ -86,7 +86,7 @@ class Cohort:
     """
 
     catalog: Catalog
-    condition: Condition
+    predicate: Predicate
     logs_version: int
     grams_version: int
     feature_set: str = PLAIN
@@ -127,12 +127,12 @@ class Cohort:
         return tuple(n for n in self.catalog.search_inputs(self.feature_set) if n in present)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
-        """Return the SQL condition on the view `grams` of the rows that a model is made of."""
+        """Return the SQL predicate on the view `grams` of the rows that a model is made of."""
         catalog, columns = self.catalog, self.catalog.calibrated
         stored = dict.fromkeys(columns[name].of if name in columns else name for name in inputs)
         names = ", ".join(f"'{name}'" for name in [*stored, catalog.signals.label])
         return (
-            f"feature_set = '{catalog.identity(self.feature_set)}' AND {self.condition.sql} AND "
+            f"feature_set = '{catalog.identity(self.feature_set)}' AND {self.predicate.sql} AND "
             f"list_has_all(string_split(signals, ','), [{names}])"
         )
 
@@ -169,7 +169,7 @@ class Cohort:
         if self.sums is not None and folding == self.folding:
             return self.sums
         if self.sums is not None and self.source is not None:
-            again = load_cohort(self.source, self.condition, self.feature_set, folding)
+            again = load_cohort(self.source, self.predicate, self.feature_set, folding)
             return again._own_folds(by, count)
         require_divided(self.catalog, self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
@@ -180,7 +180,7 @@ class Cohort:
     def serving(self, inputs: Sequence[str]) -> Served:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
-            return load_cohort(self.source, self.condition, self.feature_set).serving(inputs)
+            return load_cohort(self.source, self.predicate, self.feature_set).serving(inputs)
         table, mask = complete_cases(self.tables, [*inputs, self.catalog.signals.label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
@@ -224,39 +224,39 @@ def _lines_with(drives: pa.Table, signals: Collection[str]) -> pa.Table:
 
 def load_cohort(
     source: Warehouse | GramReader,
-    condition: str | Condition = TRAINING_DRIVES,
+    predicate: str | Predicate = TRAINING_DRIVES,
     feature_set: str = PLAIN,
     folding: Folding | None = None,
 ) -> Cohort:
-    """Read the Gram rows of the drives that satisfy a condition.
+    """Read the Gram rows of the drives that satisfy a predicate.
 
     With a `folding` only the sum of each fold is kept, which takes little memory. Raises
-    `QuestionError` for an invalid condition, `DataError` if no drive satisfies it, for a single
+    `QuestionError` for an invalid predicate, `DataError` if no drive satisfies it, for a single
     fold, or if the set was not computed for all logs, `RefusedError` for drives of evaluation
     scenarios.
     """
     catalog = source.catalog
-    condition = parse_cohort(catalog.signals, condition)
+    predicate = parse_cohort(catalog.signals, predicate)
     if folding is not None:
         require_divided(catalog, feature_set, folding.by)
-    with open_grams(source, feature_set, condition) as opened:
+    with open_grams(source, feature_set, predicate) as opened:
         if folding is None:
-            rows = opened.rows(condition)
-            require_training(rows["source"].unique().to_pylist(), condition)
+            rows = opened.rows(predicate)
+            require_training(rows["source"].unique().to_pylist(), predicate)
             kept = _expand_rows(opened, rows)
             if not kept["tables"]:  # no row, or none of changes
-                raise empty_cohort_error(opened, condition)
+                raise empty_cohort_error(opened, predicate)
         else:
-            names, fold_of = _find_folds(opened, folding, condition)
-            grams, drives = _add_up(opened, condition, names, fold_of)
+            names, fold_of = _find_folds(opened, folding, predicate)
+            grams, drives = _add_up(opened, predicate, names, fold_of)
             kept = {"drives": drives, "sums": _used_folds(names, grams, drives), "folding": folding}
         return Cohort(
             catalog=catalog,
-            condition=condition,
+            predicate=predicate,
             logs_version=opened.logs_version,
             grams_version=opened.grams_version,
             feature_set=catalog.name_of(opened.identity),
-            left_out=opened.count_left_out(condition),
+            left_out=opened.count_left_out(predicate),
             source=source,
             **kept,
         )
@@ -280,7 +280,7 @@ def with_gram_rows(cohort: Cohort, rows: pa.Table) -> Cohort:
     """
     if cohort.source is None:
         raise ValueError("it is not known where the cohort was read")
-    with open_grams(cohort.source, cohort.feature_set, cohort.condition) as opened:
+    with open_grams(cohort.source, cohort.feature_set, cohort.predicate) as opened:
         return replace(cohort, **_expand_rows(opened, rows))
 
 
@@ -290,26 +290,26 @@ def _with_signals(lines: pa.Table, signals: str) -> pa.Table:
     return lines.append_column("signals", same)
 
 
-def require_training(sources: Iterable[str], condition: Condition) -> None:
-    """Raise `RefusedError` if drives of a scenario are among those of a condition."""
+def require_training(sources: Iterable[str], predicate: Predicate) -> None:
+    """Raise `RefusedError` if drives of a scenario are among those of a predicate."""
     if SCENARIO in sources:
         raise RefusedError(
-            f"the cohort {condition.shown} has drives of evaluation scenarios, which no model "
-            f"may be trained on. Add to the condition: AND {TRAINING_DRIVES}"
+            f"the cohort {predicate.quoted} has drives of evaluation scenarios, which no model "
+            f"may be trained on. Add to the predicate: AND {TRAINING_DRIVES}"
         )
 
 
-def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
-    """Return the error that tells why a condition leaves no drive."""
-    if left_out := opened.count_left_out(condition):
+def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
+    """Return the error that tells why a predicate leaves no drive."""
+    if left_out := opened.count_left_out(predicate):
         return NotComputedError(
-            f"all {number_of(left_out, 'drive')} of the cohort {condition.shown} have no log: "
+            f"all {number_of(left_out, 'drive')} of the cohort {predicate.quoted} have no log: "
             "their cars sent Gram rows of logged signals. Use --features signals."
         )
     feature_set = opened.catalog.feature_set(opened.catalog.name_of(opened.identity))
     if feature_set.change_s:
         return DataError(
-            f"no drive of the cohort {condition.shown} has satellite fixes "
+            f"no drive of the cohort {predicate.quoted} has satellite fixes "
             f"{feature_set.change_text} apart, so there is no course to learn from. Choose another "
             "cohort, or map the course and ingest again: docs/course.md."
         )
@@ -320,7 +320,7 @@ def empty_cohort_error(opened: OpenedGrams, condition: Condition) -> DataError:
     ).fetchone()
     sources, campaigns = examples or ("", "")
     return DataError(
-        f"no drive matches the cohort condition {condition.shown}. The warehouse has sources "
+        f"no drive matches the cohort predicate {predicate.quoted}. The warehouse has sources "
         f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
         'drives"'
     )
@@ -333,14 +333,14 @@ FoldOf = Callable[[pa.RecordBatch], IntArray]
 
 
 def _add_up(
-    opened: OpenedGrams, condition: Condition, names: Sequence[object], fold_of: FoldOf
+    opened: OpenedGrams, predicate: Predicate, names: Sequence[object], fold_of: FoldOf
 ) -> tuple[dict[str, list[Gram]], pa.Table]:
     """Return the exact sums of Gram rows, by signals and fold, and whose each row is."""
     expansion = expansion_of(opened)
     grams: dict[str, list[Gram]] = {}
     lines: list[pa.Table] = []
-    for batch in opened.batches(condition, *HASHES):
-        require_training(batch["source"].unique().to_pylist(), condition)
+    for batch in opened.batches(predicate, *HASHES):
+        require_training(batch["source"].unique().to_pylist(), predicate)
         folds = fold_of(batch)
         some = pa.table({name: batch[name] for name in ("n", "source", *HASHES[:2])})
         some = some.append_column("fold", pa.array(folds))
@@ -350,23 +350,23 @@ def _add_up(
             # Filtered lines are copies: a column by itself would keep all of its batch.
             lines.append(_with_signals(some.filter(pa.array(here)), signals))
     if not grams:
-        raise empty_cohort_error(opened, condition)
+        raise empty_cohort_error(opened, predicate)
     return grams, pa.concat_tables(lines)
 
 
 def _find_folds(
-    opened: OpenedGrams, folding: Folding, condition: Condition
+    opened: OpenedGrams, folding: Folding, predicate: Predicate
 ) -> tuple[Sequence[str], FoldOf]:
     """Return the folds that there may be, and which a Gram row is in. Raises like `load_cohort`."""
     key = FOLD_KEYS[folding.by]
     dealt = folding.by in ("drive", "vehicle") and folding.count != EACH
-    found = opened.values_of(key, condition, int(folding.count) + 1 if dealt else None)
+    found = opened.values_of(key, predicate, int(folding.count) + 1 if dealt else None)
     if dealt and len(found) > (count := int(folding.count)):
         hashed = key.removesuffix("_id") + "_hash"
         names = [str(fold + 1) for fold in range(count)]
         return names, lambda rows: (rows[hashed].to_numpy() % count).astype(np.int64)
     if not len(found):
-        raise empty_cohort_error(opened, condition)
+        raise empty_cohort_error(opened, predicate)
     assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
     return assignment.names, lambda rows: assignment.fold[_places(rows[key], found)]
 
@@ -404,7 +404,7 @@ def _used_folds(
 class DailySums:
     """The Gram of each day, and the number of drives in it.
 
-    `left_out` drives of the condition have no such Gram rows: their cars sent no log.
+    `left_out` drives of the predicate have no such Gram rows: their cars sent no log.
     """
 
     days: tuple[date, ...]
@@ -416,17 +416,17 @@ class DailySums:
 def sum_days(
     source: Warehouse | GramReader,
     inputs: Sequence[str],
-    condition: str | Condition = TRAINING_DRIVES,
+    predicate: str | Predicate = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> DailySums:
     """Add up a cohort's Gram rows with label and inputs, day by day. Raises like `load_cohort`."""
     signals = (*inputs, source.catalog.signals.label)
-    condition = parse_cohort(source.catalog.signals, condition)
-    with open_grams(source, feature_set, condition) as opened:
-        found = opened.values_of("day", condition).sort()
+    predicate = parse_cohort(source.catalog.signals, predicate)
+    with open_grams(source, feature_set, predicate) as opened:
+        found = opened.values_of("day", predicate).sort()
         days: list[date] = found.to_pylist()
-        sums, lines = _add_up(opened, condition, days, lambda rows: _places(rows["day"], found))
-        left_out = opened.count_left_out(condition)
+        sums, lines = _add_up(opened, predicate, days, lambda rows: _places(rows["day"], found))
+        left_out = opened.count_left_out(predicate)
     serving = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
     if not serving:
         raise missing_signals_error(signals)

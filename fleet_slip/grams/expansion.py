@@ -21,7 +21,7 @@ from fleet_slip.grams.calibration import calibration_of
 from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import OpenedGrams
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 
 # Removes what a gyroscope's bias and scale do to the Gram rows of changes, drive by drive.
 #
@@ -166,5 +166,5 @@ def expansion_of(opened: OpenedGrams) -> Expansion:
         if number is not None:
             columns[name] = (catalog.calibrated[name].of, number)
     calibration = replace(opened, identity=catalog.identity(CALIBRATION))
-    cars = calibration_of(calibration, parse_condition(catalog.signals, ALL_DRIVES)).counts()
+    cars = calibration_of(calibration, parse_predicate(catalog.signals, ALL_DRIVES)).counts()
     return Expansion(columns, cars, sweep)

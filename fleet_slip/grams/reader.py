@@ -24,8 +24,8 @@ from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.condition import Condition, asking
 from fleet_slip.warehouse.connections import IdleConnection
+from fleet_slip.warehouse.predicate import Predicate, guarded_query
 from fleet_slip.warehouse.tables import Warehouse, gram_snapshots, lock, open_tables
 
 BATCH_ROWS = 2**13
@@ -54,64 +54,64 @@ class OpenedGrams:
     logs_version: int
     grams_version: int
 
-    def statement(self, name: str, condition: Condition, **values: str) -> str:
-        """Return a statement from `jobs/` for a condition."""
+    def statement(self, name: str, predicate: Predicate, **values: str) -> str:
+        """Return a statement from `jobs/` for a predicate."""
         trips = read_sql("jobs", "trips.sql").format(
             feature_set=self.identity, longest_pause_s=LONGEST_PAUSE_S
         )
-        values |= {"condition": condition.sql, "feature_set": self.identity, "trips": trips}
+        values |= {"predicate": predicate.sql, "feature_set": self.identity, "trips": trips}
         has_receiver = RECEIVER in self.catalog.signals.drive
         values |= {"receiver": RECEIVER if has_receiver else f"NULL AS {RECEIVER}"}
         return read_sql("jobs", name).format(**values)
 
-    def rows(self, condition: Condition) -> pa.Table:
+    def rows(self, predicate: Predicate) -> pa.Table:
         """Return the Gram rows of a cohort with all that is known of them, sorted."""
-        text = self.statement("cohort.sql", condition)
-        with asking(self.database, condition):
+        text = self.statement("cohort.sql", predicate)
+        with guarded_query(self.database, predicate):
             return self.database.sql(
                 f"FROM ({text}) ORDER BY signals, drive_id, part"
             ).to_arrow_table()
 
-    def batches(self, condition: Condition, *more: str) -> Iterator[pa.RecordBatch]:
+    def batches(self, predicate: Predicate, *more: str) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort, in any order: `SUMMED` and `more` columns of them."""
         columns = ", ".join([*SUMMED, *more])
         feature_set = self.catalog.feature_set(self.catalog.name_of(self.identity))
         rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(feature_set.columns))))
-        text = f"SELECT {columns} FROM ({self.statement('cohort.sql', condition)})"
-        with asking(self.database, condition):
+        text = f"SELECT {columns} FROM ({self.statement('cohort.sql', predicate)})"
+        with guarded_query(self.database, predicate):
             yield from self.database.sql(text).to_arrow_reader(rows)
 
-    def values_of(self, column: str, condition: Condition, most: int | None = None) -> pa.Array:
+    def values_of(self, column: str, predicate: Predicate, most: int | None = None) -> pa.Array:
         """Return the distinct values of a cohort's column, at most so many."""
-        text = self.statement("cohort.sql", condition)
+        text = self.statement("cohort.sql", predicate)
         query = f"SELECT DISTINCT {column} FROM ({text}){f' LIMIT {most}' if most else ''}"
-        with asking(self.database, condition):
+        with guarded_query(self.database, predicate):
             return self.database.sql(query).to_arrow_table()[column].combine_chunks()
 
-    def count_left_out(self, condition: Condition) -> int:
+    def count_left_out(self, predicate: Predicate) -> int:
         """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
         if self.identity == self.catalog.identity(PLAIN):
             return 0
-        [(count,)] = self._rows(self.statement("count_without_log.sql", condition), condition)
+        [(count,)] = self._rows(self.statement("count_without_log.sql", predicate), predicate)
         return int(count)
 
-    def label_sources(self, condition: Condition) -> list[tuple[str, str | None, int]]:
+    def label_sources(self, predicate: Predicate) -> list[tuple[str, str | None, int]]:
         """Return source, campaign and number of the rows of a cohort that have the label."""
-        statement = self.statement("label_sources.sql", condition, label=self.catalog.signals.label)
-        return [(source, name, int(n)) for source, name, n in self._rows(statement, condition)]
+        statement = self.statement("label_sources.sql", predicate, label=self.catalog.signals.label)
+        return [(source, name, int(n)) for source, name, n in self._rows(statement, predicate)]
 
-    def files(self, condition: Condition) -> set[str]:
+    def files(self, predicate: Predicate) -> set[str]:
         """Return the log files that have a drive of a cohort."""
-        return {f for (f,) in self._rows(self.statement("cohort_files.sql", condition), condition)}
+        return {f for (f,) in self._rows(self.statement("cohort_files.sql", predicate), predicate)}
 
-    def _rows(self, statement: str, condition: Condition) -> list[tuple[Any, ...]]:
-        with asking(self.database, condition):
+    def _rows(self, statement: str, predicate: Predicate) -> list[tuple[Any, ...]]:
+        with guarded_query(self.database, predicate):
             return self.database.execute(statement).fetchall()
 
-    def course_delays(self, condition: Condition) -> Iterator[tuple[str, tuple[int, int]]]:
+    def course_delays(self, predicate: Predicate) -> Iterator[tuple[str, tuple[int, int]]]:
         """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""
-        statement = self.statement("course_delays.sql", condition, turned=TURNED)
-        for car, least, largest in self._rows(statement, condition):
+        statement = self.statement("course_delays.sql", predicate, turned=TURNED)
+        for car, least, largest in self._rows(statement, predicate):
             yield car, (least, largest)
 
 
@@ -142,7 +142,7 @@ class GramReader:
         else:
             self._close()
 
-    def opened(self, feature_set: str, condition: Condition) -> OpenedGrams:
+    def opened(self, feature_set: str, predicate: Predicate) -> OpenedGrams:
         """Return the Gram rows of a feature set; they are valid until the next call.
 
         Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
@@ -161,7 +161,7 @@ class GramReader:
         for name in (feature_set, *([CALIBRATION] if calibrated else [])):
             if name != PLAIN:
                 rows = partial(self._opened, grams, logs, name)
-                _require_complete(self.catalog, logs, grams, rows, name, condition)
+                _require_complete(self.catalog, logs, grams, rows, name, predicate)
         return self._opened(grams, logs, feature_set)
 
     def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
@@ -195,14 +195,14 @@ KEPT_BYTES = 2**27
 def open_grams(
     source: Warehouse | GramReader,
     feature_set: str,
-    condition: Condition,
+    predicate: Predicate,
 ) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
     if isinstance(source, GramReader):
-        yield source.opened(feature_set, condition)
+        yield source.opened(feature_set, predicate)
     else:
         with GramReader(source) as reader:
-            yield reader.opened(feature_set, condition)
+            yield reader.opened(feature_set, predicate)
 
 
 def _require_complete(
@@ -211,12 +211,12 @@ def _require_complete(
     grams: Snapshot,
     opened: Callable[[], OpenedGrams],
     feature_set: str,
-    condition: Condition,
+    predicate: Predicate,
 ) -> None:
     backlog = find_backlog(logs, grams, catalog.identity(feature_set))
     if not backlog.missing and not backlog.stale:
         return
-    files = opened().files(condition)
+    files = opened().files(predicate)
     if not files and feature_set != CALIBRATION:  # that may come from another root
         unknown = find_backlog(logs, grams, catalog.identity(PLAIN)).missing
         if unknown:
@@ -226,20 +226,20 @@ def _require_complete(
             )
     missing = [file for file in backlog.missing if file.path in files]
     if missing or backlog.stale & files:
-        everything = condition.text in {ALL_DRIVES, TRAINING_DRIVES}
-        cohort = "" if everything else f" --cohort {shlex.quote(condition.text)}"
+        everything = predicate.text in {ALL_DRIVES, TRAINING_DRIVES}
+        cohort = "" if everything else f" --cohort {shlex.quote(predicate.text)}"
         raise NotComputedError(
             f"{feature_set} features are missing for {len(missing)} of {len(files)} log files of "
             f"the cohort. Run: fleet-slip gram --features {feature_set}{cohort}"
         )
 
 
-def cohort_files(source: Warehouse | GramReader, condition: Condition) -> set[str]:
+def cohort_files(source: Warehouse | GramReader, predicate: Predicate) -> set[str]:
     """Return the log files that have a drive of a cohort. Raises `DataError` without one."""
-    with open_grams(source, PLAIN, condition) as opened:
-        found = opened.files(condition)
+    with open_grams(source, PLAIN, predicate) as opened:
+        found = opened.files(predicate)
     if not found:
-        raise DataError(f"no drive with a log satisfies {condition.shown}.")
+        raise DataError(f"no drive with a log satisfies {predicate.quoted}.")
     return found
 
 

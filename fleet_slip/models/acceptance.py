@@ -42,7 +42,7 @@ from fleet_slip.regression.folds import (
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.resources import Configs
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 
 
 class Floor(Config):
@@ -261,12 +261,12 @@ def _divide(
     made = [registry.trained_drives(one.manifest) for one in versions]
     cohort = selection.cohort
     if cohort.source is not None and cohort.sums is not None:
-        condition, drives = cohort.condition, cohort.drive_count
+        predicate, drives = cohort.predicate, cohort.drive_count
         if drives > MOST_DRIVES:
             below = 16**_HEX * MOST_DRIVES // drives
             chosen = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-            condition &= parse_condition(cohort.catalog.signals, chosen)
-        cohort = load_cohort(cohort.source, condition, cohort.feature_set)
+            predicate &= parse_predicate(cohort.catalog.signals, chosen)
+        cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
     numbers = hash_names(cohort.drives["drive_id"])
     known = np.any([one.among(numbers) for one in made], axis=0)
     return (cohort, known) if known.any() and not known.all() else None

@@ -26,8 +26,8 @@ def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
     """
     if not warehouse.logs.snapshot().rows:  # all rows are of messages: none is read for this
         return None
-    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
-        rows = opened.label_sources(cohort.condition)
+    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
+        rows = opened.label_sources(cohort.predicate)
     stated = [(n, _stated_rad(source, campaign, warehouse.configs)) for source, campaign, n in rows]
     total = sum(n for n, _ in stated)
     if not total or any(std is None for _, std in stated):
@@ -92,8 +92,8 @@ def without_label(warehouse: Warehouse, cohort: Cohort, error_deg: float) -> Wit
         return None
     straight: list[FloatArray] = []
     turned = square = rows = 0.0
-    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
-        for batch in opened.batches(cohort.condition):
+    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
+        for batch in opened.batches(cohort.predicate):
             for names, lines, _ in by_signals(batch):
                 if STRAIGHT not in names.split(","):
                     continue

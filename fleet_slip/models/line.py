@@ -31,11 +31,11 @@ KEPT_UNTIL = 2
 
 
 def with_line_fitted(
-    warehouse: Warehouse, request: SelectionRequest, asked: str, condition: str
+    warehouse: Warehouse, request: SelectionRequest, asked: str, predicate: str
 ) -> SelectionRequest:
     """Return a request of a set with a line, which is fitted if none is kept; others as they are.
 
-    `asked` is the cohort, `condition` what of it has no fault. The Gram rows of the set, and those
+    `asked` is the cohort, `predicate` what of it has no fault. The Gram rows of the set, and those
     that the line needs, are made. Raises as `answer_request`.
     """
     catalog = warehouse.catalog
@@ -56,26 +56,26 @@ def with_line_fitted(
             "feature_set": catalog.identity(models.features),
             "cohort": asked,
         }
-        line = _kept_line(warehouse, about, condition)
+        line = _kept_line(warehouse, about, predicate)
         if line is None:
             with recorded_step(warehouse.root, "fit_first_stage_model", [str(about["models"])]):
-                line = fit_line(warehouse, about, condition)
+                line = fit_line(warehouse, about, predicate)
                 warehouse.stacked_models.keep(line)
         named = f"{named}_{line.digest}"
         request = replace(request, features=named)
     if catalog.first_stage_model(named):
-        ensure_grams(warehouse, named, condition, reason="they contain the first-stage estimate")
+        ensure_grams(warehouse, named, predicate, reason="they contain the first-stage estimate")
     return request
 
 
-def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageModel | None:
+def _kept_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStageModel | None:
     """Return the line that was fitted to the most drives, all of which are there.
 
     None if there is none, or the cohort has outgrown it.
     """
     models = warehouse.stacked_models
     stored = [model for digest in models.digests() if (model := models.find(digest))]
-    there = load_cohort(warehouse, condition).hash_drives_with(())
+    there = load_cohort(warehouse, predicate).hash_drives_with(())
 
     def fits(line: FirstStageModel) -> bool:
         drives = np.frombuffer(bytes.fromhex(line.drive_hashes), dtype=">u8").astype(np.uint64)
@@ -85,7 +85,7 @@ def _kept_line(warehouse: Warehouse, about: About, condition: str) -> FirstStage
     return best if best and len(there) < KEPT_UNTIL * best.drives else None
 
 
-def fit_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageModel:
+def fit_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStageModel:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
     Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
@@ -93,8 +93,8 @@ def fit_line(warehouse: Warehouse, about: About, condition: str) -> FirstStageMo
     catalog = warehouse.catalog
     plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], by="drive"))
     reason = f"model list {about['models']} fits the first-stage model on them"
-    ensure_grams(warehouse, plan.feature_set, condition, reason=reason)
-    cohort = load_cohort(warehouse, condition, plan.feature_set)
+    ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)
+    cohort = load_cohort(warehouse, predicate, plan.feature_set)
     signals, label = plan.choose(cohort).winner.model.signals, catalog.signals.label
     served = cohort.serving(signals)
     drives = served.drives["drive_id"].to_pylist()

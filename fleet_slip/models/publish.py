@@ -38,13 +38,13 @@ from fleet_slip.models.training_checks import (
 )
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.warehouse.condition import parse_cohort, with_all_drives
+from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
 from fleet_slip.warehouse.tables import Warehouse
 
 # How a model is trained again: as its champion was, and whether that would change anything.
 
 COHORT = "cohort"
-"""Key of the condition that was asked, where cars were left out of it."""
+"""Key of the predicate that was asked, where cars were left out of it."""
 
 _WHAT = {"models", "model", "nested", "features", "label", "rank", "criterion", "all_subsets"}
 _WHAT |= {"search", "most"}
@@ -66,7 +66,7 @@ def asked_of(selection: Selection) -> dict[str, Any] | None:
     fell_back = not asked and selection.model_list == LOGGED_MODELS
     if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
         return None
-    whole = selection.asked_condition == selection.cohort.condition.text
+    whole = selection.asked_condition == selection.cohort.predicate.text
     return asked if whole else {**asked, COHORT: selection.asked_condition}
 
 
@@ -212,7 +212,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         ),
         cross_validation=_cross_validated(winner, selection),
         trained_on=TrainedOn(
-            cohort=selection.cohort.condition.text,
+            cohort=selection.cohort.predicate.text,
             feature_set=catalog.identity(selection.cohort.feature_set),
             drives=winner.drives,
             vehicles=selection.cohort.count_vehicles_with(wanted),
@@ -263,8 +263,8 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         return manifest
     found = StraightOn(Fraction(0), {}, None, 0.0, 0)
     if not manifest.through_origin:
-        condition = parse_cohort(catalog.signals, manifest.trained_on.cohort)
-        found = straight_on(warehouse, condition, manifest)
+        predicate = parse_cohort(catalog.signals, manifest.trained_on.cohort)
+        found = straight_on(warehouse, predicate, manifest)
     learned = LearnedFrom(
         label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
@@ -290,8 +290,8 @@ def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Select
     if not (warehouse.root / ASSUMPTIONS).names():
         return manifest
     cohort = selection.cohort
-    with open_grams(warehouse, cohort.feature_set, cohort.condition) as opened:
-        rows = opened.label_sources(cohort.condition)
+    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
+        rows = opened.label_sources(cohort.predicate)
     mappings = {name for source, name, _ in rows if source == MEASURED and name}
     assumed = kept_assumptions(warehouse.root, mappings)
     if assumed and not manifest.learned_from and selection.label_noise_deg is None:

@@ -22,14 +22,14 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.models.summary import remark_without_information
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
-from fleet_slip.warehouse.condition import (
-    Condition,
-    asking,
+from fleet_slip.warehouse.database import sql_text
+from fleet_slip.warehouse.predicate import (
+    Predicate,
     drive_columns,
+    guarded_query,
     parse_cohort,
     row_columns,
 )
-from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
 BATCH_ROWS = 2**17
@@ -107,31 +107,31 @@ def _si_rows(signals: SignalCatalog) -> str:
     )"""
 
 
-def score(warehouse: Warehouse, manifest: Manifest, condition: str | Condition) -> Score:
-    """Score a model on the rows of `log` that satisfy a condition.
+def score(warehouse: Warehouse, manifest: Manifest, predicate: str | Predicate) -> Score:
+    """Score a model on the rows of `log` that satisfy a predicate.
 
-    The drives that have such rows are estimated whole. Raises `QuestionError` for a condition that
+    The drives that have such rows are estimated whole. Raises `QuestionError` for a predicate that
     is not one expression, and `DataError` if no row has the model's signals.
     """
-    condition = cohort_of_rows(warehouse.catalog.signals, condition)
-    estimate_rad, truth_rad, rows = _estimate_rows(warehouse, manifest, condition)
+    predicate = cohort_of_rows(warehouse.catalog.signals, predicate)
+    estimate_rad, truth_rad, rows = _estimate_rows(warehouse, manifest, predicate)
     if not len(truth_rad):
         raise DataError(
-            f"no row of the cohort {condition.shown} has {', '.join(manifest.signals)} and "
+            f"no row of the cohort {predicate.quoted} has {', '.join(manifest.signals)} and "
             f"{manifest.label.signal}. Choose another cohort, or a model with fewer signals."
         )
     return _figures(estimate_rad, truth_rad, rows)
 
 
-def cohort_of_rows(signals: SignalCatalog, condition: str | Condition) -> Condition:
-    """Return the condition of a cohort of rows, on the view `log`. Raises `QuestionError`."""
-    if isinstance(condition, Condition):
-        return condition
-    return parse_cohort(signals, condition, row_columns(signals))
+def cohort_of_rows(signals: SignalCatalog, predicate: str | Predicate) -> Predicate:
+    """Return the predicate of a cohort of rows, on the view `log`. Raises `QuestionError`."""
+    if isinstance(predicate, Predicate):
+        return predicate
+    return parse_cohort(signals, predicate, row_columns(signals))
 
 
 def _estimate_rows(
-    warehouse: Warehouse, manifest: Manifest, condition: Condition
+    warehouse: Warehouse, manifest: Manifest, predicate: Predicate
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return estimate and label in rad of the rows of a cohort that have both, and of how many."""
     signals = warehouse.catalog.signals
@@ -141,7 +141,7 @@ def _estimate_rows(
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
-        columns=counts, rows=_si_rows(signals), condition=condition.sql
+        columns=counts, rows=_si_rows(signals), predicate=predicate.sql
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
@@ -149,7 +149,7 @@ def _estimate_rows(
     unit = float(warehouse.catalog.input_scales[label])
     with (
         connect_tables(warehouse, text) as database,
-        asking(database, condition),
+        guarded_query(database, predicate),
     ):
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
         workspace = Workspace(predictor.plan)
@@ -197,28 +197,28 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Scor
 
 @dataclass(frozen=True)
 class SeenDrives:
-    """A cohort's drives, those that made a version, the condition of others."""
+    """A cohort's drives, those that made a version, the predicate of others."""
 
     drives: int
     trained: int
-    others: Condition
+    others: Predicate
 
 
 def find_seen(
-    warehouse: Warehouse, registry: Registry, manifest: Manifest, condition: str | Condition
+    warehouse: Warehouse, registry: Registry, manifest: Manifest, predicate: str | Predicate
 ) -> SeenDrives:
     """Return which drives with a log of a cohort of rows made a version. Raises as `score`."""
     signals = warehouse.catalog.signals
-    cohort = cohort_of_rows(signals, condition)
+    cohort = cohort_of_rows(signals, predicate)
     view = "log" if cohort.columns - set(drive_columns(signals)) else "drives"
     logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
-    with connect_tables(warehouse, query) as database, asking(database, cohort):
+    with connect_tables(warehouse, query) as database, guarded_query(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
     seen = registry.trained_drives(manifest).among(hash_names(names))
     if not seen.any() or seen.all():
         return SeenDrives(len(names), int(seen.sum()), cohort)
     kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]
     listed = ", ".join(map(sql_text, kept))
-    others = Condition(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
+    others = Predicate(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
     return SeenDrives(len(names), int(seen.sum()), others)

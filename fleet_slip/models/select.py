@@ -114,7 +114,7 @@ class Selection(Answer):
             f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "
             f"{winner.pooled.rmse_deg:.4f} deg, correlation {winner.correlation:.4f}, of "
             f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
-            f"{self.cohort.condition.text}>"
+            f"{self.cohort.predicate.text}>"
         )
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
@@ -155,7 +155,7 @@ class Selection(Answer):
             ],
             "winner": self.winner.model.name,
             "reason": self.winner.reason,
-            "cohort": self.cohort.condition.text,
+            "cohort": self.cohort.predicate.text,
             "feature_set": self.cohort.catalog.identity(self.cohort.feature_set),
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
@@ -212,7 +212,7 @@ def select(
     label = catalog.signals.label
     if not any(label in grams[0].signals for grams in divided.tables):
         raise DataError(
-            f"no drive of the cohort {cohort.condition.shown} has the label, {label}. Where cars "
+            f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
             "log their course, learn from it: fleet-slip select --label course"
         )
     models: list[CrossValidation] = []
@@ -265,9 +265,9 @@ GIVEN = "given"
 
 
 def answer_request(
-    warehouse: Warehouse, request: SelectionRequest, condition: str = TRAINING_DRIVES
+    warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
 ) -> Selection:
-    """Select on a condition's drives, without the columns of the usual list by that of signals.
+    """Select on a predicate's drives, without the columns of the usual list by that of signals.
 
     Raises `UsageError` for options that do not go together.
     """
@@ -275,17 +275,17 @@ def answer_request(
     plan = SelectionPlan.of(catalog, request)
     usual = not request.models and plan.request.models == DEFAULT_MODELS
     try:
-        answer = _answer(warehouse, plan, condition)
+        answer = _answer(warehouse, plan, predicate)
     except NotComputedError as error:
         if not usual:
             raise
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
         plan = SelectionPlan.of(catalog, replace(request, models=LOGGED_MODELS))
-        answer = _answer(warehouse, plan, condition)
+        answer = _answer(warehouse, plan, predicate)
     told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
     known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
-    return replace(known, request=request, asked_condition=condition)
+    return replace(known, request=request, asked_condition=predicate)
 
 
 @dataclass(frozen=True)
@@ -335,14 +335,14 @@ class SelectionPlan:
         return replace(found, weighed=weighed, full=full)
 
 
-def _answer(warehouse: Warehouse, plan: SelectionPlan, condition: str) -> Selection:
+def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
     request, folds = plan.request, plan.folds
     distances = bool(
         request.nested and not request.ordered and not _searches_of(request, plan.model_list)
     )
     of_drives = request.ordered or request.robust or request.half_life
     whole = of_drives or distances  # else the sum of each fold suffices
-    cohort = load_cohort(warehouse, condition, plan.feature_set, None if whole else folds)
+    cohort = load_cohort(warehouse, predicate, plan.feature_set, None if whole else folds)
     if request.prior:
         from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 

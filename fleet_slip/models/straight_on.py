@@ -25,7 +25,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit
-from fleet_slip.warehouse.condition import Condition
+from fleet_slip.warehouse.predicate import Predicate
 from fleet_slip.warehouse.tables import Warehouse
 
 PLANE = ("curvature_mean_16", "yaw_rate_speed_mean_16")
@@ -77,19 +77,19 @@ class _Car:
     offsets: tuple[int, ...] | None
 
 
-def straight_on(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> StraightOn:
+def straight_on(warehouse: Warehouse, predicate: Predicate, manifest: Manifest) -> StraightOn:
     """Return the intercept of a model without one. Raises `DataError` if no drive tells it."""
-    calibration = calibrate(warehouse, condition)
+    calibration = calibrate(warehouse, predicate)
     coefficients = {
         term.signal: term.coefficient_exact * Fraction(term.scale_exact) for term in manifest.terms
     }
-    sums = _levels(warehouse, condition, manifest)
+    sums = _levels(warehouse, predicate, manifest)
     catalog = warehouse.catalog
     every = [_of_car(catalog, sums, car, coefficients, calibration) for car in sums.cars]
     cars = [one for one in every if one is not None]
     if not cars:
         raise DataError(
-            f"cannot determine the intercept: all driving of {condition.shown} is alike, so no "
+            f"cannot determine the intercept: all driving of {predicate.quoted} is alike, so no "
             "sensor offset can be estimated. Choose more drives, or a model without intercept: "
             "--no-intercept."
         )
@@ -134,13 +134,13 @@ def levels_of(catalog: Catalog, manifest: Manifest) -> tuple[str, tuple[str, ...
     return str(base), columns
 
 
-def _levels(warehouse: Warehouse, condition: Condition, manifest: Manifest) -> DriveSums:
+def _levels(warehouse: Warehouse, predicate: Predicate, manifest: Manifest) -> DriveSums:
     base, columns = levels_of(warehouse.catalog, manifest)
-    with open_grams(warehouse, base, condition) as opened:
-        found = collect_sums(opened.batches(condition), {base: columns}, unnamed=True)
+    with open_grams(warehouse, base, predicate) as opened:
+        found = collect_sums(opened.batches(predicate), {base: columns}, unnamed=True)
     if not found:
         raise DataError(
-            f"no drive of {condition.shown} has {', '.join(columns)}, which the intercept needs. "
+            f"no drive of {predicate.quoted} has {', '.join(columns)}, which the intercept needs. "
             "Choose more drives, or fit without intercept: --no-intercept."
         )
     return found[base]

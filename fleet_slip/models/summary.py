@@ -11,7 +11,7 @@ from fleet_slip.grams.folding import BANDS, PARTS
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable
-from fleet_slip.warehouse.condition import describe_cohort
+from fleet_slip.warehouse.predicate import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.grams.weights import Weighed
@@ -84,11 +84,11 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         )
 
 
-def _shortened(condition: str, everything: bool) -> str:
-    """Return a condition, of a long one its beginning."""
-    condition = condition if everything else describe_cohort(condition)
-    long = not everything and len(condition) > CONDITION_WIDTH
-    return f"{condition[:CONDITION_WIDTH].rstrip()} … (--all)" if long else condition
+def _shortened(predicate: str, everything: bool) -> str:
+    """Return a predicate, of a long one its beginning."""
+    predicate = predicate if everything else describe_cohort(predicate)
+    long = not everything and len(predicate) > CONDITION_WIDTH
+    return f"{predicate[:CONDITION_WIDTH].rstrip()} … (--all)" if long else predicate
 
 
 def _models(selection: "Selection", everything: bool) -> TextTable:
@@ -96,7 +96,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
 
     A search changes some columns from size to size: how many there are stands here.
     """
-    cohort, models, where = selection.cohort, selection.models, selection.cohort.condition.text
+    cohort, models, where = selection.cohort, selection.models, selection.cohort.predicate.text
     ranked = sorted(models, key=lambda model: model.pooled.rmse)
     shown = models if everything else [one for one in models if one in ranked[:BEST]]
     found = [] if everything else [model for one in selection.searched for model in one.models]

@@ -24,7 +24,7 @@ from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
-from fleet_slip.warehouse.condition import asking, parse_cohort, parse_condition
+from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
 from fleet_slip.warehouse.tables import Warehouse, connect_tables
 
 DRIVES = 5
@@ -36,7 +36,7 @@ FEWEST_NEW = 3
 MOST_TICKS = 100_000
 
 _LONGEST = """
-    SELECT drive_id, day FROM drives WHERE source = $source AND ({condition})
+    SELECT drive_id, day FROM drives WHERE source = $source AND ({predicate})
     ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
         rows DESC, drive_id
 """
@@ -81,9 +81,12 @@ def _look(
     """Return what looks wrong in some long drives, how many these are, and of how many."""
     signals = warehouse.catalog.signals
     found: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
-    condition = parse_condition(signals, manifest.trained_on.cohort)
-    query = _LONGEST.format(condition=condition.sql)
-    with connect_tables(warehouse, query + "log_counts") as database, asking(database, condition):
+    predicate = parse_predicate(signals, manifest.trained_on.cohort)
+    query = _LONGEST.format(predicate=predicate.sql)
+    with (
+        connect_tables(warehouse, query + "log_counts") as database,
+        guarded_query(database, predicate),
+    ):
         drives = database.execute(query, {"source": MEASURED}).fetchall()
         measured = len(drives)
         if made is not None:
@@ -127,13 +130,13 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
     """
     signals = warehouse.catalog.signals
-    condition = parse_cohort(signals, manifest.trained_on.cohort)
-    with open_grams(warehouse, DELAY, condition) as opened:
-        told = opened.batches(parse_condition(signals, ALL_DRIVES))
+    predicate = parse_cohort(signals, manifest.trained_on.cohort)
+    with open_grams(warehouse, DELAY, predicate) as opened:
+        told = opened.batches(parse_predicate(signals, ALL_DRIVES))
         delays = receiver_delays(told).cars
     feature_set = warehouse.catalog.name_of(manifest.trained_on.feature_set)
-    with open_grams(warehouse, feature_set, condition) as opened:
-        cars = dict(opened.course_delays(condition))
+    with open_grams(warehouse, feature_set, predicate) as opened:
+        cars = dict(opened.course_delays(predicate))
     left = {
         car: max((delays[car].value - GRAIN_S * parts for parts in corrected), key=abs)
         for car, corrected in cars.items()
@@ -175,9 +178,9 @@ def require_sound_course(
     warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
 ) -> None:
     """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
-    condition = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
+    predicate = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
-        cars = course_moments(reader, condition)
+        cars = course_moments(reader, predicate)
     faults: dict[str, Fault] = {}
     for car, drives in sorted(cars.items()):
         relation = relate(np.sum(list(drives.values()), axis=0), delays_s.get(car, 0.0))

@@ -27,7 +27,7 @@ from fleet_slip.regression.folds import least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, TextTable
-from fleet_slip.warehouse.condition import Condition, parse_cohort
+from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -128,27 +128,27 @@ class Chart(Answer):
 def monitor(
     warehouse: Warehouse,
     version: ModelVersion,
-    condition: str | Condition | None = None,
+    predicate: str | Predicate | None = None,
     since: date | None = None,
 ) -> Chart:
     """Chart a model's error day by day. Reads Gram rows only.
 
-    `condition` chooses the drives; by default those that satisfy the condition of its training.
+    `predicate` chooses the drives; by default those that satisfy the predicate of its training.
     Days from `since` are new; by default those after the last day of the logs it was trained on.
     Raises `DataError` if fewer than `min_training_days` are left to learn from.
     """
     catalog = warehouse.catalog
     limits, manifest = thresholds(warehouse.configs).monitor, version.manifest
-    condition = parse_cohort(catalog.signals, condition or manifest.trained_on.cohort)
+    predicate = parse_cohort(catalog.signals, predicate or manifest.trained_on.cohort)
     feature_set = catalog.name_of(manifest.trained_on.feature_set)
-    sums = sum_days(warehouse, manifest.signals, condition, feature_set)
+    sums = sum_days(warehouse, manifest.signals, predicate, feature_set)
     days, grams = sums.days, sums.grams
     last = _last_training_day(warehouse, version) if since is None else None
     training = [day < since if since else last is not None and day <= last for day in days]
     if sum(training) < limits.min_training_days:
         raise DataError(
             f"Drift charts need {limits.min_training_days} training days; {version.reference} has "
-            f"{sum(training)} in the cohort {condition.shown}. Choose another cohort, or a later "
+            f"{sum(training)} in the cohort {predicate.quoted}. Choose another cohort, or a later "
             "--since."
         )
     models = _models(catalog, manifest, feature_set, grams, training)
@@ -163,7 +163,7 @@ def monitor(
     mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
     judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
-    return Chart(version.reference, condition.text, judged, mean, std, feature_set, sums.left_out)
+    return Chart(version.reference, predicate.text, judged, mean, std, feature_set, sums.left_out)
 
 
 def _models(

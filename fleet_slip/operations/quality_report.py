@@ -26,8 +26,8 @@ from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
 from fleet_slip.quality.turning import find_implausible
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
-from fleet_slip.warehouse.condition import Condition, parse_cohort, parse_condition
 from fleet_slip.warehouse.database import sql_text
+from fleet_slip.warehouse.predicate import Predicate, parse_cohort, parse_predicate
 from fleet_slip.warehouse.tables import Warehouse
 
 
@@ -83,14 +83,14 @@ class QualityReport(Answer):
 
 
 def examine_drives(
-    warehouse: Warehouse, condition: str | Condition = TRAINING_DRIVES
+    warehouse: Warehouse, predicate: str | Predicate = TRAINING_DRIVES
 ) -> QualityReport:
-    """Examine the drives that satisfy a condition: labels beside all others, then model by model.
+    """Examine the drives that satisfy a predicate: labels beside all others, then model by model.
 
     Each drive is examined, whatever signals it has.
     Raises like `fleet_slip.grams.cohort.load_cohort`.
     """
-    drives = parse_cohort(warehouse.catalog.signals, condition)
+    drives = parse_cohort(warehouse.catalog.signals, predicate)
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
         known = _faulty_courses(reader, drives)
@@ -104,26 +104,26 @@ def examine_drives(
     )
 
 
-def _faulty_courses(reader: GramReader, condition: Condition) -> dict[str, Fault]:
+def _faulty_courses(reader: GramReader, predicate: Predicate) -> dict[str, Fault]:
     """Return the drives whose course is not one, if Gram rows of its changes are there."""
     return {
         drive: fault
-        for drives in course_moments(reader, condition).values()
+        for drives in course_moments(reader, predicate).values()
         for drive, moments in drives.items()
         if (relation := relate(moments)) and (fault := relation.fault)
     }
 
 
-def _vehicle_models(reader: GramReader, condition: Condition) -> list[Condition]:
-    """Return, for each vehicle model of a cohort, the condition that a drive is of it."""
-    opened = reader.opened(PLAIN, condition)
-    sources = opened.values_of("source", condition).to_pylist()
+def _vehicle_models(reader: GramReader, predicate: Predicate) -> list[Predicate]:
+    """Return, for each vehicle model of a cohort, the predicate that a drive is of it."""
+    opened = reader.opened(PLAIN, predicate)
+    sources = opened.values_of("source", predicate).to_pylist()
     if not sources:
-        raise empty_cohort_error(opened, condition)
-    require_training(sources, condition)
-    models = sorted(opened.values_of("vehicle_model", condition).to_pylist(), key=str)
+        raise empty_cohort_error(opened, predicate)
+    require_training(sources, predicate)
+    models = sorted(opened.values_of("vehicle_model", predicate).to_pylist(), key=str)
     return [
-        parse_condition(
+        parse_predicate(
             reader.catalog.signals, f"vehicle_model IS NOT DISTINCT FROM {sql_text(model)}"
         )
         for model in models

@@ -29,12 +29,12 @@ from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.condition import (
-    Condition,
-    asking,
+from fleet_slip.warehouse.predicate import (
+    Predicate,
     drive_columns,
+    guarded_query,
     hash_drive,
-    parse_condition,
+    parse_predicate,
     row_columns,
     without_drives,
 )
@@ -65,7 +65,7 @@ class SensorScreen:
     """What was found.
 
     Attributes:
-        cohort: the condition without the faulty drives.
+        cohort: the predicate without the faulty drives.
         drives: how many were long enough to be examined.
         found: the fault of each faulty drive, by its hash.
         missing: how many measured drives were not, since they have no Gram rows.
@@ -147,33 +147,33 @@ class _Piece(NamedTuple):
         drives, rows = self.drives + other.drives, self.rows + other.rows
         return _Piece(self.first, other.last, drives, rows)
 
-    def condition(self, signals: SignalCatalog) -> Condition:
+    def predicate(self, signals: SignalCatalog) -> Predicate:
         days = f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'"
-        return parse_condition(signals, days)
+        return parse_predicate(signals, days)
 
 
 def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     """Examine the drives of a cohort like `quality`; return it without the faulty ones.
 
-    Drives without Gram rows of `signals` are not examined, and counted. Of a condition on rows all
+    Drives without Gram rows of `signals` are not examined, and counted. Of a predicate on rows all
     drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
     nothing to examine.
     """
     signals = warehouse.catalog.signals
-    measured = parse_condition(signals, f"source IN ('{MEASURED}', '{RECEIVED}')")
-    asked = parse_condition(signals, cohort, row_columns(signals))
-    condition = measured if asked.columns - set(drive_columns(signals)) else asked & measured
+    measured = parse_predicate(signals, f"source IN ('{MEASURED}', '{RECEIVED}')")
+    asked = parse_predicate(signals, cohort, row_columns(signals))
+    predicate = measured if asked.columns - set(drive_columns(signals)) else asked & measured
     grams, logs = gram_snapshots(warehouse)
-    missing = _count_unreduced(warehouse, grams, logs, condition)
+    missing = _count_unreduced(warehouse, grams, logs, predicate)
     parts: list[Mapping[str, Any]] = []
-    for piece in _pieces(warehouse, condition) if _has_measured(grams) else []:
-        about = {"cohort": condition.text, "from": piece.first, "root": warehouse.root.uri}
+    for piece in _pieces(warehouse, predicate) if _has_measured(grams) else []:
+        about = {"cohort": predicate.text, "from": piece.first, "root": warehouse.root.uri}
         limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
         state = [piece.rows, sha256(canonical_json(limits).encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
         parts.append(
-            _known(kept, state) or _examine(warehouse, condition & piece.condition(signals))
+            _known(kept, state) or _examine(warehouse, predicate & piece.predicate(signals))
         )
         content = {**parts[-1], "state": state}
         keep_json(kept, {**content, "sha256": sha256_of(canonical_json(content))})
@@ -201,8 +201,8 @@ def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     return examined
 
 
-def _examine(warehouse: Warehouse, condition: Condition) -> Mapping[str, Any]:
-    report = examine_drives(warehouse, condition)
+def _examine(warehouse: Warehouse, predicate: Predicate) -> Mapping[str, Any]:
+    report = examine_drives(warehouse, predicate)
     found = {
         hash_drive(NAME, one.drive_id): [one.fault.kind, list(one.fault.signals), one.fault.figure]
         for one in report.findings
@@ -228,12 +228,12 @@ def _has_measured(grams: Snapshot) -> bool:
     return not sources.isdisjoint((MEASURED, RECEIVED))
 
 
-def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
+def _pieces(warehouse: Warehouse, predicate: Predicate) -> list[_Piece]:
     """Divide a cohort's days, so that new days change the last piece alone."""
     with GramReader(warehouse) as reader:
-        opened = reader.opened(PLAIN, condition)
-        statement = opened.statement("examined_days.sql", condition)
-        with asking(opened.database, condition):
+        opened = reader.opened(PLAIN, predicate)
+        statement = opened.statement("examined_days.sql", predicate)
+        with guarded_query(opened.database, predicate):
             found = opened.database.execute(statement).fetchall()
     pieces: list[_Piece] = []
     for day in (_Piece(day, day, drives, [rows]) for day, drives, rows in found if drives):
@@ -247,17 +247,17 @@ def _pieces(warehouse: Warehouse, condition: Condition) -> list[_Piece]:
 
 
 def _count_unreduced(
-    warehouse: Warehouse, grams: Snapshot, logs: Snapshot, condition: Condition
+    warehouse: Warehouse, grams: Snapshot, logs: Snapshot, predicate: Predicate
 ) -> int:
     """Return the number of a cohort's drives in log files without Gram rows."""
     missing = find_backlog(logs, grams).missing
     if not missing:
         return 0
-    query = f"SELECT count(*) FROM drives WHERE {condition.sql} AND source <> '{RECEIVED}'"
+    query = f"SELECT count(*) FROM drives WHERE {predicate.sql} AND source <> '{RECEIVED}'"
     others = frozenset(f.path for f in logs.files) - frozenset(f.path for f in missing)
     only = [grams, replace(logs, without=others)]
     with open_tables(warehouse, views_in(query), only) as database:
         lock(database, [path for one in only for path in one.paths])
-        with asking(database, condition):
+        with guarded_query(database, predicate):
             [(drives,)] = database.execute(query).fetchall()
     return int(drives)

@@ -241,12 +241,12 @@ def duckdb_message(error: BaseException) -> str:
 _RESTORE = "If a file is missing or damaged, restore it from a backup."
 
 
-# Which SQL may come from people: queries that only read, and conditions that last.
+# Which SQL may come from people: queries that only read, and predicates that last.
 #
 # The type of a statement does not tell. DuckDB lets a SELECT begin with a common table expression
 # that copies rows to a file or changes a table, and has table functions that run SQL from a
 # string. So what the parser made of the text is searched, where neither comments nor quotes hide
-# anything. A condition, which manifests keep, may moreover be made only of what means the same
+# anything. A predicate, which manifests keep, may moreover be made only of what means the same
 # everywhere, for ever.
 
 LONGEST_QUERY = 100_000
@@ -370,7 +370,7 @@ FUNCTIONS = words(
 )
 """Functions of their arguments alone, the same on every machine and in every version of DuckDB.
 
-None makes a text longer than its arguments together, so that the cost of a condition is bounded by
+None makes a text longer than its arguments together, so that the cost of a predicate is bounded by
 its length. `to_days` and its like are what INTERVAL becomes, `list_value` is a list in brackets."""
 
 TYPES = words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
@@ -378,7 +378,7 @@ TYPES = words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECI
 
 
 def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
-    """Yield what is not allowed in an expression on some columns, as what a condition does."""
+    """Yield what is not allowed in an expression on some columns, as what a predicate does."""
     for node in _nodes(tree):
         if problem := _problem(node, columns):
             yield problem
@@ -437,6 +437,6 @@ def _function_problem(node: Tree) -> str | None:
     if name in FUNCTIONS | _SYMBOLS and plain and not node["order_bys"]["orders"]:
         return None
     return (
-        f"calls {printable(name)!r}. A condition must always mean the same, so it may call only: "
+        f"calls {printable(name)!r}. A predicate must always mean the same, so it may call only: "
         f"{', '.join(sorted(FUNCTIONS))}."
     )

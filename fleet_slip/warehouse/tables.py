@@ -351,7 +351,7 @@ def open_tables(
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection, to be locked yet, with some views on snapshots of their tables.
 
-    Logs and Gram rows are `of` the drives that satisfy this SQL condition. No view has rows of
+    Logs and Gram rows are `of` the drives that satisfy this SQL predicate. No view has rows of
     erased cars and drives, even if the tables have them again.
     """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)

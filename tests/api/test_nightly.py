@@ -20,7 +20,7 @@ from fleet_slip.errors import StorageError, UsageError
 from fleet_slip.operations.night import Beginning, NightReport, Nights
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.condition import hash_drive, parse_condition, without_drives
+from fleet_slip.warehouse.predicate import hash_drive, parse_predicate, without_drives
 from tests.support.cars import counts, drive
 from tests.support.catalog import SIGNALS
 from tests.support.commands import Finished, run_on, start_on, until
@@ -350,13 +350,13 @@ def test_a_changed_record_is_refused(nights: Nights, tmp_path: Path) -> None:
 
 def test_drives_are_left_out_by_hashes_that_do_not_name_them() -> None:
     hashes = [hash_drive("fleet", drive) for drive in ("car's <1>", "b")]
-    condition = without_drives("mass_kg > 1000 OR true", "fleet", hashes)
-    parse_condition(SIGNALS, condition)
-    assert "car" not in condition
+    predicate = without_drives("mass_kg > 1000 OR true", "fleet", hashes)
+    parse_predicate(SIGNALS, predicate)
+    assert "car" not in predicate
     with duckdb.connect() as database:
         left = database.execute(
             "SELECT drive_id FROM (VALUES ('car''s <1>', 1320), ('b', 1320), ('c', 1320)) "
-            f"AS drives(drive_id, mass_kg) WHERE {condition}"
+            f"AS drives(drive_id, mass_kg) WHERE {predicate}"
         ).fetchall()
     assert left == [("c",)]
     assert without_drives("true", "fleet", []) == "true"

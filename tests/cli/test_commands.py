@@ -251,12 +251,12 @@ def test_commands_on_an_empty_warehouse_say_how_to_begin(
 def test_a_long_condition_is_not_printed_whole_unless_all_is(
     run_command: RunCommand, smoke_root: Path
 ) -> None:
-    condition = "drive_id NOT IN (" + ", ".join(f"'car-{i:03}'" for i in range(50)) + ")"
-    asked = ("select", "--cohort", condition, "--models", "table1")
+    predicate = "drive_id NOT IN (" + ", ".join(f"'car-{i:03}'" for i in range(50)) + ")"
+    asked = ("select", "--cohort", predicate, "--models", "table1")
     short = run_command(*asked, root=smoke_root).stdout
-    assert condition[:60] in short
+    assert predicate[:60] in short
     assert "… (--all); " in short
-    assert condition in run_command(*asked, "--all", root=smoke_root).stdout
+    assert predicate in run_command(*asked, "--all", root=smoke_root).stdout
 
 
 def test_a_changed_campaign_is_refused_and_changes_nothing(

@@ -248,7 +248,7 @@ def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
     in_python = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
     assert in_python == options
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
-    assert taken["select"] - {"json", "condition", "everything", "include_faulty"} == options
+    assert taken["select"] - {"json", "predicate", "everything", "include_faulty"} == options
     assert taken["publish"] & options == options
 
 

@@ -145,10 +145,10 @@ def chosen_once() -> Iterator[None]:
     """Let what is asked for again be shown again: to choose takes longer than to show."""
     answer, answers = select.answer_request, dict[str, select.Selection]()
 
-    def once(warehouse: Warehouse, request: SelectionRequest, condition: str) -> select.Selection:
-        asked = f"{request} {condition}"
+    def once(warehouse: Warehouse, request: SelectionRequest, predicate: str) -> select.Selection:
+        asked = f"{request} {predicate}"
         if asked not in answers:
-            answers[asked] = answer(warehouse, request, condition)
+            answers[asked] = answer(warehouse, request, predicate)
         return answers[asked]
 
     with pytest.MonkeyPatch.context() as patch:

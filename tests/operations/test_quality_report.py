@@ -26,7 +26,7 @@ from fleet_slip.quality.label_consistency import find_repeated
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.cars import TICKS, Signals, broken, counts, drive, gram_of, with_course
 from tests.support.catalog import CATALOG, SIGNALS
@@ -53,7 +53,7 @@ def cohort_of(some: Sequence[Driven]) -> Cohort:
     for name, values in {"day": [*days], **same}.items():
         table = table.append_column(name, [values])
     return Cohort(
-        condition=parse_condition(SIGNALS, "true"),
+        predicate=parse_predicate(SIGNALS, "true"),
         logs_version=1,
         grams_version=1,
         drives=table,
@@ -193,10 +193,10 @@ def test_vehicle_models_are_examined_one_after_the_other(
         ]
         land(warehouse, str(file), *rows)
     update_grams(warehouse)
-    for condition in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
-        cohort = load_cohort(warehouse, f"{condition}\n")
+    for predicate in ("true", "drive_id LIKE '%-1' -- and '%-11'", "vehicle_model IS NULL"):
+        cohort = load_cohort(warehouse, f"{predicate}\n")
         together = examine(cohort, find_wrong_labels(cohort))
-        assert examine_drives(warehouse, condition) == together
+        assert examine_drives(warehouse, predicate) == together
         assert together.drives > 0
     with pytest.raises(DataError, match="no drive matches"):
         examine_drives(warehouse, "mass_kg > 1e9")

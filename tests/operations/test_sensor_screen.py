@@ -15,8 +15,8 @@ from fleet_slip.models.acceptance import load_floor
 from fleet_slip.operations import quality_report, sensor_screen
 from fleet_slip.operations.quality_report import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.warehouse.condition import (
-    Condition,
+from fleet_slip.warehouse.predicate import (
+    Predicate,
     describe_cohort,
     hash_drive,
     with_all_drives,
@@ -189,7 +189,7 @@ def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     assert once != asked != twice
     assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
     assert describe_cohort(once) == f"{asked}, without 1 faulty drive"
-    assert Condition(twice, "").shown == f"{asked!r}, without 2 faulty drives"
+    assert Predicate(twice, "").quoted == f"{asked!r}, without 2 faulty drives"
     assert describe_cohort(asked) == asked
 
 
@@ -199,9 +199,9 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
     asked: list[str] = []
     real = quality_report.examine_drives
 
-    def counted(warehouse: Warehouse, condition: Condition) -> QualityReport:
-        asked.append(condition.text)
-        return real(warehouse, condition)
+    def counted(warehouse: Warehouse, predicate: Predicate) -> QualityReport:
+        asked.append(predicate.text)
+        return real(warehouse, predicate)
 
     monkeypatch.setattr(sensor_screen, "examine_drives", counted)
     monkeypatch.setattr(sensor_screen, "PIECE", 4)
@@ -223,8 +223,8 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
     monkeypatch.setattr(sensor_screen, "PIECE", 150)
     fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
 
-    def ask(warehouse: Warehouse, condition: Condition) -> QualityReport:
-        asked.append(condition.sql)
+    def ask(warehouse: Warehouse, predicate: Predicate) -> QualityReport:
+        asked.append(predicate.sql)
         return QualityReport(0, 0, ())
 
     monkeypatch.setattr(sensor_screen, "examine_drives", ask)

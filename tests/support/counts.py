@@ -18,7 +18,7 @@ from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 from tests.support.catalog import CATALOG, SIGNALS
 
 Matrix = NDArray[Any]
@@ -197,7 +197,7 @@ def driven(
 
 
 def cohort_of(
-    drives: Sequence[Driven], *, feature_set: str = PLAIN, condition: str = "true"
+    drives: Sequence[Driven], *, feature_set: str = PLAIN, predicate: str = "true"
 ) -> Cohort:
     """Return the cohort of drives that all have the same signals."""
     (signals,) = {one.signals for one in drives}
@@ -221,7 +221,7 @@ def cohort_of(
         for name in ("drive", "vehicle")
     }
     return Cohort(
-        condition=parse_condition(SIGNALS, condition),
+        predicate=parse_predicate(SIGNALS, predicate),
         tables=(table,),
         drives=pa.table(columns),
         logs_version=1,

@@ -19,7 +19,7 @@ from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weights, weighted
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.tables import Warehouse, open_tables
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
@@ -42,7 +42,7 @@ def cohort() -> Cohort:
         "n": [10] * len(ROWS),
     }
     return Cohort(
-        condition=parse_condition(SIGNALS, "true"),
+        predicate=parse_predicate(SIGNALS, "true"),
         logs_version=1,
         grams_version=1,
         drives=pa.table(columns),
@@ -161,7 +161,7 @@ def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
 def test_a_reader_that_failed_leaves_nothing(warehouse: Warehouse, opened: list[object]) -> None:
     land_another(warehouse, 0)
     with pytest.raises(DataError, match="as a query may"), GramReader(warehouse) as failing:
-        failing.opened(PLAIN, parse_condition(SIGNALS, "true"))
+        failing.opened(PLAIN, parse_predicate(SIGNALS, "true"))
         raise DataError("as a query may")
     load_cohort(warehouse)
     assert len(opened) == 2

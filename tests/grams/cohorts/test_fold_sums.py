@@ -19,7 +19,7 @@ from fleet_slip.models.select import answer_request, select
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
-from fleet_slip.warehouse.condition import parse_condition
+from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.growth_history import write_fleet, write_grams
@@ -109,14 +109,14 @@ def test_days_add_up_to_those_of_the_drives(
 
 
 @pytest.mark.parametrize(
-    "condition",
+    "predicate",
     ["mass_kg > 1e9", "no_such_column = 1", "mass_kg >", "drive_id = 'drive-000000001'"],
 )
-def test_errors_are_those_of_the_cohort(fleet: Warehouse, condition: str) -> None:
+def test_errors_are_those_of_the_cohort(fleet: Warehouse, predicate: str) -> None:
     with pytest.raises(FleetSlipError) as whole:
-        load_cohort(fleet, condition).folds("drive", 5)
+        load_cohort(fleet, predicate).folds("drive", 5)
     with pytest.raises(type(whole.value)) as summed:
-        load_cohort(fleet, condition, folding=Folding())
+        load_cohort(fleet, predicate, folding=Folding())
     assert str(summed.value) == str(whole.value)
 
 
@@ -193,9 +193,9 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
 
     with GramReader(warehouse) as reader:
         before = load_cohort(reader, folding=plan)
-        opened = reader.opened(PLAIN, parse_condition(SIGNALS, "true")).database
+        opened = reader.opened(PLAIN, parse_predicate(SIGNALS, "true")).database
         assert load_cohort(reader, "adhesion > 0.7", folding=plan).drive_count == 14
-        assert reader.opened(PLAIN, parse_condition(SIGNALS, "true")).database is opened
+        assert reader.opened(PLAIN, parse_predicate(SIGNALS, "true")).database is opened
         assert tables(load_cohort(reader, folding=plan)) == tables(before)
         write_grams(warehouse, [warehouse.logs.snapshot().files[0].path], 10)
         after = load_cohort(reader, folding=plan)

@@ -23,8 +23,8 @@ from fleet_slip.grams.receiver_delay import (
     with_pooled,
     with_types,
 )
-from fleet_slip.warehouse.condition import parse_condition
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
+from fleet_slip.warehouse.predicate import parse_predicate
 from tests.support.catalog import SIGNALS
 
 CAMPAIGN = """
@@ -131,9 +131,9 @@ def test_a_car_of_few_drives_takes_the_delay_of_its_type_and_one_of_many_its_own
 def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path: Path) -> None:
     """The drives of one car stand in for those of five, of which one has had two receivers."""
     fleet = late_fleet(tmp_path, 0.087)
-    condition = parse_condition(SIGNALS, "true")
-    with open_grams(fleet.warehouse, DELAY, condition) as opened:
-        rows = pa.Table.from_batches(opened.batches(condition)).sort_by("drive_id")
+    predicate = parse_predicate(SIGNALS, "true")
+    with open_grams(fleet.warehouse, DELAY, predicate) as opened:
+        rows = pa.Table.from_batches(opened.batches(predicate)).sort_by("drive_id")
     assert rows["receiver"].unique().to_pylist() == ["box"]
     cars = pa.array(list("aabbcdee"))
     order = np.unique(rows["drive_id"].to_pylist(), return_inverse=True)[1]

@@ -125,14 +125,14 @@ def names(rng: random.Random, place: Path) -> None:
     )
     update_grams(warehouse, no_progress)
     quoted = vehicle.strip().replace("'", "''")
-    condition = rng.choice(
+    predicate = rng.choice(
         [*[f"vehicle_id = '{quoted}'"] * 5, f"track = '{track}'", vehicle, "true"]
     )
     with connect(root) as database:
         database.sql("FROM log").fetchall()
         database.sql("FROM drives").fetchall()
-    load_cohort(warehouse, condition)
-    answer_request(warehouse, SelectionRequest(nested="ax", by=rng.choice(FOLD_KEYS)), condition)
+    load_cohort(warehouse, predicate)
+    answer_request(warehouse, SelectionRequest(nested="ax", by=rng.choice(FOLD_KEYS)), predicate)
 
 
 def references(rng: random.Random, place: Path) -> None:

@@ -1,4 +1,4 @@
-"""A condition is one expression on a drive's columns, and means the same for ever."""
+"""A predicate is one expression on a drive's columns, and means the same for ever."""
 
 import duckdb
 import numpy as np
@@ -16,8 +16,8 @@ from fleet_slip.models.score import cohort_of_rows, score
 from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.quality_report import examine_drives
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.condition import asking, parse_condition
 from fleet_slip.warehouse.database import open_database
+from fleet_slip.warehouse.predicate import guarded_query, parse_predicate
 from fleet_slip.warehouse.tables import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.logs import land, log_rows, random_counts
@@ -64,7 +64,7 @@ NOT_ALONE = [
     "true, true",
     "true /*",
     "true OR",
-    "{condition}",
+    "{predicate}",
     "\ud800",
     "drive_id = '\0'",
     "(" * 3000 + "true" + ")" * 3000,
@@ -118,7 +118,7 @@ MORE_THAN_COLUMNS = [
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
     """A warehouse of four drives with different metadata."""
-    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("condition") / "data"))
+    warehouse = Warehouse(LocalFolder(tmp_path_factory.mktemp("predicate") / "data"))
     rng = np.random.default_rng(1)
     drives = [
         log_rows(f"d{i}", random_counts(rng, 30), adhesion=0.6 + 0.1 * i, mass_kg=1200.0 + 100 * i)
@@ -136,22 +136,22 @@ def drives(fleet: Warehouse) -> pa.Table:
 
 @pytest.mark.parametrize("text", LASTING)
 def test_what_stands_in_statements_means_what_was_written(drives: pa.Table, text: str) -> None:
-    condition = parse_condition(SIGNALS, text)
+    predicate = parse_predicate(SIGNALS, text)
     with DATABASE.cursor() as database:
         database.register("drives", drives)
         written, meant = (
             database.execute(f"SELECT drive_id FROM drives WHERE ({where}\n)").fetchall()
-            for where in (text, condition.sql)
+            for where in (text, predicate.sql)
         )
     assert written == meant
-    assert parse_condition(SIGNALS, condition.sql)
-    assert str(condition) == text
+    assert parse_predicate(SIGNALS, predicate.sql)
+    assert str(predicate) == text
 
 
 @pytest.mark.parametrize("text", [*NOT_ALONE, *FLEETING, *MORE_THAN_COLUMNS])
 def test_anything_else_is_refused(text: str) -> None:
     with pytest.raises(QuestionError) as refused:
-        parse_condition(SIGNALS, text)
+        parse_predicate(SIGNALS, text)
     assert str(refused.value).isprintable()
     assert len(str(refused.value)) < 1500
 
@@ -172,21 +172,21 @@ def test_every_way_in_passes_the_same_gate(fleet: Warehouse, text: str) -> None:
         lambda: monitor(fleet, ModelVersion(1, kept, "", fleet.catalog)),
     )
     for way in ways:
-        with pytest.raises(QuestionError, match="the condition"):
+        with pytest.raises(QuestionError, match="the predicate"):
             way()
 
 
 def test_a_score_may_ask_about_rows() -> None:
     assert "abs(ay_mps2) > 3" in cohort_of_rows(SIGNALS, "abs(ay_mps2) > 3").sql
     with pytest.raises(QuestionError, match="ay_mps2"):
-        parse_condition(SIGNALS, "abs(ay_mps2) > 3")
+        parse_predicate(SIGNALS, "abs(ay_mps2) > 3")
 
 
 def test_conditions_are_joined_as_they_are_meant() -> None:
-    both = parse_condition(SIGNALS, "adhesion < 1 OR true") & parse_condition(SIGNALS, "false")
+    both = parse_predicate(SIGNALS, "adhesion < 1 OR true") & parse_predicate(SIGNALS, "false")
     answer = DATABASE.execute(f"SELECT {both.sql} FROM (SELECT 2 AS adhesion)").fetchall()
     assert answer == [(False,)]
-    assert parse_condition(SIGNALS, both.text)
+    assert parse_predicate(SIGNALS, both.text)
 
 
 @settings(max_examples=300)
@@ -207,7 +207,7 @@ def test_conditions_are_joined_as_they_are_meant() -> None:
 )  # fmt: skip
 def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
     try:
-        condition = parse_condition(SIGNALS, text)
+        predicate = parse_predicate(SIGNALS, text)
     except QuestionError:
         return
     names = {**SIGNALS.drive_schema.empty_table().to_pydict(), "day": []}
@@ -217,7 +217,7 @@ def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
         else f"DATE '2024-05-01' AS {n}"
         for n in names
     )
-    statement = f"SELECT count(*) FROM (SELECT {columns}) WHERE false AND {condition.sql}"
+    statement = f"SELECT count(*) FROM (SELECT {columns}) WHERE false AND {predicate.sql}"
     try:
         assert DATABASE.execute(statement).fetchall() == [(0,)]
     except duckdb.Error as error:
@@ -225,23 +225,23 @@ def test_whatever_passes_cannot_leave_its_parentheses(text: str) -> None:
 
 
 def test_asking_ends_when_the_time_is_over() -> None:
-    condition = parse_condition(SIGNALS, "true")
+    predicate = parse_predicate(SIGNALS, "true")
     endless = "SELECT count(*) FROM range(1000000) a(x), range(1000000) b(y) WHERE x * y % 7 = 3"
     with (
         duckdb.connect() as database,
         pytest.raises(QuestionError, match="took more than"),
-        asking(database, condition, limit_s=0.1),
+        guarded_query(database, predicate, limit_s=0.1),
     ):
         database.execute(endless).fetchall()
 
 
 @pytest.mark.parametrize(
-    "condition", ["regexp_matches(drive_id, '(')", "drive_id SIMILAR TO '['", "drive_id ~ '*'"]
+    "predicate", ["regexp_matches(drive_id, '(')", "drive_id SIMILAR TO '['", "drive_id ~ '*'"]
 )
-def test_a_wrong_regular_expression_is_a_wrong_question(fleet: Warehouse, condition: str) -> None:
+def test_a_wrong_regular_expression_is_a_wrong_question(fleet: Warehouse, predicate: str) -> None:
     for folding in (None, Folding()):
         with pytest.raises(QuestionError, match="cannot be evaluated"):
-            load_cohort(fleet, condition, folding=folding)
+            load_cohort(fleet, predicate, folding=folding)
 
 
 def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
@@ -249,6 +249,6 @@ def test_what_fails_in_the_middle_of_an_answer_is_a_wrong_question() -> None:
     query = "SELECT CAST(if(i < 9000, '1', 'spa') AS INTEGER) FROM range(10000) t(i)"
     with open_database() as database:
         batches = database.sql(query).to_arrow_reader(1000)
-        asked = parse_condition(SIGNALS, "campaign = 1")
-        with pytest.raises(QuestionError, match="string 'spa'"), asking(database, asked):
+        asked = parse_predicate(SIGNALS, "campaign = 1")
+        with pytest.raises(QuestionError, match="string 'spa'"), guarded_query(database, asked):
             assert not list(batches)
