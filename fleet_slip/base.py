@@ -129,7 +129,7 @@ def last_day(through: date | str | None, name: str = "--through") -> date | None
 
 
 @contextmanager
-def needed(extra: str, purpose: str) -> Iterator[None]:
+def require_extra(extra: str, purpose: str) -> Iterator[None]:
     """Import what an extra brings; raises `ExtraError` that says how to install it and what for."""
     try:
         yield
@@ -183,12 +183,12 @@ def name_key(name: str) -> str:
 # How messages say numbers with their nouns, and names from strangers.
 
 
-def number_of(number: int, noun: str) -> str:
+def pluralize(number: int, noun: str) -> str:
     """Return a number of things, such as `1 drive` or `1,500 Gram rows`."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
-def shown(text: object) -> str:
+def quote_name(text: object) -> str:
     """Return a name as it can stand in a one-line message, whatever characters it has."""
     plain = str(text)
     return plain if plain.isprintable() else repr(plain)

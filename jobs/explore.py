@@ -18,24 +18,24 @@ def _():
     from matplotlib.figure import Figure
 
     import fleet_slip
-    from fleet_slip.base import number_of
+    from fleet_slip.base import pluralize
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.evaluation.watch import drive_frames
     from fleet_slip.pages.drawing import colour
 
     return (
         Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,
-        drive_frames, fleet_slip, mo, np, number_of, pl,
+        drive_frames, fleet_slip, mo, np, pluralize, pl,
     )  # fmt: skip
 
 
 @app.cell
-def _(fleet_slip, mo, number_of):
+def _(fleet_slip, mo, pluralize):
     fleet = fleet_slip.open(mo.cli_args().get("root"), mo.cli_args().get("config"))
     with fleet.session() as session:
         drives = session.sql("SELECT * FROM drives ORDER BY drive_id").pl()
         trained = session.sql("SELECT DISTINCT name FROM models ORDER BY 1").pl()["name"].to_list()
-    found = f"{number_of(drives.height, 'drive')}, {number_of(len(trained), 'model')}"
+    found = f"{pluralize(drives.height, 'drive')}, {pluralize(len(trained), 'model')}"
     mo.md(f"# Drives and models of {fleet.root}\n\n{found}")
     return drives, fleet, trained
 
@@ -72,7 +72,7 @@ def _(across, alt, mo, training, up):
 
 
 @app.cell
-def _(FleetSlipError, chart, fleet, mo, number_of, pl, training):
+def _(FleetSlipError, chart, fleet, mo, pluralize, pl, training):
     chosen = chart.value if len(chart.value) else training
     listed = ", ".join("'" + name.replace("'", "''") + "'" for name in chosen["drive_id"].unique())
     try:
@@ -91,7 +91,7 @@ def _(FleetSlipError, chart, fleet, mo, number_of, pl, training):
         told = mo.vstack([mo.md(f"{compared.winner.reason}"), mo.ui.table(results)])
     except FleetSlipError as error:
         told = mo.callout(str(error), kind="warn")
-    mo.vstack([mo.md(f"**{number_of(chosen['drive_id'].n_unique(), 'drive')}**"), told])
+    mo.vstack([mo.md(f"**{pluralize(chosen['drive_id'].n_unique(), 'drive')}**"), told])
     return
 
 
@@ -132,7 +132,7 @@ def _(
 
 
 @app.cell
-def _(fleet, mo, name, number_of, pl):
+def _(fleet, mo, name, pluralize, pl):
     mo.stop(name.value is None)
     versions = fleet.registry()
     terms = pl.DataFrame(
@@ -142,7 +142,7 @@ def _(fleet, mo, name, number_of, pl):
             for term in versions.load(name.value, number).manifest.terms
         ]
     )
-    counted = number_of(terms["version"].n_unique(), "version")
+    counted = pluralize(terms["version"].n_unique(), "version")
     mo.md(f"## Coefficients over {counted} of {name.value}")
     return (terms,)
 

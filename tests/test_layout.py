@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fleet_slip
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 
 PACKAGE = Path(fleet_slip.__file__).parent
 MODULES = {path: path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
@@ -32,4 +32,4 @@ def test_no_two_public_classes_have_one_name() -> None:
     ],
 )
 def test_one_thing_is_singular(number: int, noun: str, said: str) -> None:
-    assert number_of(number, noun) == said
+    assert pluralize(number, noun) == said

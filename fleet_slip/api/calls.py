@@ -23,7 +23,7 @@ from typing import (
 
 from typing_extensions import Doc
 
-from fleet_slip.base import Progress, needed, no_progress
+from fleet_slip.base import Progress, no_progress, require_extra
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.models.request import DEFAULT_MODELS, WORTH
@@ -161,7 +161,7 @@ def open_workers(root: Folder, workers: Workers) -> Iterator[Executor]:
     if isinstance(workers, Executor):
         context = nullcontext(workers)
     elif isinstance(workers, str):
-        with needed("cluster", "a cluster"):
+        with require_extra("cluster", "a cluster"):
             from fleet_slip.compute.cluster import cluster_executor  # slow
         context = cluster_executor(workers, absolute(root))
     else:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import NightRequest, of_step
 from fleet_slip.api.training import Training
-from fleet_slip.base import date_of, number_of
+from fleet_slip.base import date_of, pluralize
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.models.registry import CANDIDATE, ModelVersion
@@ -180,9 +180,9 @@ class Night:
         except RepeatedError as error:  # all others are in
             again = str(error)
         rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
-        told = f"{number_of(max(rows, 0), 'new row')}."
+        told = f"{pluralize(max(rows, 0), 'new row')}."
         if replaced := sum(one.drives_replaced for one in reports):
-            drives = number_of(replaced, "drive")
+            drives = pluralize(replaced, "drive")
             told = f"{told} The mapping was corrected: {drives} replaced."
         if again:
             return "attention", f"{told} Left out: {again}"
@@ -193,7 +193,7 @@ class Night:
 
     def _gram(self) -> Told:
         self.training.gram(self.fleet, self.asked.workers, self.asked.progress)
-        return "done", f"Of {number_of(self._now().drives, 'drive')}."
+        return "done", f"Of {pluralize(self._now().drives, 'drive')}."
 
     def _quality(self) -> Told:
         found = self.fleet.cohort(self.training.cohort).examine()
@@ -202,7 +202,7 @@ class Night:
         hashes = {hash_drive(self.training.name, one.drive_id) for one in self.faults}
         new = len(hashes - self.before.known)
         told = (
-            f"{number_of(found.drives, 'drive')} checked: {new} newly faulty, {len(hashes)} "
+            f"{pluralize(found.drives, 'drive')} checked: {new} newly faulty, {len(hashes)} "
             "faulty in all, left out of training."
         )
         return "attention" if new else "done", told
@@ -218,8 +218,8 @@ class Night:
             return "left out", str(error)
         new = [day for day in self.chart.days if not day.training]
         drives = self.chart.drives_left_out
-        left_out = f" {number_of(drives, 'drive')} without a log left out." if drives else ""
-        told = f"{champion} on {number_of(len(new), 'new day')}: "
+        left_out = f" {pluralize(drives, 'drive')} without a log left out." if drives else ""
+        told = f"{champion} on {pluralize(len(new), 'new day')}: "
         if self.chart.alarms:
             return "attention", f"{told}beyond its limits on {self.chart.alarm}.{left_out}"
         return "done", f"{told}within its limits.{left_out}"
@@ -244,7 +244,7 @@ class Night:
         told = of_step(self.asked.progress, "verify")
         checked = self.fleet.check(SAMPLE_FILES, begin=self.night.toordinal(), progress=told)
         return "done", (
-            f"{number_of(checked.rows, 'row')} of {number_of(checked.files, 'file')} and their "
+            f"{pluralize(checked.rows, 'row')} of {pluralize(checked.files, 'file')} and their "
             "Gram rows verified."
         )
 
@@ -253,6 +253,6 @@ class Night:
         report = self.fleet.retain(self.asked.retention, progress=told)
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
         return "done", (
-            f"{number_of(forgotten, 'drive')} before {report.before} forgotten, "
-            f"{number_of(removed, 'old file')} removed."
+            f"{pluralize(forgotten, 'drive')} before {report.before} forgotten, "
+            f"{pluralize(removed, 'old file')} removed."
         )

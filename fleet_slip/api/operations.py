@@ -19,7 +19,7 @@ from fleet_slip.api.calls import (
     within_reach,
 )
 from fleet_slip.api.models import JudgedModels
-from fleet_slip.base import date_of, normalize_name, number_of
+from fleet_slip.base import date_of, normalize_name, pluralize
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -53,12 +53,12 @@ class Compacted(Answer):
                 yield TextTable("", "would be removed", zip(self.vacuumed.files))
         elif found.changed:
             yield Remark(
-                f"{number_of(found.files_before, 'file')} became {found.files_after}; "
+                f"{pluralize(found.files_before, 'file')} became {found.files_after}; "
                 f"{found.rows_rewritten:,} rows were written again, "
                 f"{found.size_bytes_before:,} bytes became {found.size_bytes_after:,}"
             )
         else:
-            files = number_of(found.files_after, "file")
+            files = pluralize(found.files_after, "file")
             yield Remark(f"nothing to compact: {files}, large or alone in the day")
         yield self.vacuumed.remark
 

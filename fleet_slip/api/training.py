@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import ShowStep, Workers, of_step
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.course import COURSE
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, ConfigError, FleetSlipError, InputError, RefusedError
@@ -155,7 +155,7 @@ class Trained(Answer):
         """Return what each step did."""
         for gram in self.grams:
             name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set}"
-            read, made = number_of(gram.rows_read, "row"), number_of(gram.gram_rows, "Gram row")
+            read, made = pluralize(gram.rows_read, "row"), pluralize(gram.gram_rows, "Gram row")
             if gram.changed or gram in self.grams[:2]:
                 yield Remark(f"{name}: {read} read, {made}")
         if self.selection:
@@ -245,7 +245,7 @@ class LearnReport(Trained):
         if self.changed:
             new = [one for one in self.ingested if one.new]
             drives, rows = (sum(getattr(o.counts, n) for o in new) for n in ("drives", "ticks"))
-            yield Remark(f"ingested {number_of(drives, 'drive')}, {number_of(rows, 'row')}")
+            yield Remark(f"ingested {pluralize(drives, 'drive')}, {pluralize(rows, 'row')}")
             yield from (Remark(f"{file}: looks wrong: {found}") for found, file in looks.items())
             yield from self.training_parts(everything)
         else:

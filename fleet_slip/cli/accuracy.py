@@ -9,7 +9,7 @@ import typer
 
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import needed
+from fleet_slip.base import require_extra
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, print_answer, say
 from fleet_slip.cli.progress import progress
@@ -184,7 +184,7 @@ def explore(
 
     Example: fleet-slip explore --headless
     """
-    with needed("explore", "the notebook"):
+    with require_extra("explore", "the notebook"):
         import altair  # noqa: F401, PLC0415 - an extra
         import marimo  # noqa: F401, PLC0415
         import numba  # noqa: F401, PLC0415

@@ -12,7 +12,7 @@ import typer
 from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.training import LearnReport, RunReport
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.errors import FleetSlipError
@@ -149,7 +149,7 @@ def _say_of_lost(fleet: Fleet, campaign: str, model: str) -> None:
     if lost:
         cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
         say(
-            f"in {lost:,} of {number_of(drives, 'drive')} the car lost control; the model was "
+            f"in {lost:,} of {pluralize(drives, 'drive')} the car lost control; the model was "
             "trained on these, too. Without them:"
         )
         say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.cli.options import Cluster, command
 from fleet_slip.cli.output import Json, print_json, print_parts, say
@@ -111,7 +111,7 @@ def ingest(
             print_json(reports)
         elif folders:
             new = sum(report.new for report in reports)
-            say(_ingested(number_of(new, "new file"), reports) if new else "nothing new")
+            say(_ingested(pluralize(new, "new file"), reports) if new else "nothing new")
         _require_sound(reports)
 
 
@@ -136,13 +136,13 @@ def _ingested(what: str, reports: "Sequence[IngestReport]") -> str:
     reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in refused.items())
     left_out = sum(report.counts.rows_left_out for report in new)
     ticks, drives = (sum(getattr(one.counts, name) for one in new) for name in ("ticks", "drives"))
-    text = f"{what}: {number_of(ticks, 'row')} in {number_of(drives, 'drive')}"
+    text = f"{what}: {pluralize(ticks, 'row')} in {pluralize(drives, 'drive')}"
     if left_out:
-        text += f"; excluded by the mapping's conditions: {number_of(left_out, 'row')}"
+        text += f"; excluded by the mapping's conditions: {pluralize(left_out, 'row')}"
     if refused:
-        text += f"; in quarantine: {number_of(refused.total(), 'row')} ({reasons})"
+        text += f"; in quarantine: {pluralize(refused.total(), 'row')} ({reasons})"
     if replaced := sum(report.drives_replaced for report in new):
-        text += f"; {number_of(replaced, 'drive')} replaced"
+        text += f"; {pluralize(replaced, 'drive')} replaced"
     return text + skipped_drives(sum(report.drives_forgotten for report in new))
 
 
@@ -154,7 +154,7 @@ def _show_previews(previews: "list[Preview]", json: bool) -> None:
         for preview in previews:
             print_parts(preview.parts())
     if suspicions := sum(len(preview.alarms) for preview in previews):
-        raise AlarmError(f"{number_of(suspicions, 'suspicion')}, see above. Nothing was stored.")
+        raise AlarmError(f"{pluralize(suspicions, 'suspicion')}, see above. Nothing was stored.")
 
 
 # The command that helps to write mappings.

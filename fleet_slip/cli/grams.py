@@ -8,7 +8,7 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog, FeatureSet
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
@@ -160,7 +160,7 @@ def _families(catalog: Catalog) -> TextTable:
     single = (*file.products, *file.estimates, *file.slopes, *file.factors, *file.calibrated)
     families += [[name, "", file.time_columns[name].description] for name in single]
     families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in file.gates.items()]
-    many = number_of(len(file.time_columns), "column")
+    many = pluralize(len(file.time_columns), "column")
     title = f"\n{many} over time; one by one: --all"
     return TextTable(title, "column|over ticks|description", families, left=3)
 

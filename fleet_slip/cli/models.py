@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.models.manifest import CrossValidated, LearnedFrom
@@ -86,7 +86,7 @@ def _teacher(learned: LearnedFrom) -> str:
     unsure = learned.intercept_uncertainty_deg
     uncertain = "uncertainty unknown" if unsure is None else f"uncertain by {unsure:.2g} deg"
     return (
-        f"{told}. Intercept where {number_of(learned.cars, 'car')} "
+        f"{told}. Intercept where {pluralize(learned.cars, 'car')} "
         f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertain}"
     )
 
@@ -131,8 +131,8 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         manifest.trained_on,
         manifest.selected_by,
     )
-    drives = f"{number_of(trained.drives, 'drive')} of {number_of(trained.vehicles, 'car')}, "
-    drives += number_of(trained.rows, "row")
+    drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}, "
+    drives += pluralize(trained.rows, "row")
     facts = {
         "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
         "RMSE": f"{figures.rmse_deg:.4f} deg",
@@ -140,7 +140,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         "error std": f"{figures.error_std_deg:.4f} deg",
         "error mean": f"{figures.error_mean_deg:+.4f} deg",
         "on board": describe_costs(version),
-        "cross-validation": f"{number_of(figures.folds, 'fold')} by {figures.folds_by}",
+        "cross-validation": f"{pluralize(figures.folds, 'fold')} by {figures.folds_by}",
         "cohort": f"{describe_cohort(trained.cohort)}: {drives}",
         "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
         "selected": f"model {chosen.model} of {chosen.model_list}",
@@ -150,7 +150,7 @@ def _facts(version: ModelVersion) -> dict[str, str]:
         facts["inner line"] = f"{line}, fitted first; feature set {trained.feature_set}"
     if prior := manifest.prior:
         facts["prior"] = (
-            f"{prior.campaign}: {number_of(prior.drives, 'simulated drive')} of "
+            f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
             f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}"
         )
     if learned := manifest.learned_from:

@@ -16,7 +16,7 @@ import typer
 
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.session import Session
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import Json, json_text, print_json, print_text, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
@@ -113,7 +113,7 @@ def _write(rows: pa.Table, file: Path, exact: bool) -> None:
             file.write_text(json_text(rows.to_pylist()), "utf-8")
     except OSError as error:
         raise StorageError(f"{file}: {error.strerror or error}.") from None
-    say(f"{file}: {number_of(rows.num_rows, 'row')}, {file.stat().st_size:,} bytes")
+    say(f"{file}: {pluralize(rows.num_rows, 'row')}, {file.stat().st_size:,} bytes")
 
 
 def _write_csv(rows: pa.Table, to: Any, exact: bool) -> None:

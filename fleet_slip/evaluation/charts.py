@@ -13,7 +13,7 @@ from fleet_slip.evaluation.evaluator import EvaluatedDrive
 from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.test_drives import Section, TestDrive, find_stretches
 from fleet_slip.pages.drawing import BINS, WIDTH_IN, Picture, colour
-from fleet_slip.pages.page import degrees, listed, number
+from fleet_slip.pages.page import degrees, join_words, number
 
 
 @dataclass(frozen=True)
@@ -293,7 +293,7 @@ def draw_pictures(data: ReportData) -> Iterator[Picture]:
         title, titles = figure.title, figure.drives
         if figure.models:
             lines = tuple(model_line(data, n) for n in figure.models if n in data.evaluated.models)
-            names = listed([line.label for line in lines])
+            names = join_words([line.label for line in lines])
             title, titles = title.format(names), {"nominal": f"Nominal drive, {names}"}
         if lines:
             yield _series(

@@ -22,7 +22,7 @@ from fleet_slip.evaluation.report_data import (
     compare_errors,
 )
 from fleet_slip.export.costs import describe_costs
-from fleet_slip.pages.page import count, degrees, listed, number, percent, scientific
+from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 
 SLIGHT = 1.5
@@ -425,7 +425,7 @@ def loses_stability(report: ReportContext) -> Finding:
     limit = report.scenario(SLIPPERY)["adhesion"] * 9.81
     return Finding(
         bool(unstable) and not report.unstable("nominal"),
-        f"unstable at {listed(unstable)}" if unstable else "stable throughout",
+        f"unstable at {join_words(unstable)}" if unstable else "stable throughout",
         f"The dry-road speeds ask for {number(demand, 1)} m/s² (noise included); this road gives "
         f"{number(limit, 1)}. The section follows from the true motion of the tyres, not from the "
         "estimator's error.",
@@ -526,7 +526,7 @@ def filter_is_less_accurate(report: ReportContext) -> Finding:
         f"regression {regression}, Kalman filter {plain}, tuned {tuned}",
         f"By a paired t test of squared errors over {tests[0].blocks} blocks of {BLOCK_S:g} s. "
         "While fixes come, each corrects the filter by the true velocity."
-        + (f" Without them the tuned filter has {listed(outages)}." if outages else ""),
+        + (f" Without them the tuned filter has {join_words(outages)}." if outages else ""),
     )
 
 
@@ -612,7 +612,7 @@ def evaluate_claim(claim: Claim, data: ReportData) -> Verdict:
     if missing:
         why = (
             "The drives that the model was trained on lack signals of model "
-            f"{listed(missing)} of Table I, which the paper's statements are about."
+            f"{join_words(missing)} of Table I, which the paper's statements are about."
         )
         return Verdict(claim, Status.NOT_TESTABLE, "", why)
     try:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.tables import Warehouse
@@ -109,7 +109,7 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
 
 def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     """Tabulate statistics on measured drives, the best estimator first."""
-    drives = number_of(len(content["drives"]), "drive")
+    drives = pluralize(len(content["drives"]), "drive")
     left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(

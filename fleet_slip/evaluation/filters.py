@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
@@ -382,7 +382,7 @@ class TuningDrives:
         return stored or folder.append({"key": key, **self._tuned(car, executor)}).content
 
     def _tuned(self, car: VehicleParameters, executor: Executor) -> dict[str, Any]:
-        drives = number_of(len(self.names), "drive")
+        drives = pluralize(len(self.names), "drive")
         LOGGER.info("tuning filters and identifying the car on %s, once", drives)
         cars: dict[str, Any] = {}
         parameters: dict[str, Any] = {}

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field, FiniteFloat, ValidationError
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.base import number_of, sha256_of
+from fleet_slip.base import pluralize, sha256_of
 from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, faults_of
 from fleet_slip.errors import DataError, UsageError
@@ -426,7 +426,7 @@ class Identified(Answer):
     def parts(self) -> Iterator[Part]:
         """Return what was found, how far the filter errs, and what the drives do not tell."""
         said = self.as_dict()
-        title = f"{self.car.name}, identified from {number_of(self.drives, 'drive')}"
+        title = f"{self.car.name}, identified from {pluralize(self.drives, 'drive')}"
         values = ((what.replace("_", " "), value) for what, value in said["found"].items())
         yield TextTable(title, "what|value", values, "{0}|{1:.4g}")
         left_out = said["held_out_deg"]

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.drive_sources import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import Status, evaluate_claims
@@ -220,7 +220,7 @@ def render(data: ReportData, pictures: Sequence[Drawn]) -> str:
 
 
 def _tiles(data: ReportData, tally: Mapping[Status, int]) -> list[Tile]:
-    drives = number_of(data.version.manifest.trained_on.drives, "drive")
+    drives = pluralize(data.version.manifest.trained_on.drives, "drive")
     tiles = [
         Tile(
             f"{tally[Status.REPRODUCED]} of "
@@ -250,7 +250,7 @@ def _provenance(data: ReportData) -> list[tuple[str, str]]:
         ("its SHA-256", data.version.sha256),
         ("signals", ", ".join(manifest.signals)),
         ("cohort", trained.cohort),
-        ("trained on", f"{number_of(trained.drives, 'drive')}, {count(trained.rows)} rows"),
+        ("trained on", f"{pluralize(trained.drives, 'drive')}, {count(trained.rows)} rows"),
         (
             "table versions",
             f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "

@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
@@ -140,7 +140,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
         if any(part.fact for part in catalog.time_columns[name].definition.parts)
     ]
     if unknown or len(columns) > MOST_SIGNALS:
-        has = unknown[0] if unknown else number_of(len(columns), "column")
+        has = unknown[0] if unknown else pluralize(len(columns), "column")
         raise RefusedError(
             f"{manifest.name} has {has}: cars count up to {MOST_SIGNALS} columns of a feature set, "
             "and no properties of the car. Export without them: fleet-slip export NAME --to c"

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.export.c import StepWriter, state_bytes, step_lines
@@ -57,8 +57,8 @@ class Costs(Record):
     def __str__(self) -> str:
         """Return it as `show` prints it."""
         return (
-            f"{number_of(self.columns, 'column')}: {self.coefficient_bytes:,} bytes of "
-            f"coefficients, {number_of(self.memory_bytes, 'byte')} of memory; "
+            f"{pluralize(self.columns, 'column')}: {self.coefficient_bytes:,} bytes of "
+            f"coefficients, {pluralize(self.memory_bytes, 'byte')} of memory; "
             f"{self.multiplications} multiplications, {self.additions} additions, "
             f"{self.divisions} divisions an estimate"
         )

@@ -16,7 +16,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.errors import ConfigError, StorageError, UsageError
 from fleet_slip.export.compile import Check
 from fleet_slip.export.files import Subject, document_of, render
@@ -152,7 +152,7 @@ def describe(client: Any, version: ModelVersion, number: str, aliases: Mapping[s
     """Give a registered version a description, and the aliases that it has here."""
     name, trained = version.manifest.name, version.manifest.trained_on
     told = (
-        f"{version.reference} of fleet_slip, trained on {number_of(trained.drives, 'drive')} where "
+        f"{version.reference} of fleet_slip, trained on {pluralize(trained.drives, 'drive')} where "
         f"{trained.cohort}. {version.manifest.selected_by.reason}"
     )
     client.update_model_version(name, number, description=told)

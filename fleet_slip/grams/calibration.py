@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.calibration_parameters import (
     CALIBRATION,
     CALIBRATION_PARAMETERS,
@@ -408,7 +408,7 @@ class Calibration(Answer):
                 row |= {"median": median(values), "spread": pstdev(values)}
                 rows.append(row | {"known": median(known) if known else None})
         yield TextTable(
-            f"{number_of(len(self.cars), 'car')}, by their own drives",
+            f"{pluralize(len(self.cars), 'car')}, by their own drives",
             "number|unit|cars|median|differs by|known to +-",
             rows,
             "{name}|{unit}|{cars:,}|{median:.3g}|{spread:.2g}|{known:.2g}",

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
@@ -53,7 +53,7 @@ def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:
     """Yield how many drives have no Gram rows of a feature set, since their cars sent no log."""
     if drives:
         yield Remark(
-            f"{number_of(drives, 'drive')} without a log left out: cars send Gram rows of the "
+            f"{pluralize(drives, 'drive')} without a log left out: cars send Gram rows of the "
             f"logged signals, not of the feature set {feature_set}."
         )
 
@@ -303,7 +303,7 @@ def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
     """Return the error that tells why a predicate leaves no drive."""
     if left_out := opened.count_left_out(predicate):
         return NotComputedError(
-            f"all {number_of(left_out, 'drive')} of the cohort {predicate.quoted} have no log: "
+            f"all {pluralize(left_out, 'drive')} of the cohort {predicate.quoted} have no log: "
             "their cars sent Gram rows of logged signals. Use --features signals."
         )
     feature_set = opened.catalog.feature_set(opened.catalog.name_of(opened.identity))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.catalog import Catalog, FeatureSet
 from fleet_slip.catalog.course import COURSE_LATE, course_units
 from fleet_slip.catalog.definitions import COUNT_BITS, Slope, rows_behind
@@ -280,7 +280,7 @@ def _by_tasks(
     total = sum(file.rows for group in groups for file in group)
 
     def name_of(group: Sequence[TableFile]) -> str:
-        return f"the Gram rows of {number_of(len(group), 'log file')} from {group[0].path}"
+        return f"the Gram rows of {pluralize(len(group), 'log file')} from {group[0].path}"
 
     done: dict[str, pa.Table] = {}
     following = iter(groups)
@@ -325,7 +325,7 @@ def _query(
     absent = absent_columns(files, catalog.signals.stored_columns)
     statement = gram_statement(catalog, feature_set, whole=whole, absent=absent)
     identity = catalog.identity(feature_set)
-    doing = f"the Gram query over {number_of(len(files), 'log file')} in {warehouse.logs.folder}"
+    doing = f"the Gram query over {pluralize(len(files), 'log file')} in {warehouse.logs.folder}"
     with reading_files(database, doing):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()

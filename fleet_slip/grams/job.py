@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
@@ -61,18 +61,18 @@ class GramReport(Answer):
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was read, and what there is."""
-        rows = f"{number_of(self.gram_rows, 'Gram row')} in all"
+        rows = f"{pluralize(self.gram_rows, 'Gram row')} in all"
         if not self.changed:
             yield Remark(f"gram {self.feature_set}: nothing to do, {rows} are up to date")
             return
         yield Remark(
-            f"gram {self.feature_set}: {number_of(self.files_read, 'new file')}, "
-            f"{number_of(self.rows_read, 'row')} read, "
-            f"{number_of(self.files_dropped, 'file')} dropped; {rows}"
+            f"gram {self.feature_set}: {pluralize(self.files_read, 'new file')}, "
+            f"{pluralize(self.rows_read, 'row')} read, "
+            f"{pluralize(self.files_dropped, 'file')} dropped; {rows}"
         )
         if dropped := self.received_dropped:
             yield Remark(
-                f"{number_of(dropped, 'Gram row')} that cars had sent dropped: the logs of the "
+                f"{pluralize(dropped, 'Gram row')} that cars had sent dropped: the logs of the "
                 "same drives are here now"
             )
 
@@ -121,8 +121,8 @@ def ensure_grams(
     LOGGER.info(
         "computing Gram rows of %s from %s (%s): %s",
         feature_set,
-        number_of(len(missing), "log file"),
-        number_of(sum(missing.values()), "row"),
+        pluralize(len(missing), "log file"),
+        pluralize(sum(missing.values()), "row"),
         reason,
     )
     arguments = [f"--features={feature_set}", *([f"--cohort={cohort}"] if cohort else [])]
@@ -236,7 +236,7 @@ def _update_once(
     if work.logs.version is None and work.stale:
         raise StorageError(
             f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
-            f"{number_of(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
+            f"{pluralize(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
             "a backup."
         )
     if among is not None:

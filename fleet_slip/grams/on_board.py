@@ -22,9 +22,9 @@ from fleet_slip.base import (
     canonical_json,
     find_name_fault,
     normalize_name,
-    number_of,
+    pluralize,
+    quote_name,
     sha256_of,
-    shown,
 )
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
@@ -293,8 +293,8 @@ class CountedReport(Answer):
 
     def parts(self) -> Iterator[Part]:
         """Return what was loaded, as a remark."""
-        grams, drives = number_of(self.gram_rows, "Gram row"), number_of(self.drives, "drive")
-        said = f"{grams} of {drives}, {number_of(self.rows, 'row')}"
+        grams, drives = pluralize(self.gram_rows, "Gram row"), pluralize(self.drives, "drive")
+        said = f"{grams} of {drives}, {pluralize(self.rows, 'row')}"
         yield Remark(
             f"{self.file}: {said if self.new else 'nothing to do, it was ingested before'}"
         )
@@ -377,7 +377,8 @@ def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
         for kind in (schema.field(place).type for place in places):
             if not _is_convertible(kind, field.type):
                 raise InputError(
-                    f"{file}: column {field.name} has the type {shown(kind)[:80]}; write it as "
+                    f"{file}: column {field.name} has the type {quote_name(kind)[:80]}; write it "
+                    "as "
                     f"{field.type} (docs/export.md)."
                 )
     return [name for name in COLUMNS.names if name in schema.names]
@@ -484,7 +485,8 @@ def _refuse(
     file: Path, row: int, drive: object, reason: str, error: type[InputError] = InputError
 ) -> NoReturn:
     raise error(
-        f"{file}: row {row} (drive {shown(str(drive)[:MAX_NAME_CHARACTERS])}) {reason}. Nothing "
+        f"{file}: row {row} (drive {quote_name(str(drive)[:MAX_NAME_CHARACTERS])}) {reason}. "
+        "Nothing "
         "of the file was loaded: correct or remove the row, and load the file again."
     )
 
@@ -505,7 +507,7 @@ def _require_different(file: Path, rows: pa.Table) -> None:
     drives, digests = rows["drive_id"].to_pylist(), rows["digest"].to_pylist()
     for row, (drive, digest) in enumerate(zip(drives, digests, strict=True), 1):
         if (other := seen.setdefault(digest, drive)) != drive:
-            _refuse(file, row, drive, f"is there twice, first as {shown(other)}")
+            _refuse(file, row, drive, f"is there twice, first as {quote_name(other)}")
 
 
 def _require_possible(sets: Mapping[str, CountedSet], file: Path, table: pa.Table) -> None:
@@ -559,7 +561,7 @@ def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
             over = None if again else database.execute(statement, [LONGEST_ROWS]).fetchone()
     if again:
         row, drive, there = again
-        _refuse(file, row, drive, f"is there already, as {shown(there)}", RepeatedError)
+        _refuse(file, row, drive, f"is there already, as {quote_name(there)}", RepeatedError)
     if over:
         row, drive = over
         reason = "makes its car drive more than 24 hours on a day, with what is stored"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
@@ -56,7 +56,8 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     if not guesses:
         names = ", ".join(repr(p.channel.name) for p in profile.profiles[:30])
         raise InputError(
-            f"{shown(file)}: none of its channels looks like a signal: {names}. Write the mapping "
+            f"{quote_name(file)}: none of its channels looks like a signal: {names}. Write the "
+            "mapping "
             f"by hand: docs/mapping.md. {' '.join(_refused(profile))}".rstrip()
         )
     drive_keys, group = guess_cars(profile.profiles)
@@ -87,7 +88,8 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
     taken = {guess.column for guess in guesses.values()}
     for name in headings(profile.profiles, taken) if COURSE not in guesses else ():
         yield (
-            f"{shown(name)}: is it where the car points, or where it goes? If a satellite receiver "
+            f"{quote_name(name)}: is it where the car points, or where it goes? If a satellite "
+            "receiver "
             f"derives it from motion: course = {{ column = {_value(name)}, "
             'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, '
             "with satellite_speed beside it. A heading says nothing of side-slip."
@@ -139,7 +141,7 @@ def name_of(stem: str) -> str:
 
 def write_draft(draft: Draft, name: str) -> str:
     """Return a mapping in TOML. It lacks what the file does not contain: the day, the car."""
-    called = shlex.quote(shown(draft.file))
+    called = shlex.quote(quote_name(draft.file))
     parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats
     if draft.profile.missing:

@@ -21,7 +21,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, pluralize
 from fleet_slip.catalog.signals import SignalCatalog, as_arrow
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
@@ -130,10 +130,10 @@ class Preview(_Judged, Answer):
         counts = self.counts
         rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
         yield TextTable(
-            f"{self.file}: {number_of(counts.rows_read, 'row')}; left out by conditions "
+            f"{self.file}: {pluralize(counts.rows_read, 'row')}; left out by conditions "
             f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
-            f"{f' ({rejected})' if rejected else ''}; {number_of(counts.drives, 'drive')} of "
-            f"{number_of(counts.ticks, 'tick')}",
+            f"{f' ({rejected})' if rejected else ''}; {pluralize(counts.drives, 'drive')} of "
+            f"{pluralize(counts.ticks, 'tick')}",
             "signal|unit|least|most|missing",
             self.ranges,
             "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
@@ -274,7 +274,7 @@ def _joined(failures: list[InputError]) -> InputError:
     more = len(failures) - FAILURES_SHOWN
     kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
     return kind(
-        f"{number_of(len(failures), 'file')} cannot be used; all others are stored. {first}"
+        f"{pluralize(len(failures), 'file')} cannot be used; all others are stored. {first}"
         + (f" And {more:,} more." if more > 0 else "")
     )
 

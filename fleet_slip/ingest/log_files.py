@@ -6,7 +6,7 @@ from functools import cache
 from glob import glob
 from pathlib import Path, PosixPath
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 
 SUFFIXES = (
@@ -46,13 +46,15 @@ def _files_of(path: Path) -> list[Path]:
     tables = [path / "logs", *(one for one in (real, *real.parents) if one.name == "logs")]
     if any((table / "_delta_log").is_dir() for table in tables):
         raise InputError(
-            f"{shown(path)}: part of a data root, whose logs are stored already. Name the folder "
+            f"{quote_name(path)}: part of a data root, whose logs are stored already. Name the "
+            "folder "
             "of your logs."
         )
     inside = sorted(_logs_below(path))
     if not inside:
         raise InputError(
-            f"{shown(path)}: no file in this folder has the suffix of a log: {', '.join(SUFFIXES)}."
+            f"{quote_name(path)}: no file in this folder has the suffix of a log: "
+            f"{', '.join(SUFFIXES)}."
         )
     return _without_strays(inside, path)
 
@@ -71,7 +73,9 @@ def _matching(pattern: Path) -> list[Path]:
     names = sorted(glob(str(pattern), recursive=True))  # noqa: PTH207 - takes absolute ones
     files = [path for path in map(Path, names) if path.is_file()]
     if not files:
-        raise InputError(f"{shown(pattern)}: no file matches this pattern. Look at its folder.")
+        raise InputError(
+            f"{quote_name(pattern)}: no file matches this pattern. Look at its folder."
+        )
     plain = [part for part in pattern.parents if not WILDCARDS.intersection(str(part))]
     return _without_strays(files, plain[0])
 

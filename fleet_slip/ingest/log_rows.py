@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import polars as pl
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import find_name_fault, normalize_name, shown
+from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
     DateColumn,
@@ -363,10 +363,11 @@ class RowChecker:
         for batch in read_batches(self._file, self._mapping):
             yield self._check(batch)
         if not self.rows:
-            raise InputError(f"{shown(self._file)}: a header without rows. Export it again.")
+            raise InputError(f"{quote_name(self._file)}: a header without rows. Export it again.")
         if self.left_out == self.rows:
             raise InputError(
-                f"{shown(self._file)}: none of {self.rows:,} rows meets the condition of mapping "
+                f"{quote_name(self._file)}: none of {self.rows:,} rows meets the condition of "
+                "mapping "
                 f"{self._mapping.name!r}: {describe(self._mapping.where)}."
             )
 
@@ -375,7 +376,7 @@ class RowChecker:
         try:
             fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
         except InputError as error:
-            raise InputError(f"{shown(self._file)}: {error}") from None
+            raise InputError(f"{quote_name(self._file)}: {error}") from None
         if RAW + ROW in raw.columns:
             raw = raw.rename({RAW + ROW: "row"})
         else:
@@ -390,7 +391,7 @@ class RowChecker:
         rows, refused = _split(self.keys.number(valued, fields), fields)
         if len(self.keys.metadata) > MAX_KEYS:
             raise InputError(
-                f"{shown(self._file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
+                f"{quote_name(self._file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
                 f"Check the columns under [drive] in the mapping {self._mapping.name!r}."
             )
         if self._mapping.time.rate_hz is not None:

@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, shown
+from fleet_slip.base import canonical_ascii, find_name_fault, normalize_name, quote_name
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import COURSE
 from fleet_slip.catalog.signals import Identifier, SignalCatalog
@@ -140,7 +140,7 @@ class FromPath(Config):
             matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
             if None not in matches:
                 return "".join(value for value in matches if value is not None)
-        raise InputError(f"{shown(file)}: the path does not end as in path = {self.path!r}.")
+        raise InputError(f"{quote_name(file)}: the path does not end as in path = {self.path!r}.")
 
 
 def match_name(pattern: str, name: str) -> str | None:
@@ -285,7 +285,7 @@ class Mapping(Config):
         try:
             drive = DriveMetadata.model_validate({**given, **found}, context=self._signal_catalog)
         except ValidationError as error:
-            raise InputError(f"{shown(file)}: drive: {faults_of(error)}") from None
+            raise InputError(f"{quote_name(file)}: drive: {faults_of(error)}") from None
         return self.model_copy(update={"drive": drive})
 
     def time_bases(self) -> dict[str | None, list[str]]:

@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import number_of, shown
+from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import Mapping
@@ -284,7 +284,8 @@ class SameRecordings:
         for origin in Fingerprints(self._batch).find(fingerprints):
             # Another one: the same bytes count once anyway.
             raise RepeatedError(
-                f"{shown(log)}: same recording as {shown(self._files[origin.digest])}. Leave one "
+                f"{quote_name(log)}: same recording as {quote_name(self._files[origin.digest])}. "
+                "Leave one "
                 "of them out."
             )
         if self._logs_have is None:
@@ -305,10 +306,11 @@ class SameRecordings:
         if drives and not gives_way:
             what = "this recording is in the logs already"
             what = "it has changed since it was ingested" if changed else what
-            source, more = shown(there[drives[0]]), number_of(len(drives), "drive")
+            source, more = quote_name(there[drives[0]]), pluralize(len(drives), "drive")
             such = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
             raise RepeatedError(
-                f"{shown(log)}: {what} and would count twice: {such} from {source}. To replace "
+                f"{quote_name(log)}: {what} and would count twice: {such} from {source}. To "
+                "replace "
                 f"the old one: --replace. To remove it: fleet-slip forget --drive {drives[0]}"
             )
         self._batch.update(fingerprints)

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.base import canonical_ascii, number_of, shown
+from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
@@ -196,7 +196,7 @@ class MeasuredStream:
         try:
             drive = to_ticks(rows, self.mapping, intervals_s, name, known)
         except InputError as error:
-            raise InputError(f"{shown(self.file)}: {error}") from None
+            raise InputError(f"{quote_name(self.file)}: {error}") from None
         self.counts.rows_kept += rows.height
         self.counts.drives += 1
         self.counts.drives_resampled += drive.method != "snap"
@@ -218,25 +218,26 @@ class MeasuredStream:
         counts, name = self.counts, self.mapping.name
         if counts.drives > MAX_DRIVES and counts.rows_kept < SHORT_ROWS * counts.drives:
             raise InputError(
-                f"{shown(self.file)}: it splits into more than {MAX_DRIVES:,} drives of "
+                f"{quote_name(self.file)}: it splits into more than {MAX_DRIVES:,} drives of "
                 f"{counts.rows_kept / counts.drives:.0f} rows on average. Check time, split_gap_s "
                 f"and the drive's column in the mapping {name!r}."
             )
         if counts.ticks > MAX_TICKS and counts.ticks > MOST_TICKS_A_ROW * counts.rows_kept:
             raise InputError(
-                f"{shown(self.file)}: {counts.rows_kept:,} rows span {counts.ticks:,} ticks of "
+                f"{quote_name(self.file)}: {counts.rows_kept:,} rows span {counts.ticks:,} ticks "
+                "of "
                 f"100 Hz. Check the unit of time and split_gap_s in the mapping {name!r}."
             )
 
     def _require_usable(self) -> None:
         """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
-        counts, file, name = self.counts, shown(self.file), self.mapping.name
+        counts, file, name = self.counts, quote_name(self.file), self.mapping.name
         if not counts.rows_kept and (first := self._first_refused):
             several = Counter(counts.quarantined)
             reasons = ", ".join(f"{n:,} {reason}" for reason, n in several.most_common())
             example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
             raise InputError(
-                f"{file}: none of {number_of(several.total(), 'row')} is usable ({reasons}; "
+                f"{file}: none of {pluralize(several.total(), 'row')} is usable ({reasons}; "
                 f"first: {example}). Check columns, units and time in mapping {name!r}."
             )
         if not counts.ticks:
@@ -248,7 +249,7 @@ class MeasuredStream:
         for signal, source in self.mapping.signals.items():
             if self._samples[signal] and not self._values[signal]:
                 raise InputError(
-                    f"{file}: {signal} has {number_of(self._samples[signal], 'value')} in "
+                    f"{file}: {signal} has {pluralize(self._samples[signal], 'value')} in "
                     f"{source.column!r}, and none is on a tick of 100 Hz: they are further apart "
                     f"than longest_gap_s. Give the signal in the mapping {name!r} a longest_gap_s "
                     "of its own, or interpolate = false."
@@ -339,7 +340,8 @@ def _require_dense(file: Path, descriptor: int) -> None:
     os.lseek(descriptor, 0, os.SEEK_SET)
     if first_hole < status.st_size:
         raise InputError(
-            f"{shown(file)}: its size is {status.st_size:,} bytes, but only {on_disk:,} were ever "
+            f"{quote_name(file)}: its size is {status.st_size:,} bytes, but only {on_disk:,} were "
+            "ever "
             "written. Copy it again."
         )
 

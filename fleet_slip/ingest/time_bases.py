@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.reading import file_errors, open_source
 from fleet_slip.ingest.formats.source import BASE, Budget
@@ -34,7 +34,7 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     with file_errors(log), open_source(log, mapping.formats) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
-                f"{shown(log)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
+                f"{quote_name(log)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
                 f"{mapping.name!r}."
             )
         metered = Budget.of(log).metered
@@ -60,7 +60,8 @@ def _with_times(
     for batch in batches:
         if not batch[own].dtype.is_numeric():
             raise InputError(
-                f"{shown(log)}: the time {own!r} is not numeric, as a signal with its own time "
+                f"{quote_name(log)}: the time {own!r} is not numeric, as a signal with its own "
+                "time "
                 "needs."
             )
         if own == time:

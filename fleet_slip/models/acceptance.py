@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
@@ -132,8 +132,8 @@ class Comparison:
             for one, shortfall in zip(self.incumbents, self.gaps, strict=True)
         )
         return (
-            f"on the same {number_of(challenger.rows, 'row')} of "
-            f"{number_of(self.challenger.drives, 'drive')}"
+            f"on the same {pluralize(challenger.rows, 'row')} of "
+            f"{pluralize(self.challenger.drives, 'drive')}"
             f"{' that are new to both' if self.unseen else ''}, held out "
             f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; {others}"
@@ -288,10 +288,10 @@ def find_faults(floor: Floor, manifest: Manifest, champion: Manifest | None) -> 
         found.append(f"its RMSE is {figures.rmse_deg:.4f} deg, above {floor.max_rmse_deg} deg")
     if trained.drives < floor.min_drives:
         found.append(
-            f"it was trained on {number_of(trained.drives, 'drive')}, fewer than {floor.min_drives}"
+            f"it was trained on {pluralize(trained.drives, 'drive')}, fewer than {floor.min_drives}"
         )
     if trained.vehicles < floor.min_vehicles:
-        cars = number_of(trained.vehicles, "car")
+        cars = pluralize(trained.vehicles, "car")
         found.append(f"it was trained on {cars}, fewer than {floor.min_vehicles}")
     if champion is not None:
         found += _shrunk(manifest, champion, floor.min_part_of_champion)
@@ -306,11 +306,11 @@ def find_lacks(floor: Floor, manifest: Manifest) -> list[str]:
     columns, trained = len(manifest.terms), manifest.trained_on
     own_rows_only = manifest.prior is None or not manifest.prior.weight
     if own_rows_only and columns > floor.max_columns_per_drive * trained.drives:
-        drives = number_of(trained.drives, "drive")
+        drives = pluralize(trained.drives, "drive")
         most = f"{floor.max_columns_per_drive:g}"
         found.append(f"it has {columns} columns on {drives}, more than {most} a drive")
     if trained.rows < floor.min_rows_per_column * columns:
-        rows = number_of(trained.rows, "row")
+        rows = pluralize(trained.rows, "row")
         few = f"{floor.min_rows_per_column} for each of its {columns} columns"
         found.append(f"it was trained on {rows}, fewer than {few}")
     return found

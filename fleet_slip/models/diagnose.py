@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.grams.cohort import Cohort, clustered_moments
 from fleet_slip.grams.weights import Weighed
 from fleet_slip.models.select import lost_drives
@@ -74,7 +74,7 @@ class Diagnosis(Answer):
             for robust, naive in both
         )
         yield TextTable(
-            f"{number_of(self.drives, 'drive')}, {number_of(self.fitted.gram.n, 'row')}, "
+            f"{pluralize(self.drives, 'drive')}, {pluralize(self.fitted.gram.n, 'row')}, "
             f"{self.evidence.rows:,.0f} effective; R squared {self.fitted.r_squared:.4f}, "
             f"condition number {self.condition_number:.3g} (1: independent signals)",
             f"signal|unit|coefficient|s.e. by {self.cluster}s|t|s.e. by rows|VIF",

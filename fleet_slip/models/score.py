@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
@@ -68,7 +68,7 @@ class Score(Answer):
         if self.examined:
             yield Remark(self.examined)
         yield TextTable(
-            f"{self.model} on {number_of(self.rows, 'row')}",
+            f"{self.model} on {pluralize(self.rows, 'row')}",
             f"figure|{self.model}",
             (
                 [name.replace("_deg", ", deg").replace("_", " "), f"{value:.4f}"]
@@ -82,12 +82,12 @@ class Score(Answer):
     def _trained(self) -> Iterator[Remark]:
         """Yield which drives made the model: on these its error is that of a fit."""
         if self.drives_left_out:
-            left = number_of(self.drives_left_out, "drive")
+            left = pluralize(self.drives_left_out, "drive")
             yield Remark(f"left out: {left} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
-                f"{number_of(self.drives, 'drive')}: its error there is a training error. For new "
+                f"{pluralize(self.drives, 'drive')}: its error there is a training error. For new "
                 f"drives: fleet-slip evaluate {self.model}"
             )
 

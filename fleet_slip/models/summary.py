@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.grams.cohort import remark_left_out
@@ -27,7 +27,7 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
     """Yield how many rows of a cohort told nothing, if they are more than windows begin with."""
     if rows > TELLING * of:
         yield Remark(
-            f"{rows:,} of {number_of(of, 'row')} skipped: the label or a signal of the model is "
+            f"{rows:,} of {pluralize(of, 'row')} skipped: the label or a signal of the model is "
             "null."
         )
 
@@ -75,7 +75,7 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         yield Remark(f"distances of the nested models unknown: {selection.distances}")
     for name, reason in selection.skipped.items():
         one, *others = reason.split("; ")
-        more = f"; and {number_of(len(others), 'relation')} more, see --json." if others else ""
+        more = f"; and {pluralize(len(others), 'relation')} more, see --json." if others else ""
         yield Remark(f"Skipped model {name}: {one}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
@@ -100,9 +100,9 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
     ranked = sorted(models, key=lambda model: model.pooled.rmse)
     shown = models if everything else [one for one in models if one in ranked[:BEST]]
     found = [] if everything else [model for one in selection.searched for model in one.models]
-    title = f"{number_of(cohort.drive_count, 'drive')}, {number_of(cohort.rows, 'row')}"
+    title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
     title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything)}"
-    title += f"; {number_of(len(models[0].folds), 'fold')} by {selection.folds.by}"
+    title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.folds.by}"
     title += "" if selection.intercept else "; no intercept"
     title += "" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"
     header, row = "model", "{model.name}"
@@ -120,7 +120,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
         {
             "model": one,
             "pooled": one.pooled,
-            "signals": number_of(len(one.signals), "column")
+            "signals": pluralize(len(one.signals), "column")
             if one in found
             else in_families(cohort.catalog, one.signals),
         }
@@ -165,7 +165,7 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     yield from remark_without_information(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_received_with():
-        without = number_of(without_log, "drive")
+        without = pluralize(without_log, "drive")
         yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
     yield from lost_remarks(selection.weighed)

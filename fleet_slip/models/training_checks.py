@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
 from fleet_slip.catalog.signals import SignalCatalog
@@ -150,7 +150,7 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
             f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(delays, unsure)})"
         )
     if unknown := len(cars) - len(left):
-        cars_text = number_of(unknown, "car")
+        cars_text = pluralize(unknown, "car")
         problems.append(f"that of {cars_text} cannot be estimated from their drives")
     if late:
         problems.append(
@@ -193,7 +193,7 @@ def require_sound_course(
     more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
-        f"{number_of(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "
+        f"{pluralize(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "
         "ingest again, or choose other cars; fleet-slip quality lists the drives. To publish it "
         f"anyway: fleet-slip publish {manifest.name} --label course --force"
     )

@@ -10,7 +10,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import digest_counts
 from fleet_slip.errors import StorageError
@@ -44,7 +44,7 @@ class VacuumReport:
     def remark(self) -> Remark:
         """How much was removed."""
         done = "would be removed" if self.dry_run else "removed"
-        return Remark(f"{number_of(len(self.files), 'file')} with {self.size_bytes:,} bytes {done}")
+        return Remark(f"{pluralize(len(self.files), 'file')} with {self.size_bytes:,} bytes {done}")
 
 
 def vacuum(

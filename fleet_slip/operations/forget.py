@@ -15,7 +15,7 @@ from datetime import date, timedelta
 import pyarrow.compute as pc
 from pydantic import Field
 
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.gram_files import is_of_received
@@ -84,8 +84,8 @@ class ForgetReport(Answer):
             yield Remark("nothing to do: it was forgotten before")
             return
         yield Remark(
-            f"{number_of(self.drives, 'drive')} forgotten, {number_of(self.rows, 'row')}: "
-            f"{number_of(self.files_rewritten, 'file')} rewritten without them, "
+            f"{pluralize(self.drives, 'drive')} forgotten, {pluralize(self.rows, 'row')}: "
+            f"{pluralize(self.files_rewritten, 'file')} rewritten without them, "
             f"{self.files_removed} removed"
         )
         if self.old_files_deleted:

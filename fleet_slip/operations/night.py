@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from pydantic import PlainSerializer, TypeAdapter
 
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, pluralize
 from fleet_slip.errors import AlarmError, FleetSlipError, printable
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.storage.documents import DocumentFolder
@@ -171,8 +171,8 @@ class NightReport(Answer):
         """What the night brought in."""
         rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
         held = self.quarantined - self.before.quarantined
-        new = f"{number_of(drives, 'drive')}, {number_of(rows, 'row')}"
-        return f"{new}; in quarantine: {number_of(held, 'row')}" if held else new
+        new = f"{pluralize(drives, 'drive')}, {pluralize(rows, 'row')}"
+        return f"{new}; in quarantine: {pluralize(held, 'row')}" if held else new
 
     def as_past(self) -> dict[str, Any]:
         """Return the night as the record keeps it; `faulty` are hashes of the faulty drives."""

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, pluralize
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
@@ -64,7 +64,7 @@ class QualityReport(Answer):
         """Return a table of the findings."""
         peers = "other" if self.compared else "too few"
         examined = (
-            f"{number_of(self.drives, 'drive')} checked, {self.compared:,} of them against peers "
+            f"{pluralize(self.drives, 'drive')} checked, {self.compared:,} of them against peers "
             f"({peers} drives of a car or vehicle model)"
         )
         if self.findings:
@@ -77,7 +77,7 @@ class QualityReport(Answer):
     @property
     def problem(self) -> AlarmError | None:
         """That some drives have faulty sensors."""
-        of = number_of(self.drives, "drive")
+        of = pluralize(self.drives, "drive")
         found = len(self.findings)
         return AlarmError(f"faulty sensors in {found} of {of}") if found else None
 

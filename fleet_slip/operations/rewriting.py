@@ -19,7 +19,7 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
@@ -358,7 +358,7 @@ class MigrationReport(Answer):
         if self.added:
             yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
         if self.files_without_names:
-            files = number_of(self.files_without_names, "file")
+            files = pluralize(self.files_without_names, "file")
             yield Remark(f"{files} written anew, without names that none of their rows has")
         if self.sealed:
             yield Remark(f"anchored the documents of {', '.join(self.sealed)}")

@@ -16,7 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fleet_slip.base import canonical_json, number_of, sha256_of
+from fleet_slip.base import canonical_json, pluralize, sha256_of
 from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
@@ -87,7 +87,7 @@ class SensorScreen:
         if not self.missing:
             return ""
         return (
-            f"{number_of(self.missing, 'measured drive')} not checked for faulty sensors: their "
+            f"{pluralize(self.missing, 'measured drive')} not checked for faulty sensors: their "
             "Gram rows are missing. Run: fleet-slip gram"
         )
 
@@ -95,7 +95,7 @@ class SensorScreen:
         """Return what is left out, and what was not examined; nothing if none is faulty."""
         said = []
         if self.found:
-            out = number_of(len(self.found), "drive")
+            out = pluralize(len(self.found), "drive")
             said.append(
                 f"{out} of {self.drives:,} left out: faulty sensors ({self._faults_text}). See: "
                 "fleet-slip quality. To use them anyway: --include-faulty"
@@ -119,7 +119,7 @@ class SensorScreen:
             ):
                 raise
             raise DataError(
-                f"All {number_of(self.drives, 'drive')} have faulty sensors "
+                f"All {pluralize(self.drives, 'drive')} have faulty sensors "
                 f"({self._faults_text}); none left to train on. See: fleet-slip quality. To use "
                 "them anyway: --include-faulty"
             ) from None

@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.errors import (
     HIDDEN,
     AlarmError,
@@ -108,7 +108,7 @@ class WarehouseStatus(Answer):
             "{name}|{committed_at:%Y-%m-%d %H:%M}|{version}|{files:,}|{rows:,}|{size_mb:,.1f}",
             left=2,
         )
-        backlog = f"{number_of(self.backlog_files, 'file')}, {number_of(self.backlog_rows, 'row')}"
+        backlog = f"{pluralize(self.backlog_files, 'file')}, {pluralize(self.backlog_rows, 'row')}"
         facts = {"newest day": str(self.newest_day or "none"), "waiting for the Gram job": backlog}
         if self.disk_free_bytes is not None and self.disk_free_fraction is not None:
             free = f"{self.disk_free_bytes / 1e9:,.1f} GB free, {self.disk_free_fraction:.0%}"
@@ -129,7 +129,7 @@ class WarehouseStatus(Answer):
     @property
     def problem(self) -> AlarmError | None:
         """That something calls for attention."""
-        found = number_of(len(self.problems), "matter")
+        found = pluralize(len(self.problems), "matter")
         return AlarmError(f"{found} found, see above.") if self.problems else None
 
 
@@ -292,7 +292,7 @@ def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[s
     if options:
         commands = "; ".join(f"fleet-slip forget {name} --now" for name in options[:RETURNED_SHOWN])
         yield (
-            f"the tables have rows of {number_of(len(options), 'erased name')} again, as after "
+            f"the tables have rows of {pluralize(len(options), 'erased name')} again, as after "
             f"restoring an old backup. Views and models leave them out. Erase them: {commands}"
         )
 

@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import (
@@ -132,9 +132,9 @@ class Verification(Answer):
             if findings := getattr(self, title):
                 yield TextTable(title, "where|problem", findings, "{path}|{problem}", left=2)
         yield Remark(
-            f"{number_of(self.files, 'file')} with {self.size_bytes:,} bytes and "
-            f"{number_of(self.documents, 'document')} were read, the Gram rows of "
-            f"{number_of(self.log_files_recomputed, 'log file')} computed again: "
+            f"{pluralize(self.files, 'file')} with {self.size_bytes:,} bytes and "
+            f"{pluralize(self.documents, 'document')} were read, the Gram rows of "
+            f"{pluralize(self.log_files_recomputed, 'log file')} computed again: "
             + (f"{len(self.damage)} damaged" if self.damage else "no damage found")
         )
         if self.compared:
@@ -285,7 +285,7 @@ def verify_rows(
         twice = ask(warehouse.grams, grams, "verify_grams.sql")
     for drive, in_files, beginnings, n, file in cut:
         problem = (
-            f"{n:,} rows in {number_of(in_files, 'file')} with {number_of(beginnings, 'row')} of "
+            f"{n:,} rows in {pluralize(in_files, 'file')} with {pluralize(beginnings, 'row')} of "
             f"tick 0; one is {file}"
         )
         report.note("drive", drive, problem)
@@ -334,7 +334,7 @@ def verify_grams(
     stale = where.keys() - set(active)
     if missing or stale:
         problem = (
-            f"no Gram rows of {number_of(missing, 'log file')}, Gram rows of {len(stale)} that "
+            f"no Gram rows of {pluralize(missing, 'log file')}, Gram rows of {len(stale)} that "
             "are gone"
         )
         report.note("backlog", "grams", f"{problem}; run: fleet-slip gram")
@@ -463,7 +463,7 @@ def _report_missing_logs(
         return
     damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
     if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
-        problem = f"the table is gone; Gram rows of {number_of(len(gone), 'file')} remain"
+        problem = f"the table is gone; Gram rows of {pluralize(len(gone), 'file')} remain"
         report.note("log", "logs", problem)
 
 

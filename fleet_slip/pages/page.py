@@ -46,7 +46,7 @@ def scientific(value: float, digits: int = 2) -> str:
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def listed(words: list[str]) -> str:
+def join_words(words: list[str]) -> str:
     """Return words as a list in a sentence: a, b and c."""
     if len(words) < 2:
         return "".join(words)

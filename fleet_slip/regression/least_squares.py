@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import Record, number_of
+from fleet_slip.base import Record, pluralize
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
@@ -172,7 +172,7 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
     ]
     if not relations:
         return ""
-    rows = f" There are only {number_of(gram.n, 'row')}." if gram.n <= len(inputs) else ""
+    rows = f" There are only {pluralize(gram.n, 'row')}." if gram.n <= len(inputs) else ""
     return (
         f"the model has no unique solution: {'; '.join(relations)}.{rows} Leave out one signal of "
         "each."

@@ -17,7 +17,7 @@ import pyarrow as pa
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import Progress, no_progress, number_of
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
@@ -275,14 +275,14 @@ class SimulationReport(Answer):
         if not self.changed:
             yield Remark(f"{self.campaign}: nothing to do, all is simulated")
             return
-        drives, rows = number_of(self.drives, "drive"), number_of(self.rows, "row")
+        drives, rows = pluralize(self.drives, "drive"), pluralize(self.rows, "row")
         yield Remark(
             f"{self.campaign}: simulated {drives}, {rows} in "
-            f"{number_of(self.batches_written, 'file')}, "
+            f"{pluralize(self.batches_written, 'file')}, "
             f"{self.size_bytes / max(self.rows, 1):.1f} bytes a row"
             + skipped_drives(self.drives_forgotten)
         )
-        checked = number_of(self.drives_checked, "drive")
+        checked = pluralize(self.drives_checked, "drive")
         yield Remark(f"checked against highway-env: {checked}, equal within {TOLERANCE:g}")
         yield Remark(f"{self.seconds:.1f} s, {self.rows / self.seconds:,.0f} rows/s")
 

@@ -70,7 +70,7 @@ def check_local_files(paths: Iterable[str]) -> None:
             list(executor.map(_check_local, named))
 
 
-def gone(path: str) -> StorageError:
+def missing_file_error(path: str) -> StorageError:
     """Return the error of a data file that was there when its table was opened."""
     return StorageError(
         f"{path} is gone. If forget --now or compact deleted it meanwhile, run the same command "
@@ -83,7 +83,7 @@ def _check_local(path: str) -> None:
         try:
             status = Path(path).stat()
         except FileNotFoundError:
-            raise gone(path) from None
+            raise missing_file_error(path) from None
     if not stat.S_ISREG(status.st_mode):  # opening a pipe would wait for a writer
         raise StorageError(f"{path}: not a regular file. Restore it from a backup.")
     _check_once(path, status.st_size, status.st_mtime_ns, status.st_ino)

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from fleet_slip.base import needed
+from fleet_slip.base import require_extra
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.folder import Folder
 
@@ -78,6 +78,6 @@ def _at_url(url: str) -> Folder:
             "or az://CONTAINER/PATH, with letters, digits and any of _ . = + - in the path. "
             "Credentials are not part of it: they come from the environment."
         )
-    with needed("objects", "a data root on an object store"):
+    with require_extra("objects", "a data root on an object store"):
         from fleet_slip.storage.objects import ObjectFolder  # noqa: PLC0415 - of the extra
     return ObjectFolder(found["bucket"], found["path"].strip("/"))

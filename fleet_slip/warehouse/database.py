@@ -23,7 +23,7 @@ from fleet_slip.errors import (
     printable,
 )
 from fleet_slip.limits import data_needed, memory_bytes
-from fleet_slip.storage.checksums import check_local_files, gone
+from fleet_slip.storage.checksums import check_local_files, missing_file_error
 from fleet_slip.storage.folder import SPILL_PREFIX, Folder
 from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS, words
 
@@ -185,7 +185,7 @@ def database_errors(doing: str) -> Iterator[None]:
         raise StorageError(f"{doing} failed: {reason}. Select less at once.") from None
     except duckdb.PermissionException as error:
         if deleted := _DELETED.search(str(error)):
-            raise gone(deleted[1]) from None
+            raise missing_file_error(deleted[1]) from None
         raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
     except _OF_FILES as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None

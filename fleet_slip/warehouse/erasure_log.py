@@ -31,7 +31,7 @@ from typing import Any, Literal, TypeAlias
 
 import pyarrow.compute as pc
 
-from fleet_slip.base import name_key, normalize_name, number_of
+from fleet_slip.base import name_key, normalize_name, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.documents import DocumentFolder
@@ -109,7 +109,7 @@ def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
 def skipped_drives(count: int) -> str:
     """Return the end of a sentence on drives that were not written; empty for none."""
     allow = "fleet-slip forget --allow readmits them"
-    return f"; {number_of(count, 'drive')} skipped: forgotten before ({allow})" if count else ""
+    return f"; {pluralize(count, 'drive')} skipped: forgotten before ({allow})" if count else ""
 
 
 @dataclass(frozen=True)

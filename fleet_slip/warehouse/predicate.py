@@ -18,7 +18,7 @@ from typing import Any
 
 import duckdb
 
-from fleet_slip.base import number_of
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.drive_sources import SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
@@ -266,4 +266,4 @@ def _split_excluded(cohort: str) -> tuple[str, str]:
     number = 0
     while match := _EXCLUDED.fullmatch(cohort):
         cohort, number = match[1], number + 1 + match[2].count(",")
-    return cohort, f", without {number_of(number, 'faulty drive')}" if number else ""
+    return cohort, f", without {pluralize(number, 'faulty drive')}" if number else ""

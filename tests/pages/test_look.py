@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from fleet_slip.pages.drawing import PALETTE, Picture, colour, draw, inline
-from fleet_slip.pages.page import degrees, listed, number, percent, scientific
+from fleet_slip.pages.page import degrees, join_words, number, percent, scientific
 
 
 def test_numbers_read_well() -> None:
@@ -17,7 +17,7 @@ def test_numbers_read_well() -> None:
     assert percent(0.999, 1) == "99.9 %"
     assert scientific(8.561e-4, 2) == "8.56 × 10⁻⁴"
     assert scientific(-0.0421, 2) == "−0.0421"
-    assert listed(["a", "b", "c"]) == "a, b and c"
+    assert join_words(["a", "b", "c"]) == "a, b and c"
 
 
 def _luminance(hexadecimal: str) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
@@ -75,7 +75,7 @@ def failure(file: Path, mapping: Mapping | None = None) -> str:
     with pytest.raises(InputError) as caught:
         read_measured(file, mapping or a_mapping())
     message = str(caught.value)
-    assert message.startswith(shown(file))
+    assert message.startswith(quote_name(file))
     assert "\n" not in message
     return message
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.config import Config, Name, read_named_file
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.formats.source import (
@@ -227,7 +227,7 @@ def parse_database(bus: CanBus) -> Any:
     except Exception as error:
         place = re.search(r"line \d+", str(error))
         raise InputError(
-            f"{shown(database)}: cantools cannot read it as {bus.format.upper()}"
+            f"{quote_name(database)}: cantools cannot read it as {bus.format.upper()}"
             f"{f', from {place[0]} on' if place else ''}. Is it the right file, and complete?"
         ) from None
 
@@ -243,7 +243,7 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
     """Yield the data frames of a trace. Raises `InputError`."""
     if budget.file.suffix.lower() not in SUFFIXES:
         raise InputError(
-            f"{shown(budget.file)}: unknown suffix. CAN traces end with "
+            f"{quote_name(budget.file)}: unknown suffix. CAN traces end with "
             f"{', '.join(sorted(SUFFIXES))}. Rename the file."
         )
     can = load_library(budget.file, "can")
@@ -255,7 +255,8 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
         stated = getattr(trace, "file_size", 0)
         if stated > budget.size:
             raise InputError(
-                f"{shown(budget.file)}: {budget.size:,} of {stated:,} bytes: it is truncated. Copy "
+                f"{quote_name(budget.file)}: {budget.size:,} of {stated:,} bytes: it is truncated. "
+                "Copy "
                 "it again."
             )
         sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
@@ -263,7 +264,8 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
             yield _block_of(some)
         if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
             raise InputError(
-                f"{shown(budget.file)}: an object in it is damaged, or ends too early. Copy it "
+                f"{quote_name(budget.file)}: an object in it is damaged, or ends too early. Copy "
+                "it "
                 "again."
             )
 
@@ -324,7 +326,8 @@ class CanSource(FormatSource):
             raise missing_column(self._bus.database, column, known)
         if not math.isfinite(signal.scale) or not signal.scale:
             raise InputError(
-                f"{shown(self._bus.database)}: the conversion of {column!r} is not linear (one "
+                f"{quote_name(self._bus.database)}: the conversion of {column!r} is not linear "
+                "(one "
                 "factor and offset). Make it so, or map another signal."
             )
         return name, signal
@@ -343,7 +346,9 @@ class CanSource(FormatSource):
             for block in self._blocks():
                 self._keep(block)
             if not self._numbers:
-                raise InputError(f"{shown(self._file)}: it has no CAN frames. Record it again.")
+                raise InputError(
+                    f"{quote_name(self._file)}: it has no CAN frames. Record it again."
+                )
 
     def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""
@@ -382,14 +387,15 @@ class CanSource(FormatSource):
         if _key(message) not in self._numbers:
             known = sum(_key(m) in self._numbers for m in self._database.messages)
             raise InputError(
-                f"{shown(self._file)}: no message {message.name} ({message.frame_id:#x}). Of the "
+                f"{quote_name(self._file)}: no message {message.name} ({message.frame_id:#x}). Of "
+                "the "
                 f"{len(self._numbers)} identifiers in the trace, {known} are in "
                 f"{self._bus.database}. Is it the database of this car and bus?"
             )
         buses = frames.buses
         if self._bus.channel is None and len(buses) > 1:
             raise InputError(
-                f"{shown(self._file)}: the message {message.name} is on the buses "
+                f"{quote_name(self._file)}: the message {message.name} is on the buses "
                 f"{', '.join(buses)}. Choose one in the mapping: [can] channel = "
                 f'"{buses[0]}".'
             )
@@ -397,7 +403,7 @@ class CanSource(FormatSource):
         short = sum(number for size, number in sizes.items() if size < needed)
         if short or not sizes:
             raise InputError(
-                f"{shown(self._file)}: {short:,} of {sizes.total():,} frames of "
+                f"{quote_name(self._file)}: {short:,} of {sizes.total():,} frames of "
                 f"{message.name} ({message.frame_id:#x}) are too short: {column} ends "
                 f"in byte {needed}, the longest has {max(sizes, default=0)}; buses: "
                 f"{', '.join(buses)}. Is {self._bus.database} the database of this car and bus?"

@@ -15,7 +15,7 @@ import pyarrow as pa
 from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.arrays import is_finite
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
@@ -201,17 +201,18 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
     if not line.strip():
         number = "first line" if csv_format.header_line == 1 else f"line {csv_format.header_line}"
         raise InputError(
-            f"{shown(file)}: {f'its {number} is' if line else 'it is'} empty. Export it again."
+            f"{quote_name(file)}: {f'its {number} is' if line else 'it is'} empty. Export it again."
         )
     if len(line) > MAX_LINE_BYTES:
         raise InputError(
-            f"{shown(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV file?"
+            f"{quote_name(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV "
+            "file?"
         )
     text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
     try:
         names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
     except csv.Error as error:
-        raise InputError(f"{shown(file)}: its header is not CSV: {error}.") from None
+        raise InputError(f"{quote_name(file)}: its header is not CSV: {error}.") from None
     for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
         stream.readline(MAX_LINE_BYTES)
     return [name.strip() for name in names]
@@ -234,7 +235,7 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
             continue
         if len(block) > LINE_BLOCKS * BLOCK_BYTES:
             raise InputError(
-                f"{shown(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
+                f"{quote_name(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
                 "Is a quote not closed?"
             )
         rest = block
@@ -276,9 +277,9 @@ def _decode(block: bytes, file: Path) -> str:
         "give a Parquet file."
     )
     if b"\0" in block:
-        raise InputError(f"{shown(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
+        raise InputError(f"{quote_name(file)}: binary or UTF-16, not a UTF-8 CSV file. {advice}")
     try:
         return block.decode("utf-8")
     except UnicodeDecodeError as error:
         line = block[error.start - min(error.start, 20) : error.start + 20]
-        raise InputError(f"{shown(file)}: not UTF-8, near {line!r}. {advice}") from None
+        raise InputError(f"{quote_name(file)}: not UTF-8, near {line!r}. {advice}") from None

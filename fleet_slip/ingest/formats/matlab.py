@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import (
     Budget,
@@ -91,7 +91,8 @@ class Vectors(FormatSource):
             if whole.size[1] != 1:
                 axes = " x ".join(map(str, whole.shape)) or "1"
                 raise InputError(
-                    f"{shown(self._file)}: channel {column!r} has {axes} values, not one a row. "
+                    f"{quote_name(self._file)}: channel {column!r} has {axes} values, not one a "
+                    "row. "
                     "Map one of its columns."
                 )
             return "", (whole, 0)
@@ -101,7 +102,7 @@ class Vectors(FormatSource):
             return "", (matrix, int(found[2]) - 1)
         for path, why in self._refused.items():
             if f"{column}.".startswith(f"{path}."):
-                raise InputError(f"{shown(self._file)}: {column!r} {why}")
+                raise InputError(f"{quote_name(self._file)}: {column!r} {why}")
         raise missing_column(self._file, column, [channel.name for channel in self.channels()])
 
     def read(self, _base: str, found: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
@@ -111,7 +112,7 @@ class Vectors(FormatSource):
         for name, (matrix, _) in found.items():
             if (length := matrix.size[0]) != rows:
                 raise InputError(
-                    f"{shown(self._file)}: {name!r} has {length:,} values and {first!r} has "
+                    f"{quote_name(self._file)}: {name!r} has {length:,} values and {first!r} has "
                     f'{rows:,}. Give the signal the time that goes with it: time = "…".'
                 )
         for start in range(0, max(rows, 1), WINDOW_ROWS):
@@ -160,7 +161,8 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
             layout = item.id.get_create_plist()
             if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
                 raise InputError(
-                    f"{shown(file)}: the values of {path!r} are in other files. Export it again "
+                    f"{quote_name(file)}: the values of {path!r} are in other files. Export it "
+                    "again "
                     "with all values in one file."
                 )
             if _PACKED & set(item.attrs):

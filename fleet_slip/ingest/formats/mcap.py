@@ -16,7 +16,7 @@ from typing import Any
 
 import polars as pl
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
@@ -161,7 +161,7 @@ class McapSource(FormatSource):
                 found[channel.topic] = list(dict(leaves_of(decode(message.data))))
         if not found:
             raise InputError(
-                f"{shown(self._file)}: no message in it can be decoded "
+                f"{quote_name(self._file)}: no message in it can be decoded "
                 f"({', '.join(sorted(encodings)) or 'none'}). Supported are ROS 2 messages "
                 "(cdr with ros2msg schemas) and json."
             )
@@ -196,7 +196,8 @@ class McapSource(FormatSource):
                 continue
             if decode is None:
                 raise InputError(
-                    f"{shown(self._file)}: topic {topic!r} has messages in an encoding that is "
+                    f"{quote_name(self._file)}: topic {topic!r} has messages in an encoding that "
+                    "is "
                     f"not supported ({channel.message_encoding!r}). Record it in one encoding, or "
                     "map another topic."
                 )

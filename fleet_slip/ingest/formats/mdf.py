@@ -12,7 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import Bytes, CanBus, CanSource, FrameBlock
 from fleet_slip.ingest.formats.source import (
@@ -174,7 +174,8 @@ class MdfSource(FormatSource):
         if len(places) > 1:
             titles = ", ".join(repr(f"{name}@{number}") for number, _ in places[:5])
             raise InputError(
-                f"{shown(self._file)}: {len(places)} channels are called {column!r}. Choose one: "
+                f"{quote_name(self._file)}: {len(places)} channels are called {column!r}. Choose "
+                "one: "
                 f"{titles}."
             )
         return f"group {places[0][0]}", places[0]
@@ -222,7 +223,8 @@ class MdfSource(FormatSource):
         self._release()
         if len(signals[0]) < records:
             raise InputError(
-                f"{shown(self._file)}: group {number} has {start + len(signals[0]):,} samples, "
+                f"{quote_name(self._file)}: group {number} has {start + len(signals[0]):,} "
+                "samples, "
                 "fewer than it states: the file is truncated. Copy it again."
             )
         return list(signals)
@@ -237,7 +239,8 @@ class MdfSource(FormatSource):
             require_arithmetic(conversion)
         except ValueError as error:
             raise InputError(
-                f"{shown(self._file)}: channel {channel.name!r}: {error}. Export it again with "
+                f"{quote_name(self._file)}: channel {channel.name!r}: {error}. Export it again "
+                "with "
                 "physical values, or map another channel."
             ) from None
 
@@ -255,7 +258,8 @@ class MdfSource(FormatSource):
         # MDF 3 knows no kinds: its masters are times.
         if master is None or kind not in {_TIME_SYNC, None}:
             raise InputError(
-                f"{shown(self._file)}: channel {name!r} is in group {number}, whose master is not "
+                f"{quote_name(self._file)}: channel {name!r} is in group {number}, whose master is "
+                "not "
                 "time but an angle, a distance or an index. Map another channel."
             )
         self._physical(number, master, None)
@@ -274,7 +278,8 @@ class MdfSource(FormatSource):
             flagged = True
         if not flagged or start + channel.bit_count > 8 * cg.samples_byte_nr:
             raise InputError(
-                f"{shown(self._file)}: channel {channel.name!r} lies outside of the records of its "
+                f"{quote_name(self._file)}: channel {channel.name!r} lies outside of the records "
+                "of its "
                 "group: the file is damaged. Copy it again."
             )
 
@@ -287,7 +292,7 @@ class MdfSource(FormatSource):
         samples, size = group.channel_group.cycles_nr, group.channel_group.samples_byte_nr
         if samples * size > whole:
             raise InputError(
-                f"{shown(self._file)}: the group of {name!r} states {samples:,} samples of "
+                f"{quote_name(self._file)}: the group of {name!r} states {samples:,} samples of "
                 f"{size:,} bytes, and has {whole:,} bytes: it is truncated or damaged. Copy it "
                 "again."
             )
@@ -298,7 +303,7 @@ class MdfSource(FormatSource):
         groups = [n for n in groups if self._mdf.groups[n].channel_group.cycles_nr]
         if not groups:
             raise InputError(
-                f"{shown(self._file)}: it has no CAN frames ({_FRAME}ID). Map its channels "
+                f"{quote_name(self._file)}: it has no CAN frames ({_FRAME}ID). Map its channels "
                 "without [can] in the mapping."
             )
         for number in groups:
@@ -307,7 +312,8 @@ class MdfSource(FormatSource):
             there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
             if "DataBytes" not in there:
                 raise InputError(
-                    f"{shown(self._file)}: group {number} has frames without {_FRAME}DataBytes. "
+                    f"{quote_name(self._file)}: group {number} has frames without "
+                    f"{_FRAME}DataBytes. "
                     "Export it again, with payloads."
                 )
             for window in self._windows(number, there):

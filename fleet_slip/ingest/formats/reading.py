@@ -11,7 +11,7 @@ from pathlib import Path
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined import open_confined
@@ -56,16 +56,19 @@ def require_unchanged_log(log: Path) -> Iterator[None]:
     """Raise `InputError` if a log is no regular file of its folder, or changes while it is read."""
     if isinstance(log, StrayLink):
         raise InputError(
-            f"{shown(log)}: a symbolic link out of its folder, not followed. Give the file by its "
+            f"{quote_name(log)}: a symbolic link out of its folder, not followed. Give the file by "
+            "its "
             "own path."
         )
     if not log.is_file():
         what = "is not a regular file" if log.exists() else "no such file"
-        raise InputError(f"{shown(log)}: {what}. Give the path of a file.")
+        raise InputError(f"{quote_name(log)}: {what}. Give the path of a file.")
     before = _size_and_time(log)
     yield
     if _size_and_time(log) != before:
-        raise InputError(f"{shown(log)}: it changed while it was read. Wait until it is complete.")
+        raise InputError(
+            f"{quote_name(log)}: it changed while it was read. Wait until it is complete."
+        )
 
 
 def _size_and_time(file: Path) -> tuple[int, int]:
@@ -85,7 +88,8 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
     for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
             raise InputError(
-                f"{shown(file)}: it is an archive. Unpack it with {program} and give the files."
+                f"{quote_name(file)}: it is an archive. Unpack it with {program} and give the "
+                "files."
             )
     suffix = file.suffix.lower()
     begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
@@ -98,7 +102,7 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         return open_parquet(budget)
     if name == "can_trace" and formats.can is None:
         raise InputError(
-            f'{shown(file)}: this format needs [can] with database = "….dbc" in the mapping '
+            f'{quote_name(file)}: this format needs [can] with database = "….dbc" in the mapping '
             f"{formats.name!r}."
         )
     if name:
@@ -107,7 +111,8 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
             raise InputError(
-                f"{shown(file)}: not {kind}, despite its suffix. Export it again, or correct the "
+                f"{quote_name(file)}: not {kind}, despite its suffix. Export it again, or correct "
+                "the "
                 "suffix."
             )
     if VBO_BEGINS.match(start) and formats.csv == CsvFormat():

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import needed, shown
+from fleet_slip.base import quote_name, require_extra
 from fleet_slip.errors import InputError
 
 OWN_TIME = "\0time"
@@ -105,7 +105,7 @@ class FormatSource(Source):
 
 def load_library(file: Path, package: str) -> Any:
     """Return a package of the extra `logs`, which then logs nothing; what it raises is its own."""
-    with needed("logs", f"{shown(file)}: its format"):
+    with require_extra("logs", f"{quote_name(file)}: its format"):
         module = import_module(package)
     logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
     return module
@@ -113,9 +113,10 @@ def load_library(file: Path, package: str) -> Any:
 
 def unreadable(file: object, error: BaseException) -> InputError:
     """Return the error of a file at which a library raised another one."""
-    reason = shown(str(error).strip().split("\n")[0][:200]) or type(error).__name__
+    reason = quote_name(str(error).strip().split("\n")[0][:200]) or type(error).__name__
     return InputError(
-        f"{shown(file)}: cannot be read: {reason}. Is it complete? Copy it again, or export it in "
+        f"{quote_name(file)}: cannot be read: {reason}. Is it complete? Copy it again, or export "
+        "it in "
         "another format."
     )
 
@@ -124,7 +125,8 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
     """Return an array as text, timestamps or 64-bit floats. Raises `InputError` for others."""
     if values.ndim != 1:
         raise InputError(
-            f"{shown(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} values, "
+            f"{quote_name(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} "
+            "values, "
             "not one a row. Map one of its columns."
         )
     if values.dtype.kind == "S":
@@ -135,7 +137,8 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
         return pl.Series(name, values.astype("M8[us]"))
     if values.dtype.kind not in "iufb":
         raise InputError(
-            f"{shown(file)}: channel {name!r} is of the type {values.dtype}, neither a number nor "
+            f"{quote_name(file)}: channel {name!r} is of the type {values.dtype}, neither a number "
+            "nor "
             "text. Map another one."
         )
     return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))
@@ -145,13 +148,13 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
     """Return where a column stands. Raises `InputError` for none or two of its name."""
     if len(names) > MAX_COLUMNS:
         raise InputError(
-            f"{shown(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
+            f"{quote_name(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
         )
     found = [i for i, name in enumerate(names) if name == column]
     if len(found) > 1:
         where = ", ".join(str(i + 1) for i in found[:5])
         raise InputError(
-            f"{shown(file)}: {len(found)} columns are called {column!r} (number {where}). "
+            f"{quote_name(file)}: {len(found)} columns are called {column!r} (number {where}). "
             "Rename all but one."
         )
     if not found:
@@ -176,7 +179,9 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
     hint = f" Did the mapping mean {' or '.join(repr(name[:80]) for name in near)}?" if near else ""
     there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
-    return InputError(f"{shown(file)}: no column {column!r}.{hint} Its columns are {there}{more}.")
+    return InputError(
+        f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {there}{more}."
+    )
 
 
 # A small file can stand for anything. What it may become while it is decoded follows from its size
@@ -263,7 +268,8 @@ class Budget:
 
     def _too_much(self, what: str) -> InputError:
         return InputError(
-            f"{shown(self.file)}: {what}. Is it damaged? If it is a real recording, export it as "
+            f"{quote_name(self.file)}: {what}. Is it damaged? If it is a real recording, export it "
+            "as "
             "uncompressed CSV."
         )
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
@@ -60,7 +60,8 @@ class ParquetSource(FormatSource):
         kind = self._schema.field(column).type
         if not is_readable(kind):  # before anything is decoded: one list can be all of a file
             raise InputError(
-                f"{shown(self._file)}: column {column!r} has the type {shown(kind)[:80]}, which is "
+                f"{quote_name(self._file)}: column {column!r} has the type "
+                f"{quote_name(kind)[:80]}, which is "
                 "neither a number, text nor a time. Convert it or map another one."
             )
         return "", None
@@ -103,7 +104,7 @@ def require_small_footer(stream: pa.NativeFile, file: Path) -> None:
     tail = stream.read_at(8, max(0, stream.size() - 8))
     if tail[4:] == PARQUET_MAGIC and int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
         raise InputError(
-            f"{shown(file)}: its footer is too large. Write fewer columns or row groups."
+            f"{quote_name(file)}: its footer is too large. Write fewer columns or row groups."
         )
 
 
@@ -116,7 +117,8 @@ def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
     budget.require_unfolded(sum(group.total_byte_size for group in groups))
     if any(group.num_columns and group.column(0).file_path for group in groups):
         raise InputError(
-            f"{shown(budget.file)}: its values are in other files: it is the index of a dataset. "
+            f"{quote_name(budget.file)}: its values are in other files: it is the index of a "
+            "dataset. "
             "Give the files themselves."
         )
 
@@ -143,7 +145,7 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
         longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
         if longest is not None and longest > MAX_TEXT:
             raise InputError(
-                f"{shown(file)}: column {name!r} has texts of {longest:,} characters, "
+                f"{quote_name(file)}: column {name!r} has texts of {longest:,} characters, "
                 f"at most {MAX_TEXT:,} are read."
             )
         array = array.dictionary_decode()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.matlab import Matrix, Vectors
 from fleet_slip.ingest.formats.source import (
@@ -95,13 +95,15 @@ def open_tdms(budget: Budget) -> Iterator[Vectors]:
             one.segment_incomplete or one.final_chunk_lengths_override is not None for one in last
         ):
             raise InputError(
-                f"{shown(file)}: its last segment ends too early: it was cut off, or is still "
+                f"{quote_name(file)}: its last segment ends too early: it was cut off, or is still "
                 "written. Copy it again."
             )
         channels = [one for group in tdms.groups() for one in group.channels() if len(one)]
         if not channels or any(one.scaler_data_types for one in channels):
             what = "has unscaled raw data of DAQmx" if channels else "has no values"
-            raise InputError(f"{shown(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled.")
+            raise InputError(
+                f"{quote_name(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled."
+            )
         for of in (tdms, *tdms.groups(), *channels):
             _require_scales(budget, of.properties)
         several = Counter(one.name for one in channels)
@@ -121,6 +123,7 @@ def _require_scales(budget: Budget, properties: Any) -> None:
         odd = odd or ["another number of scales than it says"]
     if odd and properties.get("NI_Scaling_Status") != "scaled":
         raise InputError(
-            f"{shown(budget.file)}: it has scales that are not applied: {', '.join(odd)}. Save it "
+            f"{quote_name(budget.file)}: it has scales that are not applied: {', '.join(odd)}. "
+            "Save it "
             "from LabVIEW or DIAdem, scaled."
         )

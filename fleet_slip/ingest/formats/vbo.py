@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import shown
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers, first_lines
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel
@@ -50,7 +50,7 @@ class VboSource(CsvSource):
         for section in ("[column names]", "[data]"):
             if section not in self._places:
                 raise InputError(
-                    f"{shown(budget.file)}: a VBO file without the section {section}. Is it "
+                    f"{quote_name(budget.file)}: a VBO file without the section {section}. Is it "
                     "complete? Copy it again."
                 )
         names, data = self._places["[column names]"] + 1, self._places["[data]"] + 1
