@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from fleet_slip.evaluation.evaluator import ErrorStatistics
 from fleet_slip.evaluation.report_data import (
     BLOCK_S,
     DRAWN_FILTERS,
     PAPER_TABLE_TWO,
-    ErrorDifference,
     ReportData,
     blocks_won,
     compare_errors,
@@ -24,6 +22,7 @@ from fleet_slip.evaluation.report_data import (
 from fleet_slip.export.costs import describe_costs
 from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
 SLIGHT = 1.5
 """Largest ratio of RMSE that counts as slight, or as close. A ratio, because an angle such as 0.1°
@@ -43,6 +42,7 @@ SIGNIFICANT = 0.05
 SMALL_DEG = 1
 """Largest error that counts as acceptably small."""
 
+NOMINAL = "nominal"
 SLIPPERY = "adhesion_0_4"
 
 
@@ -61,41 +61,44 @@ class Errors(NamedTuple):
     error_max_deg: float
 
 
-def _complete(statistics: ErrorStatistics | None, subject: str) -> Errors:
-    """Return statistics of which none is missing. Raises `NotEvaluatedError` otherwise."""
-    if statistics is None or None in vars(statistics).values():
-        raise NotEvaluatedError(subject)
-    return Errors(*(getattr(statistics, name) for name in Errors._fields))
-
-
 @dataclass(frozen=True)
 class ReportContext:
     """Results of a report that several claims use. All raise `NotEvaluatedError`."""
 
     data: ReportData
 
-    def errors(self, scenario: str, estimator: str = "") -> Errors:
-        """Return the errors of an estimator, by default the paper's choice, over a drive."""
+    def errors(self, scenario: str, estimator: str = "", side: str = "") -> Errors:
+        """Return the errors of an estimator, by default the paper's choice, over a drive.
+
+        Side `inside` or `outside` restricts them to the unstable section, or to the others.
+        """
         name = estimator or self.data.choice
-        return _complete(self.data.evaluated.statistics(scenario, name), f"{name} on {scenario}")
+        statistics = self.data.evaluated.statistics(scenario, name, side, "unstable")
+        if statistics is None or None in vars(statistics).values():
+            section = "unstable section of " if side else ""
+            raise NotEvaluatedError(f"{name} on the {section}drive {scenario}")
+        return Errors(*(getattr(statistics, field) for field in Errors._fields))
 
     def rmse(self, scenario: str, estimator: str = "") -> str:
         """Return the RMSE of an estimator over a drive, in words."""
         return degrees(self.errors(scenario, estimator).rmse_deg)
 
+    def change(self, *scenarios: str) -> float:
+        """Return the largest RMSE over that of the nominal drive."""
+        largest_deg = max(self.errors(name).rmse_deg for name in scenarios)
+        return largest_deg / self.errors(NOMINAL).rmse_deg
+
     def scenario(self, name: str) -> Any:
         """Return the document of a scenario."""
-        return self.data.evaluated.scenarios[name]
+        try:
+            return self.data.evaluated.scenarios[name]
+        except KeyError:
+            raise NotEvaluatedError(f"drive {name}") from None
 
-    def unstable(self, scenario: str) -> list[str]:
-        """Return the times at which the car is unstable in a drive."""
-        stretches = self.data.evaluated.stretches(scenario, "unstable")
-        return [f"{begin:.0f}\N{EN DASH}{end:.0f} s" for begin, end in stretches]
-
-    def slippery(self, side: str, subject: str) -> Errors:
-        """Return the errors inside or outside of the unstable section of the slippery drive."""
-        evaluated, choice = self.data.evaluated, self.data.choice
-        return _complete(evaluated.statistics(SLIPPERY, choice, side, "unstable"), subject)
+    def nominal_errors(self) -> dict[str, float]:
+        """Return the RMSE of each model of Table I on the nominal drive."""
+        models = self.data.evaluated.models.items()
+        return {name: self.errors(NOMINAL, estimator).rmse_deg for name, estimator in models}
 
     @property
     def signals(self) -> int:
@@ -126,20 +129,14 @@ def claim(place: str, criterion: str) -> Callable[[Callable[[ReportContext], Fin
     return lambda find: Claim(place, str(find.__doc__).rstrip("."), criterion, find)
 
 
-@claim(
-    "Abstract",
-    "on cars of another class, a fleet-trained model beats the one-car model in most cases",
-)
+@claim("Abstract", "a fleet-trained model beats the one-car model in most cases on other classes")
 def many_vehicles(report: ReportContext) -> Finding:
     """Signals of many vehicles can be used to make the estimator."""
-    scenarios = report.data.evaluated.scenarios
-    if "nominal" not in scenarios:
-        raise NotEvaluatedError("nominal drive")
-    nominal_model = scenarios["nominal"]["vehicle_model"]
+    nominal_model = report.scenario(NOMINAL)["vehicle_model"]
     rows = [
         row
         for row in report.data.evaluated.document.content["comparisons"]
-        if scenarios[row["scenario"]]["vehicle_model"] != nominal_model
+        if report.scenario(row["scenario"])["vehicle_model"] != nominal_model
     ]
     if not rows:
         raise NotEvaluatedError("fleet-trained model on cars of other classes")
@@ -149,8 +146,8 @@ def many_vehicles(report: ReportContext) -> Finding:
         better > len(rows) / 2,
         f"better in {better} of {len(rows)} cases; on average its root mean square error differs "
         f"by {degrees(change_deg, sign=True)}",
-        "Loads, tyres and sensor biases of many cars average out in a fleet's coefficients. A car "
-        "that is much like the trained one is served worse by them, a very different one better.",
+        "Loads, tyres and sensor biases of many cars average out in a fleet's coefficients. This "
+        "costs accuracy in a car like the trained one, and gains it in a very different car.",
     )
 
 
@@ -169,27 +166,23 @@ def little_computation(report: ReportContext) -> Finding:
 @claim("I", "no learned rival is more accurate as it is")
 def networks_are_hard(_: ReportContext) -> Finding:
     """Neural networks can be efficient, but are hard to implement and to train."""
-    return Finding(
-        None,
-        "",
-        "Networks, trees and neuro-fuzzy rules are fitted by `python -m benchmarks.rivals` of the "
-        "source tree, on the same columns.",
-    )
+    rivals = "Networks, trees and neuro-fuzzy rules on the same columns"
+    return Finding(None, "", f"{rivals}: `python -m benchmarks.rivals` of the source tree.")
 
 
 @claim("I", "no filter without GPS is more accurate than the fusion")
 def needs_gps(report: ReportContext) -> Finding:
     """A precise Kalman filter can need a sensor fusion with accurate GPS."""
-    without = report.errors("nominal", "ekf_class_tuned").rmse_deg
-    fusion = report.errors("nominal", "kalman_tuned").rmse_deg
-    nominal, soft = report.rmse("nominal"), report.rmse("tyres_soft")
+    without, fusion = (
+        report.errors(NOMINAL, name).rmse_deg for name in ("ekf_class_tuned", "kalman_tuned")
+    )
     return Finding(
         without >= fusion,
         f"an extended Kalman filter without GPS {degrees(without)}, the fusion with GPS "
-        f"{degrees(fusion)}, the regression {nominal}",
-        "A filter on the single-track model with wheel speeds needs no GPS. It needs to know mass, "
-        "geometry and tyres instead: on softer tyres than it believes it has "
-        f"{report.rmse('tyres_soft', 'ekf_class_tuned')}, the regression {soft}.",
+        f"{degrees(fusion)}, the regression {report.rmse(NOMINAL)}",
+        "A filter on the single-track model needs mass, geometry and tyres instead of GPS. On "
+        f"softer tyres than assumed it has {report.rmse('tyres_soft', 'ekf_class_tuned')}, the "
+        f"regression {report.rmse('tyres_soft')}.",
     )
 
 
@@ -215,8 +208,8 @@ def no_loss(report: ReportContext) -> Finding:
         tunnel.coverage == 1,
         f"{percent(tunnel.coverage)} of the tunnel drive has an estimate, error "
         f"{degrees(tunnel.rmse_deg)}",
-        "No signal of the model comes from outside the car. What it cannot stand is a sensor that "
-        "fails: see the drives with a signal stuck or missing.",
+        "All signals of the model are the car's own. A failing sensor does harm: see the drives "
+        "with a signal stuck or missing.",
     )
 
 
@@ -227,8 +220,8 @@ def subsets_unfeasible(report: ReportContext) -> Finding:
     return Finding(
         orders.subsets != 2 ** len(orders.signals),
         f"all {orders.subsets} models of {len(orders.signals)} signals were compared for this page",
-        "From a Gram matrix a subset costs a handful of additions. The statement is true of a "
-        "great many signals, but a car does not have them.",
+        "From a Gram matrix a subset costs a few additions. Many more signals would be unfeasible, "
+        "but a car has no more.",
     )
 
 
@@ -241,10 +234,9 @@ def order_is_crucial(report: ReportContext) -> Finding:
         max(orders.needed.values()) > orders.best,
         f"signals needed to leave 0.1 % of the variance to the full model: {sizes}; best subset "
         f"{orders.best}",
-        f"In the order of the paper's list {orders.needed['declared']} are needed; with a good "
-        f"ranking {min(orders.needed.values())}. (Two criteria have other names in the paper than "
-        "with their authors: CIC is the covariance inflation criterion, RIC the risk inflation "
-        "criterion.)",
+        f"The order of the paper's list needs {orders.needed['declared']} signals, a good ranking "
+        f"{min(orders.needed.values())}. (The authors of two criteria call them covariance "
+        "inflation criterion, CIC, and risk inflation criterion, RIC.)",
     )
 
 
@@ -265,13 +257,12 @@ def last_two_best(report: ReportContext) -> Finding:
     selection = report.data.trained.selection
     ranked = sorted(selection.models, key=lambda model: model.correlation, reverse=True)
     winner = selection.winner
-    if winner.model is winner.best:
-        why = f"No model with fewer signals comes near model {winner.best.name}."
-    else:
-        gain = next(gap for gap in winner.gaps if gap.model is winner.model)
+    why = f"No model with fewer signals comes near model {winner.best.name}."
+    if winner.model is not winner.best:
+        gap = next(gap for gap in winner.gaps if gap.model is winner.model)
         why = (
             f"Model {winner.model.name}, with {len(winner.model.signals)} signals, has an RMSE "
-            f"that is larger by {gain}, {'real' if gain.is_significant else 'not real'} and "
+            f"that is larger by {gap}: {'real' if gap.is_significant else 'not real'}, and "
             "negligible."
         )
     return Finding(
@@ -281,10 +272,7 @@ def last_two_best(report: ReportContext) -> Finding:
     )
 
 
-@claim(
-    "III, Table I",
-    "equal correlations to the four digits of Table I, with wheel angles that are measured",
-)
+@claim("III, Table I", "equal correlations to four digits, with wheel angles that are measured")
 def exactly_as_accurate(report: ReportContext) -> Finding:
     """Models 4 and 5 are exactly as accurate, as their steering angles are closely related."""
     models, trained = report.data.evaluated.models, report.data.trained.selection.models
@@ -293,39 +281,31 @@ def exactly_as_accurate(report: ReportContext) -> Finding:
     return Finding(
         None,
         "",
-        f"Here they have {correlation['4']} and {correlation['5']}, but that is no reproduction: "
-        "the wheels' steering angles are functions of the steering wheel's, without compliance, "
-        "lash or error of their own, so that equal figures come from the construction. They hold "
-        "for the steering ratio that the models were trained with. In a sedan with another one "
-        f"their errors are {sedan[0]} and {sedan[1]}: model 5 goes on measuring road wheel angles, "
-        "model 4 does not.",
+        f"Here they have {correlation['4']} and {correlation['5']}, but that is no reproduction. "
+        "The simulated wheel angles are functions of the steering wheel's, without compliance, "
+        "lash or error. In a sedan with another steering ratio the errors are "
+        f"{sedan[0]} and {sedan[1]}.",
     )
-
-
-def _nominal_errors(report: ReportContext) -> dict[str, float]:
-    """Return the RMSE of each model of Table I on the nominal drive."""
-    models = report.data.evaluated.models.items()
-    return {name: report.errors("nominal", estimator).rmse_deg for name, estimator in models}
 
 
 @claim("III, Table II", "each model's root mean square error is at most that of Table II")
 def all_accurate(report: ReportContext) -> Finding:
     """All models predict the side-slip angle accurately."""
-    errors = _nominal_errors(report)
-    std_deg = report.scenario("nominal")["truth"]["sideslip_std_deg"]
+    errors = report.nominal_errors()
+    std_deg = report.scenario(NOMINAL)["truth"]["sideslip_std_deg"]
     return Finding(
         all(error <= math.hypot(*PAPER_TABLE_TWO[name]) for name, error in errors.items()),
         ", ".join(f"model {name} {degrees(error)}" for name, error in errors.items()),
-        f"The angle itself has a standard deviation of {degrees(std_deg, 2)}. How it was driven in "
-        "the paper is not known; slower bends are easier.",
+        f"The angle itself has a standard deviation of {degrees(std_deg, 2)}. The paper does not "
+        "state how it was driven; slower bends are easier.",
     )
 
 
 @claim("III, Figure 1", f"one of them has the smallest error in all but one block of {BLOCK_S:g} s")
 def best_but_for_a_section(report: ReportContext) -> Finding:
     """But for a short section, models 4 and 5 predict best."""
-    errors, models = _nominal_errors(report), report.data.evaluated.models
-    by_estimator = blocks_won(report.data.runs["nominal"], list(models.values()))
+    errors, models = report.nominal_errors(), report.data.evaluated.models
+    by_estimator = blocks_won(report.data.runs[NOMINAL], list(models.values()))
     won = {name: by_estimator[estimator] for name, estimator in models.items()}
     blocks, similar = sum(won.values()), [errors[name] for name in errors if name != "1"]
     counts = ", ".join(f"model {name} in {times}" for name, times in won.items())
@@ -340,60 +320,50 @@ def best_but_for_a_section(report: ReportContext) -> Finding:
 @claim("III.A", "needs measurements of real sensors")
 def sensor_quality(_: ReportContext) -> Finding:
     """Inertial sensors and gyroscope are noisy; wheel speeds and steering are measured well."""
-    return Finding(
-        None,
-        "",
-        "Noise is an input of the simulation: the paper's figures for inertial sensors and "
-        "gyroscope, and a small one for wheel speeds and steering.",
-    )
+    return Finding(None, "", "Noise is an input of the simulation.")
 
 
 @claim("III.A, Figure 3", f"the root mean square error grows by less than a factor of {SLIGHT}")
 def noise_is_slight(report: ReportContext) -> Finding:
     """More noise has only a slight effect on the prediction."""
-    doubled, nominal = report.errors("noise_doubled"), report.errors("nominal")
-    moved_deg = doubled.error_mean_deg - nominal.error_mean_deg
-    first = report.data.evaluated.models["1"]
+    doubled, nominal = report.errors("noise_doubled"), report.errors(NOMINAL)
+    ratio, first = report.change("noise_doubled"), report.data.evaluated.models["1"]
     return Finding(
-        doubled.rmse_deg < SLIGHT * nominal.rmse_deg,
-        f"from {degrees(nominal.rmse_deg)} to {degrees(doubled.rmse_deg)}, "
-        f"{number(doubled.rmse_deg / nominal.rmse_deg, 1)} times; the mean moves by "
-        f"{degrees(moved_deg, sign=True)}",
-        "Steering carries most of the estimate, and its sensor is quiet. Model 1, which has none, "
-        f"goes from {report.rmse('nominal', first)} to {report.rmse('noise_doubled', first)}. The "
-        "mean moves because the intercept has learned the old biases.",
+        ratio < SLIGHT,
+        f"from {degrees(nominal.rmse_deg)} to {degrees(doubled.rmse_deg)}, {number(ratio, 1)} "
+        f"times; the mean moves by "
+        f"{degrees(doubled.error_mean_deg - nominal.error_mean_deg, sign=True)}",
+        "Steering, whose sensor is quiet, carries most of the estimate. Model 1, which has none, "
+        f"goes from {report.rmse(NOMINAL, first)} to {report.rmse('noise_doubled', first)}. The "
+        "mean moves because the intercept contains the former biases.",
     )
 
 
-@claim(
-    "III.B, Figure 4",
-    f"root mean square errors at both masses below {SLIGHT} times the nominal one",
-)
+@claim("III.B, Figure 4", f"root mean square errors at both masses below {SLIGHT} times nominal")
 def mass_is_insignificant(report: ReportContext) -> Finding:
     """The mass has no significant influence."""
-    drives = ("mass_1000", "mass_1740", "nominal")
-    light, heavy, nominal = (report.errors(name).rmse_deg for name in drives)
-    light_kg, heavy_kg, nominal_kg = (
-        number(report.scenario(name)["sprung_mass_kg"], 0) for name in drives
+    ratio = report.change("mass_1000", "mass_1740")
+    errors = (
+        f"{report.rmse(name)} at {number(report.scenario(name)['sprung_mass_kg'], 0)} kg"
+        for name in ("mass_1000", NOMINAL, "mass_1740")
     )
     return Finding(
-        max(light, heavy) < SLIGHT * nominal,
-        f"{degrees(light)} at {light_kg} kg, {degrees(nominal)} at {nominal_kg} kg, "
-        f"{degrees(heavy)} at {heavy_kg} kg",
-        f"Up to {number(max(light, heavy) / nominal, 1)} times the nominal error: the slip angles "
-        "of tyres change with their load, and no signal tells the load.",
+        ratio < SLIGHT,
+        ", ".join(errors),
+        f"Up to {number(ratio, 1)} times the nominal error: the slip angles of tyres change with "
+        "their load, and no signal measures the load.",
     )
 
 
-@claim("III.C, Figure 5", f"root mean square error below {SLIGHT} times the nominal one")
+@claim("III.C, Figure 5", f"root mean square error below {SLIGHT} times nominal")
 def as_accurate_at_0_7(report: ReportContext) -> Finding:
     """At an adhesion of 0.7 the model is as accurate as normally."""
-    wet, nominal = report.errors("adhesion_0_7"), report.errors("nominal")
+    wet, nominal = report.errors("adhesion_0_7"), report.errors(NOMINAL)
     return Finding(
-        wet.rmse_deg < SLIGHT * nominal.rmse_deg,
+        report.change("adhesion_0_7") < SLIGHT,
         f"{degrees(wet.rmse_deg)} against {degrees(nominal.rmse_deg)}, correlation "
         f"{number(wet.correlation)} against {number(nominal.correlation)}",
-        f"{number(wet.rmse_deg / nominal.rmse_deg, 1)} times the nominal error: in the fast bends "
+        f"{number(report.change('adhesion_0_7'), 1)} times the nominal error: in the fast bends "
         "the tyres are nearer to their limit, and slip more.",
     )
 
@@ -401,48 +371,43 @@ def as_accurate_at_0_7(report: ReportContext) -> Finding:
 @claim("III.C, Figure 5", f"correlation at least {MIN_CORRELATION} while the car is stable")
 def appropriate_at_0_4(report: ReportContext) -> Finding:
     """At 0.4 the model works appropriately but for one section."""
-    subject = "unstable section at an adhesion of 0.4"
-    inside, outside = (report.slippery(side, subject) for side in ("inside", "outside"))
-    drive = report.errors(SLIPPERY)
+    inside, outside, drive = (
+        report.errors(SLIPPERY, side=side) for side in ("inside", "outside", "")
+    )
     return Finding(
         outside.correlation >= MIN_CORRELATION,
         f"correlation {number(outside.correlation)} and root mean square error "
         f"{degrees(outside.rmse_deg)} while stable, {number(inside.correlation)} and "
         f"{degrees(inside.rmse_deg)} while not; the drive as a whole {number(drive.correlation)} "
         f"and {degrees(drive.rmse_deg)}",
-        "The model knows steering and lateral acceleration; a car that slides over its front "
-        "wheels is steered more and turns no more, which no training drive has shown.",
+        "A car that slides over its front wheels turns no more when it is steered more. No "
+        "training drive contains this.",
     )
 
 
 @claim("III.C, Figure 5", "tyres slip beyond their peak there, and nowhere in the nominal drive")
 def loses_stability(report: ReportContext) -> Finding:
     """In that section the car loses its stability, being too fast for the adhesion."""
-    for name in ("nominal", SLIPPERY):
-        report.errors(name)
-    unstable = report.unstable(SLIPPERY)
-    demand = report.scenario("nominal")["truth"]["lateral_acceleration_p99_mps2"]
-    limit = report.scenario(SLIPPERY)["adhesion"] * 9.81
+    truth, slippery = report.scenario(NOMINAL)["truth"], report.scenario(SLIPPERY)
+    nominal, unstable = (
+        report.data.evaluated.stretches(name, "unstable") for name in (NOMINAL, SLIPPERY)
+    )
+    times = join_words([f"{begin:.0f}\N{EN DASH}{end:.0f} s" for begin, end in unstable])
     return Finding(
-        bool(unstable) and not report.unstable("nominal"),
-        f"unstable at {join_words(unstable)}" if unstable else "stable throughout",
-        f"The dry-road speeds ask for {number(demand, 1)} m/s² (noise included); this road gives "
-        f"{number(limit, 1)}. The section follows from the true motion of the tyres, not from the "
-        "estimator's error.",
+        bool(unstable) and not nominal,
+        f"unstable at {times}" if unstable else "stable throughout",
+        f"The dry-road speeds need {number(truth['lateral_acceleration_p99_mps2'], 1)} m/s² (noise "
+        f"included); this road gives {number(slippery['adhesion'] * GRAVITY_MPS2, 1)}. The section "
+        "follows from the true motion of the tyres, not from the estimator's error.",
     )
 
 
-@claim(
-    "III.C, Figure 5", f"root mean square error while stable below {SLIGHT} times the nominal one"
-)
+@claim("III.C, Figure 5", f"root mean square error while stable below {SLIGHT} times nominal")
 def accurate_elsewhere(report: ReportContext) -> Finding:
     """In all other sections the model is accurate."""
-    evaluated, choice = report.data.evaluated, report.data.choice
-    if evaluated.statistics(SLIPPERY, choice, "outside", "unstable") is None:
-        stable = report.errors(SLIPPERY).rmse_deg
-    else:
-        stable = report.slippery("outside", "stable section").rmse_deg
-    nominal = report.errors("nominal").rmse_deg
+    is_unstable = report.data.evaluated.stretches(SLIPPERY, "unstable")
+    stable = report.errors(SLIPPERY, side="outside" if is_unstable else "").rmse_deg
+    nominal = report.errors(NOMINAL).rmse_deg
     return Finding(
         stable < SLIGHT * nominal,
         f"{degrees(stable)} while stable, {report.rmse(SLIPPERY)} as a whole, {degrees(nominal)} "
@@ -452,12 +417,12 @@ def accurate_elsewhere(report: ReportContext) -> Finding:
     )
 
 
-@claim("III.D, Figure 7", f"root mean square error below {SLIGHT} times the nominal one")
+@claim("III.D, Figure 7", f"root mean square error below {SLIGHT} times nominal")
 def close_on_another_track(report: ReportContext) -> Finding:
     """On another track the accuracy is close to normal."""
-    melbourne, nominal = report.errors("melbourne"), report.errors("nominal")
+    melbourne, nominal = report.errors("melbourne"), report.errors(NOMINAL)
     return Finding(
-        melbourne.rmse_deg < SLIGHT * nominal.rmse_deg,
+        report.change("melbourne") < SLIGHT,
         f"correlation {number(melbourne.correlation)} against {number(nominal.correlation)}, error "
         f"{degrees(melbourne.rmse_deg)} against {degrees(nominal.rmse_deg)}",
         "To the model a track is a mixture of speeds, steering angles and lateral accelerations.",
@@ -478,62 +443,51 @@ def generally_able(report: ReportContext) -> Finding:
     }
     if not shares:
         raise NotEvaluatedError("drive beyond the paper")
-    misses = {drive: share for drive, share in shares.items() if share > ACCURATE}
-    texts = "; ".join(f"{drive} ({number(share, 2)})" for drive, share in misses.items())
+    misses = [f"{name} ({number(share, 2)})" for name, share in shares.items() if share > ACCURATE]
     return Finding(
         not misses,
         f"in {len(shares) - len(misses)} of {len(shares)} drives",
-        f"Not in: {texts}. A linear model ends where tyres are no longer linear."
+        f"Not in: {'; '.join(misses)}. A linear model ends where tyres are no longer linear."
         if misses
         else "None of them goes beyond where tyres are linear.",
     )
 
 
-def _in_outages(report: ReportContext) -> list[str]:
-    """Return the errors while satellite navigation is out, in words."""
-    texts = []
-    for scenario, place in {
-        "gps_urban": "between high buildings",
-        "gps_tunnel": "in the tunnel",
-    }.items():
-        regression, tuned = (
-            report.data.evaluated.statistics(scenario, estimator, "inside", "gps_outage")
-            for estimator in (report.data.choice, "kalman_tuned")
-        )
-        if regression and tuned:
-            pair = f"{degrees(tuned.rmse_deg)} against {degrees(regression.rmse_deg)}"
-            texts.append(f"{place} {pair}")
-    return texts
-
-
 @claim(
-    "IV, Figure 8",
-    f"a larger error on the nominal drive with p < {SIGNIFICANT}, as it is and tuned",
+    "IV, Figure 8", f"a larger error on the nominal drive, p < {SIGNIFICANT}, as it is and tuned"
 )
 def filter_is_less_accurate(report: ReportContext) -> Finding:
     """The Kalman filter is significantly less accurate than the regression."""
-    choice = report.data.choice
-    regression, *filters = (report.rmse("nominal", name) for name in (choice, *DRAWN_FILTERS))
-    tests: list[ErrorDifference] = [
-        compare_errors(report.data.runs["nominal"], choice, name) for name in DRAWN_FILTERS
-    ]
+    choice, evaluated = report.data.choice, report.data.evaluated
+    regression, *filters = (report.rmse(NOMINAL, name) for name in (choice, *DRAWN_FILTERS))
+    run = report.data.runs[NOMINAL]
+    tests = [compare_errors(run, choice, name) for name in DRAWN_FILTERS]
     plain, tuned = (
         f"{rmse} (p = {scientific(test.p, 1)})" for rmse, test in zip(filters, tests, strict=True)
     )
-    outages = _in_outages(report)
+    why = (
+        f"By a paired t test of squared errors over {tests[0].blocks} blocks of {BLOCK_S:g} s. "
+        "Each fix corrects the filter by the true velocity."
+    )
+    outages = []
+    for name, place in {"gps_urban": "between high buildings", "gps_tunnel": "in a tunnel"}.items():
+        pair = [
+            evaluated.statistics(name, estimator, "inside", "gps_outage")
+            for estimator in ("kalman_tuned", choice)
+        ]
+        words = [degrees(statistics.rmse_deg) for statistics in pair if statistics]
+        outages += [f"{place} {' against '.join(words)}"] if len(words) == 2 else []
     return Finding(
         all(test.t > 0 and test.p < SIGNIFICANT for test in tests),
         f"regression {regression}, Kalman filter {plain}, tuned {tuned}",
-        f"By a paired t test of squared errors over {tests[0].blocks} blocks of {BLOCK_S:g} s. "
-        "While fixes come, each corrects the filter by the true velocity."
-        + (f" Without them the tuned filter has {join_words(outages)}." if outages else ""),
+        f"{why} Without fixes the tuned filter has {join_words(outages)}." if outages else why,
     )
 
 
 @claim("IV", "needs vehicles")
 def commercial_vehicles(_: ReportContext) -> Finding:
     """The method can be used in commercial vehicles together with the Kalman filter."""
-    return Finding(None, "", "Use in series cars is not a matter of simulation.")
+    return Finding(None, "", "A simulation does not show use in series cars.")
 
 
 @claim("V", f"at most {MAX_MULTIPLICATIONS} coefficients")
@@ -551,9 +505,10 @@ def easily_implemented(report: ReportContext) -> Finding:
 @claim("V", f"no error above {SMALL_DEG}° in any of the paper's drives")
 def guarantees_small_errors(report: ReportContext) -> Finding:
     """The method can guarantee acceptably small errors."""
+    drives = report.data.evaluated.scenarios.items()
     errors = [
         (report.errors(name).error_max_deg, drive["description"])
-        for name, drive in report.data.evaluated.scenarios.items()
+        for name, drive in drives
         if drive["paper"]
     ]
     if not errors:
@@ -562,21 +517,17 @@ def guarantees_small_errors(report: ReportContext) -> Finding:
     return Finding(
         largest_deg <= SMALL_DEG,
         f"largest error {degrees(largest_deg, 1)} ({drive}); 99 % of the nominal drive within "
-        f"{degrees(report.errors('nominal').error_p99_deg, 2)}",
-        "Least squares makes the mean square over the training rows small, and promises nothing of "
-        "a single row, or of a situation that was not trained.",
+        f"{degrees(report.errors(NOMINAL).error_p99_deg, 2)}",
+        "Least squares minimises the mean square over the training rows. It bounds no single "
+        "error, and none in a situation beyond training.",
     )
 
 
 @claim("V", "needs a vehicle")
 def real_vehicle(_: ReportContext) -> Finding:
     """The method is to be verified with a real test vehicle."""
-    return Finding(
-        None,
-        "",
-        "The test drives are simulated. Measured drives are judged by fleet-slip evaluate MODEL "
-        "--cohort CONDITION.",
-    )
+    command = "fleet-slip evaluate MODEL --cohort CONDITION"
+    return Finding(None, "", f"The test drives are simulated. For measured drives: {command}.")
 
 
 CLAIMS = tuple(value for value in globals().values() if isinstance(value, Claim))
@@ -608,21 +559,17 @@ def evaluate_claims(data: ReportData) -> tuple[Verdict, ...]:
 
 def evaluate_claim(claim: Claim, data: ReportData) -> Verdict:
     """Evaluate a claim; it is not testable where the evaluation lacks a result."""
-    missing = [name for name in PAPER_TABLE_TWO if name not in data.evaluated.models]
-    if missing:
+    holds, figure = None, ""
+    if missing := [name for name in PAPER_TABLE_TWO if name not in data.evaluated.models]:
         why = (
-            "The drives that the model was trained on lack signals of model "
-            f"{join_words(missing)} of Table I, which the paper's statements are about."
+            f"The training drives lack signals of model {join_words(missing)} of Table I, to which "
+            "the paper's statements refer."
         )
-        return Verdict(claim, Status.NOT_TESTABLE, "", why)
-    try:
-        holds, figure, why = claim.find(ReportContext(data))
-    except NotEvaluatedError as error:
-        why = (
-            f"The evaluation has no {error}. Run: fleet-slip evaluate {data.evaluated.group} "
-            "--fleet NAME"
-        )
-        return Verdict(claim, Status.NOT_TESTABLE, "", why)
-    if holds is None:
-        return Verdict(claim, Status.NOT_TESTABLE, figure, why)
-    return Verdict(claim, Status.REPRODUCED if holds else Status.NOT_REPRODUCED, figure, why)
+    else:
+        try:
+            holds, figure, why = claim.find(ReportContext(data))
+        except NotEvaluatedError as error:
+            command = f"fleet-slip evaluate {data.evaluated.group} --fleet NAME"
+            why = f"The evaluation has no {error}. Run: {command}"
+    status = {True: Status.REPRODUCED, False: Status.NOT_REPRODUCED, None: Status.NOT_TESTABLE}
+    return Verdict(claim, status[holds], figure, why)
