@@ -66,7 +66,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # The feature sets that cars can count: their columns, the ranges of these, and their definition.
 #
