@@ -20,7 +20,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.simulate import simulate_campaign
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.dask_processes import dask_processes
 
 WARM_UP = "smoke"

@@ -14,7 +14,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.commits import CHECKSUM_KEY, NOTE, checksum_of_actions
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 SIMULATE = ("simulate", "{campaign}", "--threads", "1")
 INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")

@@ -21,7 +21,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.warehouse.tables import CONFIG_VARIABLE, QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.warehouse import CONFIG_VARIABLE, QUARANTINE_SCHEMA, Warehouse
 from tests.support.commands import COMMAND, PATIENCE_S, run_here
 
 KINDS = {

@@ -19,7 +19,7 @@ from pathlib import Path
 from benchmarks.billion import PROGRAM
 from benchmarks.usage import Usage, measured
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support import growth_history as history
 
 MODEL = "growth"

@@ -45,7 +45,7 @@ _INGEST = """
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 mapping = load_mapping({mapping!r})
 warehouse = Warehouse(LocalFolder(Path({root!r})))
 list(ingest_files(warehouse, [Path({small!r})], mapping))

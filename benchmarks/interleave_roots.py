@@ -19,7 +19,7 @@ from benchmarks.crash_commands import MAPPING, let_time_pass
 from benchmarks.interleave_stops import Environment, Running
 from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
-from fleet_slip.warehouse.tables import CONFIG_VARIABLE
+from fleet_slip.warehouse.warehouse import CONFIG_VARIABLE
 from tests.support.catalog import configs_with
 
 CAR = "mini-0000"

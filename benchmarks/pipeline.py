@@ -31,7 +31,7 @@ from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import select
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, absent_columns
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 
 ROUNDS = 5

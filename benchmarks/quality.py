@@ -22,7 +22,7 @@ from fleet_slip.operations.quality_report import QualityReport, examine, find_wr
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 
 Counts = NDArray[np.float64]

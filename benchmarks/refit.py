@@ -21,7 +21,7 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 
 ROUNDS = 7

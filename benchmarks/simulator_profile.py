@@ -22,7 +22,7 @@ from fleet_slip.simulation.simulate import lane_drive, simulate_logs, tabulate
 from fleet_slip.storage.checksums import checksum_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 
 ROUNDS = 5

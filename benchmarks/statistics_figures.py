@@ -35,7 +35,7 @@ from fleet_slip.regression.subsets import (
     subset_sizes,
 )
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 
 SIGNALS = CATALOG.signals

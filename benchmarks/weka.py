@@ -27,7 +27,7 @@ from benchmarks.harness import add_options, peak_bytes, simulated
 from benchmarks.peer_ways import COLUMNS, INPUTS
 from benchmarks.peers import digits, exact_model, in_process
 from fleet_slip.regression.least_squares import LinearModel
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 JAR = Path("/usr/share/java/weka.jar")
 

@@ -67,7 +67,7 @@ def open(  # noqa: A001 - as in gzip
         If `config` is no readable folder of configs.
     """
     from fleet_slip.api.fleet import Fleet  # noqa: PLC0415 - pyarrow and Delta
-    from fleet_slip.warehouse.tables import open_warehouse  # noqa: PLC0415
+    from fleet_slip.warehouse.warehouse import open_warehouse  # noqa: PLC0415
 
     return Fleet(open_warehouse(root, config))
 

@@ -9,7 +9,7 @@ from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
-from fleet_slip.warehouse.tables import (
+from fleet_slip.warehouse.warehouse import (
     TABLE_VIEWS,
     Warehouse,
     add_table,

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, is_hypothesis_test, settings
 
 from fleet_slip.resources import cache_folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.budget import Budget
 from tests.support.commands import Finished, RunCommand, done_on, run_on
 from tests.support.once import compile_once, made_once, require_unchanged

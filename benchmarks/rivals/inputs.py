@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Definition
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
 from fleet_slip.evaluation.test_drives import TestDrive
@@ -22,7 +22,7 @@ from fleet_slip.grams.folding import assign_folds
 from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 
 

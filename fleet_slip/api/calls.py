@@ -31,7 +31,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import current_run_id, recording
 
 if TYPE_CHECKING:
-    from fleet_slip.warehouse.tables import Warehouse
+    from fleet_slip.warehouse.warehouse import Warehouse
 
 
 class Rooted:
@@ -187,7 +187,7 @@ def within_reach(warehouse: "Warehouse", executor: Executor) -> "Warehouse":
 
     It is pickled with its catalog: a worker need not have the folder of configs.
     """
-    from fleet_slip.warehouse.tables import Warehouse
+    from fleet_slip.warehouse.warehouse import Warehouse
 
     if unless_local(executor) is None:
         return warehouse

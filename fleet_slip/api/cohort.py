@@ -17,7 +17,7 @@ from fleet_slip.models.request import (
     inputs_of,
 )
 from fleet_slip.regression.drives import ClusterUnit
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import Identified

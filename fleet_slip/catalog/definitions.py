@@ -266,7 +266,7 @@ class Slope(Config):
 
     Products of columns, each a sixteenth and rounded, are summed up over the ticks that lack
     nothing, and `ridge` is added to each diagonal: Gaussian elimination of whole numbers then
-    solves them (`fleet_slip.columns.operations`). The unknown times `ratio` is rounded.
+    solves them (`fleet_slip.columns.lowering`). The unknown times `ratio` is rounded.
     """
 
     equations: tuple[Equation, ...] = Field(min_length=1, max_length=4)

@@ -68,7 +68,7 @@ class Feature(Scaled):
             raise ValueError("at_least is for a divisor that varies, which must have it")
         if self._divisor_is_number and int(self.divided_by or 0) == 0:
             raise ValueError("divided_by is zero")
-        # What a manifest takes, and every target computes: see `columns/operations.py`.
+        # What a manifest takes, and every target computes: see `columns/lowering.py`.
         if not parse(integer_arithmetic(self.sql, info)).inputs:
             raise ValueError("it is of no signal")
         return self

@@ -15,7 +15,7 @@ from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.cli.options import command
 from fleet_slip.cli.output import All, Json, print_json, print_parts, say
 from fleet_slip.cli.progress import progress
-from fleet_slip.columns.sql import column_query
+from fleet_slip.columns.column_sql import column_query
 from fleet_slip.config import read_named_file
 from fleet_slip.grams.compute import gram_statement, has_statement
 from fleet_slip.rendering import TextTable

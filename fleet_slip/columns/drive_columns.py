@@ -1,7 +1,7 @@
 """From the counts of one drive to the integer columns of a feature set, sample by sample.
 
 Gram rows, scores, evaluations and predictions come through it, and it computes what
-the SQL of `fleet_slip.columns.sql` says.
+the SQL of `fleet_slip.columns.column_sql` says.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.definitions import limit_of
 from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.columns.block_program import BLOCK_ROWS, ColumnPlan, Region
 from fleet_slip.columns.kernel import GAPS, run
-from fleet_slip.columns.operations import VehicleAttribute
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan, Region
+from fleet_slip.columns.lowering import VehicleAttribute
 from fleet_slip.errors import DataError
 
 _EXACT = 2**53

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.columns import plan as op
-from fleet_slip.columns.plan import EACH, FIXED, LIMIT, NUMERATOR
+from fleet_slip.columns import block_program as op
+from fleet_slip.columns.block_program import EACH, FIXED, LIMIT, NUMERATOR
 from fleet_slip.compiling import equation, inner_loop, kernel
 
 # Compiled loops of integer arithmetic on the rows of a block.

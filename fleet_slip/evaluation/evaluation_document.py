@@ -8,7 +8,7 @@ from typing import Any
 from fleet_slip.base import pluralize
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 BLIND_COLUMNS = 5
 """Estimators of the table that is printed first: published models, then the best of the others."""

@@ -47,7 +47,7 @@ from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from fleet_slip.views import open_views
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 TABLE_ONE = "table1"
 """The model list with the paper's five sets of signals."""

@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import Workspace
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
@@ -29,7 +29,7 @@ from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import Selection, SelectionPlan
 from fleet_slip.views import open_views
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # Segments of drives: a drive and a quarter of its time. All four quarters are a whole drive.
 

@@ -63,7 +63,7 @@ from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 FITTED = "fitted without what is judged"
 CHOSEN = "chosen and fitted without what is judged"

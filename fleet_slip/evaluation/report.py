@@ -35,7 +35,7 @@ from fleet_slip.pages.page import (
 )
 from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.storage.folder import Folder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 PAPER_TABLE_ONE = {"1": 0.9013, "2": 0.9534, "3": 0.9796, "4": 0.9911, "5": 0.9911}
 """Cross-validated correlations, Table I."""

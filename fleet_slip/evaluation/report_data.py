@@ -22,7 +22,7 @@ from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import best_subsets
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import Document
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 PAPER_TABLE_TWO = {
     "1": (0.0135, 0.3018),

@@ -32,7 +32,7 @@ from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def train_competitors(

@@ -33,7 +33,7 @@ from fleet_slip.simulation.simulate import (
 )
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import brush_force
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray, IntArray, float_column
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.test_drives import simulate_drives
 from fleet_slip.models.manifest import Manifest
@@ -29,7 +29,7 @@ from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.simulate import MOTION
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import open_views
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 if TYPE_CHECKING:
     from fleet_slip.simulation.traffic import TrafficDrive

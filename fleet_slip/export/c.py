@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.columns.operations import operation_of, plain_of, size_of
+from fleet_slip.columns.lowering import operation_of, plain_of, size_of
 from fleet_slip.export.program import Program, Steps
 from fleet_slip.export.templating import (
     INDENT,

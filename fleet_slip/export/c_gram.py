@@ -44,8 +44,8 @@ from fleet_slip.catalog.course import (
 from fleet_slip.catalog.definitions import plain_column
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.operations import Lowering
-from fleet_slip.columns.sql import rows_of
+from fleet_slip.columns.column_sql import rows_of
+from fleet_slip.columns.lowering import Lowering
 from fleet_slip.errors import RefusedError
 from fleet_slip.export.c import StepWriter, helper_texts, keep_lines, start_lines, state_fields
 from fleet_slip.export.program import Input, Steps

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
-from fleet_slip.columns.operations import VehicleAttribute
+from fleet_slip.columns.lowering import VehicleAttribute
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
@@ -21,7 +21,7 @@ from fleet_slip.export.program import Angle, Input, Program, Target
 from fleet_slip.export.sql_statement import sql_macro, sql_statement
 from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # A program as a JSON document, from which an implementation can be written: docs/export.md.
 #

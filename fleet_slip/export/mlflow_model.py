@@ -8,7 +8,7 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import predict
-from fleet_slip.warehouse.tables import open_warehouse
+from fleet_slip.warehouse.warehouse import open_warehouse
 
 
 class LoggedVersion:

@@ -19,7 +19,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from fleet_slip.columns.operations import (
+from fleet_slip.columns.lowering import (
     GIVEN,
     POWERS,
     operands_of,

@@ -2,7 +2,7 @@
 
 * **Signals** are counts, or missing. A count beyond its signal's valid range is missing, and so is
   what a car is told of itself. At a tick that was not logged, all signals are missing.
-* **Steps** are operations on whole numbers (`fleet_slip.columns.operations`).
+* **Steps** are operations on whole numbers (`fleet_slip.columns.lowering`).
 * **The angle** is a dot product of steps, and missing where one of them is.
 """
 
@@ -17,7 +17,7 @@ from fleet_slip.catalog.arithmetic import parse
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import plain_column
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
-from fleet_slip.columns.operations import (
+from fleet_slip.columns.lowering import (
     Lowering,
     ParameterCount,
     Range,

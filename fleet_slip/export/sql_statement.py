@@ -4,7 +4,7 @@ DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a l
 """
 
 from fleet_slip.catalog.signals import COUNT_MAX
-from fleet_slip.columns.sql import PLAIN_SQL, SqlLayers, attribute_sql
+from fleet_slip.columns.column_sql import PLAIN_SQL, SqlLayers, attribute_sql
 from fleet_slip.export.program import Program
 from fleet_slip.export.templating import fill_in_version
 from fleet_slip.models.registry import ModelVersion

@@ -7,7 +7,7 @@ from typing import Any
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
 from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.columns.operations import operation_of, plain_of, power
+from fleet_slip.columns.lowering import operation_of, plain_of, power
 from fleet_slip.errors import InputError
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program

@@ -57,7 +57,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # What the roads of a fleet have in common: they lean to one side, and are banked in bends.
 #

@@ -17,7 +17,7 @@ from fleet_slip.grams.job import transaction_name
 from fleet_slip.grams.receiver_delay import recorded_cars
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4
 """The SQL of windows takes minutes for a file: one of so many files is checked."""

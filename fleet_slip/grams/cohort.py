@@ -46,7 +46,7 @@ from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.rendering import Remark
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:

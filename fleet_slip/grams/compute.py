@@ -24,16 +24,16 @@ from fleet_slip.catalog.course import COURSE_LATE, course_units
 from fleet_slip.catalog.definitions import COUNT_BITS, Slope, rows_behind
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.columns.block_program import BLOCK_ROWS, ColumnPlan
+from fleet_slip.columns.column_sql import with_absent, with_columns
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
-from fleet_slip.columns.sql import with_absent, with_columns
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.grams.changes import Fixes
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # The rows of drives, one drive at a time in the order of time: from log files, or from a query.
 

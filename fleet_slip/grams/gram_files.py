@@ -23,7 +23,7 @@ from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
 from fleet_slip.warehouse.database import open_database, reading_files
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 Hashes = NDArray[np.uint64]
 """Hashes of drives or cars: what tells one from others, in 8 bytes."""

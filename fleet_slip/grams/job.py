@@ -37,7 +37,7 @@ from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
 from fleet_slip.warehouse.predicate import parse_cohort
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)

@@ -57,16 +57,20 @@ from fleet_slip.grams.gram_files import (
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.parquet_sizes import DELTA_BYTE_ARRAY, read_page_headers, read_row_groups
 from fleet_slip.grams.reader import BATCH_ROWS
-from fleet_slip.ingest.formats.tables import require_small_footer
+from fleet_slip.ingest.formats.parquet_footer import (
+    DELTA_BYTE_ARRAY,
+    RowGroup,
+    read_page_headers,
+)
+from fleet_slip.ingest.formats.tables import read_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # The feature sets that cars can count: their columns, the ranges of these, and their definition.
 #
@@ -340,9 +344,8 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
 def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
     stream = pa.BufferReader(content)
-    require_small_footer(stream, file)
     try:
-        _require_decodable(file, content)
+        _require_decodable(file, content, read_footer(stream, file))
         parquet = pq.ParquetFile(stream)
         columns = _documented_columns(file, parquet.schema_arrow)
         # Texts stay in dictionaries until their length is known: one can stand in every row.
@@ -432,13 +435,14 @@ def _too_large(file: Path) -> InputError:
     )
 
 
-def _require_decodable(file: Path, content: bytes) -> None:
+def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -> None:
     """Raise `InputError` for pages that decode to too much, or that have no checksum.
 
     The headers of all pages are read, since the footer can state other sizes. Without a checksum a
     flipped bit of a product goes unseen.
     """
-    groups = read_row_groups(content)
+    if any(chunk.is_in_other_file for group in groups for chunk in group.chunks):
+        raise ValueError("columns in another file")
     if sum(group.rows for group in groups) > MAX_ROWS:
         raise _too_large(file)
     decoded, pages = 0, 0

@@ -26,7 +26,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.connections import IdleConnection
 from fleet_slip.warehouse.predicate import Predicate, guarded_query
-from fleet_slip.warehouse.tables import Warehouse, gram_snapshots, lock, open_tables
+from fleet_slip.warehouse.warehouse import Warehouse, gram_snapshots, lock, open_tables
 
 BATCH_ROWS = 2**13
 """Gram rows of one batch: some 700 bytes each."""

@@ -52,7 +52,7 @@ from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regu
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, retry_conflicts
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 BATCH_BYTES = 2**24
 """Files are read, written and committed together up to this size."""

@@ -29,7 +29,7 @@ from fleet_slip.storage.table import (
     retry_conflicts,
 )
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Replace: TypeAlias = Literal["no", "corrected", "all"]

@@ -15,7 +15,7 @@ from fleet_slip.grams.gram_files import by_signals, gram_table
 from fleet_slip.grams.reader import open_grams
 from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.resources import Configs
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:

@@ -19,7 +19,7 @@ from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.least_squares import LinearModel, fit
 from fleet_slip.storage.runs import recorded_step
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 FOLDS = 8
 

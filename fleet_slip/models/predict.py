@@ -20,8 +20,8 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks, valid_values
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.compute import counts_of

@@ -18,7 +18,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.simulate import simulate_campaign
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 NOT_LOST = "lost_control_s IS NULL"
 """The drives of a prior in which the driver kept the car."""

@@ -39,7 +39,7 @@ from fleet_slip.models.training_checks import (
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # How a model is trained again: as its champion was, and whether that would change anything.
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from fleet_slip.models.predict import Predictor
-    from fleet_slip.warehouse.tables import Warehouse
+    from fleet_slip.warehouse.warehouse import Warehouse
 
 
 # Where the aliases of a model point, and every move that brought them there.

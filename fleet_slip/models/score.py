@@ -30,7 +30,7 @@ from fleet_slip.warehouse.predicate import (
     parse_cohort,
     row_columns,
 )
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
 
 BATCH_ROWS = 2**17
 

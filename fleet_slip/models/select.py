@@ -56,7 +56,7 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:

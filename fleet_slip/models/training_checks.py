@@ -25,7 +25,7 @@ from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
 from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
-from fleet_slip.warehouse.tables import Warehouse, connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
 
 DRIVES = 5
 """That are looked at, of as many cars if there are so many."""

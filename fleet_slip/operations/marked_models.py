@@ -16,7 +16,7 @@ from fleet_slip.grams.gram_files import Hashes, hash_names
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def marked_models(warehouse: Warehouse) -> frozenset[str]:

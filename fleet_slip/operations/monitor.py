@@ -28,7 +28,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.database import sql_text
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort, parse_predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from fleet_slip.warehouse.predicate import (
     row_columns,
     without_drives,
 )
-from fleet_slip.warehouse.tables import (
+from fleet_slip.warehouse.warehouse import (
     Warehouse,
     connect_tables,
     gram_snapshots,

@@ -34,7 +34,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import find_erased
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600
 LEAST_MEMORY_BYTES = 2**30

@@ -54,7 +54,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[
     "file",

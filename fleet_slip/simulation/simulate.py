@@ -30,7 +30,7 @@ from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_con
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 # From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts.
 

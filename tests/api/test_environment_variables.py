@@ -11,7 +11,7 @@ READERS = {
     "cli/app.py": "the folder for fonts, which matplotlib needs before it is imported",
     "cli/output.py": "TERM",
     "cli/progress.py": "CI",
-    "warehouse/tables.py": "open_warehouse: the data root and the folder of configs",
+    "warehouse/warehouse.py": "open_warehouse: the data root and the folder of configs",
     "resources.py": "the system's folder for caches, needed when a module is imported",
     "compiling.py": "numba's folder for caches, needed when a module is imported",
     "limits.py": "Arrow's allocator, before Arrow is imported",

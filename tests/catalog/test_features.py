@@ -28,9 +28,9 @@ from fleet_slip.catalog.definitions import (
     parity,
 )
 from fleet_slip.catalog.features import FeatureFile, load_features_over
+from fleet_slip.columns.block_program import ColumnPlan
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
-from fleet_slip.columns.plan import ColumnPlan
-from fleet_slip.columns.sql import with_columns
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams.cohort import load_cohort
@@ -40,7 +40,7 @@ from fleet_slip.quality.course_relation import CourseRelation, relate
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.resources import folder
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.counts import nearest
 from tests.support.logs import land, log_rows, random_counts

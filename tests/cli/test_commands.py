@@ -18,7 +18,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.commands import COMMAND, RunCommand, run_here, run_on
 

@@ -19,7 +19,7 @@ from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.models import select
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 
 QUERY = "SELECT drive_id, rows, 52.660000000000004::DOUBLE AS exact FROM drives ORDER BY 1"

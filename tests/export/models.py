@@ -22,7 +22,7 @@ from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
 from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest
 

@@ -27,7 +27,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.export.compiled import (
     COLUMNS,
     SANITIZED,

@@ -30,7 +30,7 @@ from fleet_slip.catalog.definitions import (
     Slope,
 )
 from fleet_slip.catalog.time_columns import Feature
-from fleet_slip.columns.sql import with_columns
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.export.compile import (
     Sample,
     angles_by_kernel,

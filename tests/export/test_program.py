@@ -13,7 +13,7 @@ import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import Combination, Definition
 from fleet_slip.cli.app import app
-from fleet_slip.columns.operations import most_values
+from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content

@@ -24,7 +24,7 @@ from fleet_slip.resources import Configs
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, within
 from tests.support.logs import ask, land, log_rows, path_of, random_counts

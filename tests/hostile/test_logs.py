@@ -150,6 +150,21 @@ def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
     assert "its values are in other files" in failure(file)
 
 
+def test_a_flipped_bit_of_a_footer_is_an_error(tmp_path: Path) -> None:
+    """pyarrow aborts the process when it is asked for a column of some of these files."""
+    file = tmp_path / "log.parquet"
+    pq.write_table(pa.table({column: values(column) for column in COLUMNS}), file)
+    content = file.read_bytes()
+    repetition = content.index(b"schema") + 11  # of the first column, two bytes before its name
+    refusals = []
+    for place in range(8 * repetition, 8 * repetition + 16):
+        damaged = bytearray(content)
+        damaged[place // 8] ^= 1 << place % 8
+        file.write_bytes(damaged)
+        refusals.append(failure(file))
+    assert all("Is it complete?" in text or "no column" in text for text in refusals)
+
+
 def test_columns_that_unfold_to_many_bytes_are_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,7 +30,7 @@ from fleet_slip.warehouse.database import (
     interruptible,
     one_query,
 )
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
 

@@ -11,7 +11,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.resources import folder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with
 from tests.support.logs import ask
 from tests.support.measured import a_mapping, csv_text, ingest_file, physical, read_columns, ticks

@@ -18,7 +18,7 @@ from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
 from tests.support.reported import call
 

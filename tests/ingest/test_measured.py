@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, stream
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (

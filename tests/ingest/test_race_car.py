@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_slip.columns.sql import column_query
+from fleet_slip.columns.column_sql import column_query
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
@@ -15,7 +15,7 @@ from fleet_slip.regression.inference import infer_classically
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.measured import csv_text, ingest_file
 from tests.support.reported import call

@@ -22,7 +22,7 @@ from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.load import log_table
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.measured import (
     a_mapping,
     csv_text,

@@ -19,7 +19,7 @@ from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.counts import INPUTS, LABEL, by_rows, cohort_of, dense_fit, driven, rows_of
 

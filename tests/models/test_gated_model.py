@@ -11,7 +11,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.once import made_once
 from tests.support.reported import answer

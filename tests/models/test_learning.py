@@ -11,8 +11,8 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.definitions import Combination
 from fleet_slip.catalog.first_stage import FirstStageModel, integer_combination
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import compute_columns
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
@@ -168,7 +168,7 @@ def test_a_drive_too_long_for_its_slope_is_refused(
 ) -> None:
     """On board a slope adds up no more from then on: the two would differ."""
     version = fleet.model("tiny")
-    monkeypatch.setattr("fleet_slip.columns.plan.most_products", lambda _: 1000)
+    monkeypatch.setattr("fleet_slip.columns.block_program.most_products", lambda _: 1000)
     with pytest.raises(DataError, match="too many for windows"):
         fleet.score(version)
 

@@ -24,7 +24,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand, done_on, run_on
 from tests.support.counts import gram_of

@@ -15,7 +15,7 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import answer_request
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 from tests.support.logs import land, log_rows, random_counts

@@ -20,7 +20,7 @@ from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.logs import DAY, ask, land, log_rows, path_of, random_counts
 from tests.support.once import filled_once
 

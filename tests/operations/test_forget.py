@@ -34,7 +34,7 @@ from fleet_slip.operations.verify import verify
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts

@@ -26,7 +26,7 @@ from fleet_slip.storage import encoding
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.erasure_log import FOLDER, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file, recording
 
 ROWS = 600

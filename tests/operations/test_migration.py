@@ -19,7 +19,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.rewriting import migrate
 from fleet_slip.resources import folder
 from fleet_slip.views import open_views
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS, configs_with
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import gram_of, row_of, write_counted

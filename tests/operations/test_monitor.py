@@ -21,7 +21,7 @@ from fleet_slip.models.select import answer_request
 from fleet_slip.operations.monitor import Chart, Limits, monitor
 from fleet_slip.regression.figures import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import counts, drive
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand

@@ -35,7 +35,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
 from fleet_slip.storage.table import Change, Snapshot, Table
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.operations.test_forget import CARS, drive, fill, mentions
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, run

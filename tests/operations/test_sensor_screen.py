@@ -22,7 +22,7 @@ from fleet_slip.warehouse.predicate import (
     with_all_drives,
     without_drives,
 )
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.landing import Landing

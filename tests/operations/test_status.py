@@ -19,7 +19,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand, run
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 

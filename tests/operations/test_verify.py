@@ -28,7 +28,7 @@ from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 from tests.support.manifests import manifest, publish

@@ -17,7 +17,7 @@ from fleet_slip.simulation.simulate import SimulationReport, simulate_batches, s
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.highway import FourWheelVehicle
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 
 DAYS = 5

@@ -15,7 +15,7 @@ from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.commits import find_commit_faults
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.logs import DAY, land, log_rows
 from tests.support.once import filled_once
 

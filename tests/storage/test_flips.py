@@ -23,7 +23,7 @@ from fleet_slip.storage.checksums import check_local_files, checksum_in
 from fleet_slip.storage.folder import Folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.models.acceptance.test_champion_rules import publish_from, write
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand

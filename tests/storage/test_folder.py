@@ -27,7 +27,7 @@ from fleet_slip.storage.objects import ObjectFolder, client
 from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
 from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts
 from fleet_slip.warehouse.database import database_errors
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.logs import DAY, ask, land, log_rows, random_counts
 from tests.support.s3_server import ACCESS_KEY, SECRET_KEY, Server, forget_clients
 

@@ -33,7 +33,7 @@ from fleet_slip.storage.runs import (
     write_line,
 )
 from fleet_slip.views import connect
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand, finish, start
 from tests.support.logs import ask
 from tests.support.s3_server import Server

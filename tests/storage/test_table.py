@@ -24,7 +24,7 @@ from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import SCALE, AppTransaction, Change, retry_conflicts
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
 

@@ -22,7 +22,7 @@ from fleet_slip.grams.job import transaction_name
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 
 SIGNALS = CATALOG.signals.gram_signals

@@ -15,7 +15,7 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.views import open_views
-from fleet_slip.warehouse.tables import Warehouse, open_warehouse
+from fleet_slip.warehouse.warehouse import Warehouse, open_warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 
 DAY = date(2024, 5, 1)

@@ -17,7 +17,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
-from fleet_slip.warehouse.tables import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA, Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 

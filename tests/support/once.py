@@ -15,7 +15,7 @@ from numba.core.dispatcher import Dispatcher
 
 from fleet_slip import compiling
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 _made: dict[Path, frozenset[Path]] = {}
 """What is committed and published in each."""

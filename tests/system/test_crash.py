@@ -23,7 +23,7 @@ from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import PATIENCE_S, RunCommand, finish, run, start_on
 from tests.support.logs import DAY, log_rows, state

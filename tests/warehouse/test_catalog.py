@@ -16,7 +16,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
 from fleet_slip.resources import folder
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, configs_with
 from tests.support.logs import ask, land, log_rows, path_of, random_counts
 from tests.support.measured import a_mapping, csv_text, ingest_file

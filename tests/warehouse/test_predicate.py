@@ -18,7 +18,7 @@ from fleet_slip.operations.quality_report import examine_drives
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.predicate import guarded_query, parse_predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.logs import land, log_rows, random_counts
 from tests.support.manifests import manifest

@@ -17,8 +17,9 @@ from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined import open_confined
 from fleet_slip.ingest.formats.confined_reader import FORMATS
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
+from fleet_slip.ingest.formats.parquet_footer import MAGIC
 from fleet_slip.ingest.formats.source import Budget, Source, unreadable
-from fleet_slip.ingest.formats.tables import PARQUET_MAGIC, open_parquet
+from fleet_slip.ingest.formats.tables import open_parquet
 from fleet_slip.ingest.formats.vbo import VBO_BEGINS, VboSource
 from fleet_slip.ingest.log_files import StrayLink
 
@@ -98,7 +99,7 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         name = "mdf_bus" if name == "mdf" else name or "can_trace"
     elif suffix in {".blf", ".asc"}:
         name = name or "can_trace"
-    if start.startswith(PARQUET_MAGIC):
+    if start.startswith(MAGIC):
         return open_parquet(budget)
     if name == "can_trace" and formats.can is None:
         raise InputError(

@@ -1,7 +1,7 @@
 """Reads Parquet: text, numbers as float64, dates and timestamps."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.parquet_footer import MAGIC, RowGroup, read_row_groups
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
 BATCH_ROWS = 2**15
@@ -23,10 +24,10 @@ BATCH_ROWS = 2**15
 BUFFER_BYTES = 2**16
 """Bytes of a column that are read at once."""
 MAX_FOOTER_BYTES = 2**24
+"""Size of a footer: parsing a larger one would take too much memory."""
 MAX_TEXT = 1_000
 """Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
 
-PARQUET_MAGIC = b"PAR1"
 _PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
 _FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
 _END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
@@ -39,11 +40,9 @@ class ParquetSource(FormatSource):
 
     def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
         """Take the bytes of a file, and what it may become."""
-        require_small_footer(stream, budget.file)
         self._file, self._stream = budget.file, stream
-        parquet = pq.ParquetFile(stream)
-        _require_within(budget, parquet.metadata)
-        self._schema = parquet.schema_arrow
+        _require_within(budget, read_footer(stream, budget.file))
+        self._schema = pq.ParquetFile(stream).schema_arrow
         keys = partition_keys(budget.file).items()
         self._keys = {name: text for name, text in keys if name not in self._schema.names}
 
@@ -99,23 +98,24 @@ def partition_keys(file: Path) -> dict[str, str]:
     return {key: unquote(text) for key, equals, text in named if key and equals}
 
 
-def require_small_footer(stream: pa.NativeFile, file: Path) -> None:
-    """Raise `InputError` for a footer whose parsing would take too much memory."""
-    tail = stream.read_at(8, max(0, stream.size() - 8))
-    if tail[4:] == PARQUET_MAGIC and int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+def read_footer(stream: pa.NativeFile, file: Path) -> list[RowGroup]:
+    """Return the row groups of a file. Raises `InputError` for a large footer, `ValueError`."""
+    size = stream.size()
+    tail = stream.read_at(8, max(0, size - 8))
+    length = int.from_bytes(tail[:4], "little") + len(tail)
+    if tail[4:] == MAGIC and length > MAX_FOOTER_BYTES:
         raise InputError(
             f"{quote_name(file)}: its footer is too large. Write fewer columns or row groups."
         )
+    return read_row_groups(stream.read_at(min(length, size), max(0, size - length)))
 
 
-def _require_within(budget: Budget, metadata: pq.FileMetaData) -> None:
+def _require_within(budget: Budget, groups: Sequence[RowGroup]) -> None:
     """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
-    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
-    values = [[group.column(i).num_values for i in range(group.num_columns)] for group in groups]
-    rows = sum(max([group.num_rows, *of]) for group, of in zip(groups, values, strict=True))
-    budget.require_rows(max(rows, metadata.num_rows))
-    budget.require_unfolded(sum(group.total_byte_size for group in groups))
-    if any(group.num_columns and group.column(0).file_path for group in groups):
+    rows = (max([group.rows, *(chunk.values for chunk in group.chunks)]) for group in groups)
+    budget.require_rows(sum(rows))
+    budget.require_unfolded(sum(group.size_bytes for group in groups))
+    if any(chunk.is_in_other_file for group in groups for chunk in group.chunks):
         raise InputError(
             f"{quote_name(budget.file)}: its values are in other files: it is the index of a "
             "dataset. "

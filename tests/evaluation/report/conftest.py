@@ -9,7 +9,7 @@ from fleet_slip.evaluation.report import gather
 from fleet_slip.evaluation.report_data import ReportData
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.once import made_once
 from tests.support.reported import Reported, call

@@ -43,7 +43,7 @@ from fleet_slip.pages.page import Cell, number
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import Finished, RunCommand, done_on, run
 from tests.support.measured import ingest_own
 from tests.support.reported import Reported, call

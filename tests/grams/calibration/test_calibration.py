@@ -40,7 +40,7 @@ from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ExactSums, fit
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support import cars
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import done_on

@@ -20,7 +20,7 @@ from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weigh
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse.predicate import parse_predicate
-from fleet_slip.warehouse.tables import Warehouse, open_tables
+from fleet_slip.warehouse.warehouse import Warehouse, open_tables
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
 from tests.support.logs import land, log_rows, random_counts

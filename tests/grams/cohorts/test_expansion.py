@@ -8,8 +8,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
+from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
-from fleet_slip.columns.plan import ColumnPlan
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
@@ -19,7 +19,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score
 from fleet_slip.regression.gram import Gram
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support import cars
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import table_of

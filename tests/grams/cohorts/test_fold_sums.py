@@ -20,7 +20,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
 from fleet_slip.warehouse.predicate import parse_predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.growth_history import write_fleet, write_grams
 from tests.support.logs import DAY, land, log_rows, random_counts

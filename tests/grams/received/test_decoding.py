@@ -11,7 +11,11 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import FleetSlipError, InputError
 from fleet_slip.grams import on_board
-from fleet_slip.grams.parquet_sizes import DELTA_BYTE_ARRAY, read_page_headers, read_row_groups
+from fleet_slip.ingest.formats.parquet_footer import (
+    DELTA_BYTE_ARRAY,
+    read_page_headers,
+    read_row_groups,
+)
 from tests.support.counted_rows import START_S, gram_of, list_array, row_of, rows_of_fleet
 from tests.support.counted_rows import write_counted as write
 

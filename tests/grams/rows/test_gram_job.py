@@ -21,7 +21,7 @@ from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.logs import DAY, land, log_rows, random_counts

@@ -20,16 +20,16 @@ from fleet_slip.catalog.definitions import (
     Gate,
     limit_of,
 )
+from fleet_slip.columns.block_program import BLOCK_ROWS, ColumnPlan
+from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
-from fleet_slip.columns.plan import BLOCK_ROWS, ColumnPlan
-from fleet_slip.columns.sql import with_columns
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.export.models import DEFINITIONS as OF_MODELS
 from tests.export.models import SPEED
 from tests.support.catalog import CATALOG, configs_with

@@ -26,7 +26,7 @@ from fleet_slip.regression.orders import stepwise_order
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import land, log_rows
 

@@ -7,8 +7,8 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
+from fleet_slip.columns.block_program import BLOCK_ROWS
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
-from fleet_slip.columns.plan import BLOCK_ROWS
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import MODELS, model_of

@@ -45,7 +45,7 @@ from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import one_query
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
 from tests.support.fuzz.logs import damaged_file

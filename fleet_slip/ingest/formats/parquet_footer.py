@@ -1,8 +1,7 @@
-"""Reads from a Parquet file how much its pages decode to, before anything is decoded.
+"""Reads the footer and the page headers of a Parquet file, before anything is decoded.
 
-Footer and page headers are structs in the compact protocol of Thrift (`parquet.thrift`). They are
-read here because the footer need not state what the pages hold, and because pyarrow aborts the
-process for some damaged footers when it is asked for a column.
+They are structs in the compact protocol of Thrift (`parquet.thrift`). pyarrow is not used here:
+asked for a column of a row group, it aborts the process for some damaged footers.
 """
 
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ DELTA_BYTE_ARRAY = 7
 """Encoding of texts by their common prefixes: a small page can decode to any size."""
 
 _DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
-_MAGIC, _TAIL_BYTES = b"PAR1", 8
+MAGIC, _TAIL_BYTES = b"PAR1", 8
 _MAX_HEADER_BYTES, _DEEPEST, _LONGEST_VARINT = 2**16, 12, 10
 
 
@@ -23,12 +22,14 @@ class ColumnChunk(NamedTuple):
     values: int
     start: int
     size: int
+    is_in_other_file: bool
 
 
 class RowGroup(NamedTuple):
-    """Rows of a file that are stored together."""
+    """Rows of a file that are stored together; `size_bytes` are those of the decoded pages."""
 
     rows: int
+    size_bytes: int
     chunks: tuple[ColumnChunk, ...]
 
 
@@ -43,16 +44,23 @@ class PageHeader(NamedTuple):
 
 
 def read_row_groups(content: bytes) -> list[RowGroup]:
-    """Return the row groups of a file. Raises `ValueError` or `IndexError` for damage."""
+    """Return the row groups of a file, or of its last bytes. Raises `ValueError` for damage."""
     tail = content[-_TAIL_BYTES:]
     size = int.from_bytes(tail[:4], "little")
-    if tail[4:] != _MAGIC or size + _TAIL_BYTES > len(content):
+    if tail[4:] != MAGIC or size + _TAIL_BYTES > len(content):
         raise ValueError("a file without a footer")
     end = len(content) - _TAIL_BYTES
-    footer, _ = _read_struct(memoryview(content)[end - size : end], 0)
+    try:
+        footer, _ = _read_struct(memoryview(content)[end - size : end], 0)
+    except IndexError:
+        raise ValueError("the footer ends in a struct") from None
     groups = _checked(footer, 4, list) if footer.get(3) else []
     return [
-        RowGroup(_checked(group, 3, int), tuple(map(_column_chunk, _checked(group, 1, list))))
+        RowGroup(
+            _checked(group, 3, int),
+            _checked(group, 2, int),
+            tuple(map(_column_chunk, _checked(group, 1, list))),
+        )
         for group in groups
     ]
 
@@ -61,13 +69,14 @@ def _column_chunk(fields: Any) -> ColumnChunk:
     about = _checked(fields, 3, dict)
     offsets = (_checked(about, 9, int), _checked(about, 11, int) if 11 in about else 0)
     path = _checked(about, 3, list)
-    if 1 in fields or not all(isinstance(name, bytes) for name in path):
-        raise ValueError("a column in another file, or without a name")
+    if not path or not all(isinstance(name, bytes) for name in path):
+        raise ValueError("a column without a name")
     return ColumnChunk(
         path[0].decode(),
         _checked(about, 5, int),
-        min(offset for offset in offsets if offset),
+        min((offset for offset in offsets if offset), default=0),
         _checked(about, 7, int),
+        is_in_other_file=1 in fields,
     )
 
 

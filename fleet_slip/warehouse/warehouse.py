@@ -19,7 +19,7 @@ from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.sql import with_absent
+from fleet_slip.columns.column_sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs, folder, read_sql

@@ -23,7 +23,8 @@ from fleet_slip.catalog.definitions import (
     plain_column,
     rows_behind,
 )
-from fleet_slip.columns.operations import (
+from fleet_slip.columns.column_sql import CountedColumns, parts_of, rows_of
+from fleet_slip.columns.lowering import (
     GIVEN,
     OPERATIONS,
     ParameterCount,
@@ -35,7 +36,6 @@ from fleet_slip.columns.operations import (
     plain_of,
     size_of,
 )
-from fleet_slip.columns.sql import CountedColumns, parts_of, rows_of
 from fleet_slip.errors import QuestionError
 
 # The operations of a program over blocks of rows: whole numbers, and one of four ratios or limits.

@@ -11,7 +11,7 @@ from fleet_slip.catalog.arithmetic import nearest_sql
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE, Definition, rows_behind
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
-from fleet_slip.columns.operations import (
+from fleet_slip.columns.lowering import (
     GIVEN,
     OPERATIONS,
     POWERS,

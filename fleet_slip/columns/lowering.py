@@ -210,7 +210,7 @@ def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
 
 # Lowers signals, features, windows, factors, gates and own numbers to steps: the one place.
 #
-# Columns are `fleet_slip.catalog.definitions`, steps `fleet_slip.columns.operations`, once each.
+# Columns are `fleet_slip.catalog.definitions`, steps `fleet_slip.columns.lowering`, once each.
 
 Key = TypeVar("Key", bound=Hashable)
 
