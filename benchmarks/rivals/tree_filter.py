@@ -22,7 +22,6 @@ from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
-from fleet_slip.evaluation.identify import tune
 from fleet_slip.evaluation.kalman import independent_state
 from fleet_slip.evaluation.single_track import (
     STEP_S,
@@ -35,6 +34,7 @@ from fleet_slip.evaluation.single_track import (
     sideslip_angle,
 )
 from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.evaluation.tuning import tune
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6

@@ -20,7 +20,7 @@ from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.warehouse.warehouse import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.evaluation.identify import Identified
+    from fleet_slip.evaluation.identify import IdentifiedVehicle
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.select import Selection
@@ -125,7 +125,7 @@ class FleetCohort(Rooted):
         *,
         threads: int | None = None,
         **measured: Unpack[CarMeasures],
-    ) -> "Identified":
+    ) -> "IdentifiedVehicle":
         """Identify the tyres and the yaw inertia of the car that made the cohort's drives.
 
         Mass and axles must be known. The extended Kalman filter in the car is fitted to the labels
@@ -134,9 +134,9 @@ class FleetCohort(Rooted):
         that no car can have.
         """
         from fleet_slip.evaluation.filters import TuningDrives
-        from fleet_slip.evaluation.identify import identify_held_out, measured_car
+        from fleet_slip.evaluation.identify import identify_held_out, measures_of
 
-        car = measured_car(name, measured)
+        car = measures_of(name, measured)
         chosen = TuningDrives.choose(self.warehouse, self._load(PLAIN), with_mass=False)
         with open_workers(self.root, threads) as executor:
             return identify_held_out(car, chosen.drives, executor)

@@ -359,18 +359,18 @@ class JudgedModels(PublishedModels):
         car can be, and what `model` raises.
         """
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
-        from fleet_slip.evaluation.identify import Measured, measured_car
+        from fleet_slip.evaluation.identify import VehicleMeasures, measures_of
         from fleet_slip.evaluation.measured_evaluation import evaluate_measured
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = [self.model(one) for one in (model, *others)]
-        car: VehicleParameters | Measured | None = None
+        car: VehicleParameters | VehicleMeasures | None = None
         if vehicle:
             car = load_vehicle(vehicle, self.warehouse.configs)
         if any(measured.values()):
             if car is not None:
                 raise UsageError("give a vehicle file or measurements of the car, not both.")
-            car = measured_car("measured", measured)
+            car = measures_of("measured", measured)
         with open_workers(self.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
         return store_evaluation(evaluations_of(self.warehouse, "measured"), content)

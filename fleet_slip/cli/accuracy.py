@@ -18,7 +18,7 @@ from fleet_slip.resources import folder
 from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
-    from fleet_slip.evaluation.identify import Identified
+    from fleet_slip.evaluation.identify import IdentifiedVehicle
     from fleet_slip.evaluation.report import WrittenReport
 
 
@@ -104,7 +104,7 @@ def evaluate(
 
 @command(Fleet.cohort, FleetCohort.identify, arguments=["name"], without=["include_faulty"])
 def identify(
-    found: "Identified",
+    found: "IdentifiedVehicle",
     output: Annotated[
         Path | None, typer.Option(help="Write the vehicle file here.", show_default=False)
     ] = None,

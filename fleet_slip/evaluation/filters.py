@@ -9,26 +9,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import pluralize
+from fleet_slip.base import pluralize, sha256_of
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.evaluator import Estimator
-from fleet_slip.evaluation.identify import (
-    Identified,
-    Measured,
-    Tuned,
-    checksum_of_sources,
-    identify,
-    tune,
-)
+from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures, identify
 from fleet_slip.evaluation.single_track import (
     DriveSignals,
     LabelledDrive,
@@ -36,6 +30,7 @@ from fleet_slip.evaluation.single_track import (
     read_drive,
 )
 from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.evaluation.tuning import TuningResult, tune
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
@@ -185,7 +180,7 @@ class Filter:
 
     def tune(
         self, drives: Sequence[LabelledDrive], car: VehicleParameters, executor: Executor
-    ) -> Tuned[Config]:
+    ) -> TuningResult[Config]:
         """Return the best parameters over all starts."""
         return min(
             (
@@ -277,7 +272,7 @@ def filter_bank(
     stored = drives.load_or_tune(car, executor)
     for failure in stored["failing"]:
         LOGGER.warning("%s", failure)
-    cars = {model: Identified.load(content) for model, content in stored["cars"].items()}
+    cars = {model: IdentifiedVehicle.load(content) for model, content in stored["cars"].items()}
     bank: EstimatorBank = {}
     if cars:
         identified = IdentifiedEstimate(cars)
@@ -306,7 +301,7 @@ DRIVES_OF_A_CLASS = 12
 class IdentifiedEstimate:
     """The filter in the identified car of a drive's class, or in the first identified car."""
 
-    cars: Mapping[str, Identified]
+    cars: Mapping[str, IdentifiedVehicle]
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick."""
@@ -323,6 +318,12 @@ class IdentifiedEstimate:
             "told": "labelled drives",
             "parameters": {name: car.dump() for name, car in self.cars.items()},
         }
+
+
+def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
+    """Return the SHA-256 of the modules of a folder, by default of all that tuning depends on."""
+    modules = sorted(folder.glob("*.py"))
+    return sha256_of("\0".join(module.read_text(encoding="utf-8") for module in modules))
 
 
 T = TypeVar("T")
@@ -399,7 +400,7 @@ class TuningDrives:
                 failures.append(f"{kind.name} left untuned: {error}")
         return {"cars": cars, "parameters": parameters, "failing": failures}
 
-    def _identified(self, executor: Executor) -> Iterator[tuple[str, Identified]]:
+    def _identified(self, executor: Executor) -> Iterator[tuple[str, IdentifiedVehicle]]:
         """Identify each class of cars that has a file. Raises `DataError` as `identify`."""
         classes: dict[str, list[LabelledDrive]] = {}
         for (_, model, _), drive in zip(self.keys, self.drives, strict=True):
@@ -408,7 +409,7 @@ class TuningDrives:
         for model, drives in sorted(classes.items()):
             chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
             car = load_vehicle(model, self.warehouse.configs)
-            yield model, identify(Measured.of(car), chosen, executor)
+            yield model, identify(VehicleMeasures.of_vehicle(car), chosen, executor)
 
     @cached_property
     def drives(self) -> tuple[LabelledDrive, ...]:

@@ -41,7 +41,12 @@ from fleet_slip.evaluation.held_out import (
     predict_drive,
     read_measured_drives,
 )
-from fleet_slip.evaluation.identify import IDENTIFIED, Fitted, Identified, Measured, identify
+from fleet_slip.evaluation.identify import (
+    IDENTIFIED,
+    IdentifiedVehicle,
+    VehicleMeasures,
+    identify,
+)
 from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
 from fleet_slip.evaluation.single_track import (
     STEP_S,
@@ -73,7 +78,7 @@ def evaluate_measured(
     warehouse: Warehouse,
     versions: Sequence[ModelVersion],
     predicate: str,
-    car: VehicleParameters | Measured | None,
+    car: VehicleParameters | VehicleMeasures | None,
     executor: Executor,
 ) -> dict[str, Any]:
     """Evaluate models, those of Table I and, in a car, filters; return the document.
@@ -210,7 +215,7 @@ class Competition:
     published: Mapping[str, Predictor]
     learners: Mapping[str, tuple[str, Learner]]
     vehicle: VehicleParameters | None
-    measured: Measured | None
+    measured: VehicleMeasures | None
     cars: CarCounts
     executor: Executor
     _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
@@ -223,7 +228,7 @@ class Competition:
         versions: Sequence[ModelVersion],
         predicate: str,
         drives: Sequence[HeldOutDrive],
-        car: VehicleParameters | Measured | None,
+        car: VehicleParameters | VehicleMeasures | None,
         executor: Executor,
     ) -> "Competition":
         """Collect Table I, the versions, and filters in the car if there is one."""
@@ -249,7 +254,7 @@ class Competition:
             for _, learner in learners.values()
         )
         vehicle = car if isinstance(car, VehicleParameters) else None
-        measured = Measured.of(car) if isinstance(car, VehicleParameters) else car
+        measured = VehicleMeasures.of_vehicle(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
             drives = [_moving(with_acceleration(drive, measured), measured) for drive in drives]
@@ -267,7 +272,7 @@ class Competition:
             **dict(self._tune(held_out, identified)),
         }
 
-    def _identify(self, held_out: Segments) -> Identified | None:
+    def _identify(self, held_out: Segments) -> IdentifiedVehicle | None:
         """Identify the car; None without measures of it, or if the drives lack a signal."""
         if self.measured is None:
             return None
@@ -286,7 +291,7 @@ class Competition:
         return drives
 
     def _train(
-        self, held_out: Segments, identified: Identified | None
+        self, held_out: Segments, identified: IdentifiedVehicle | None
     ) -> Iterator[tuple[str, FittedEstimator]]:
         """Train the learners; warn of those that cannot be trained."""
         for name, (source, learner) in self.learners.items():
@@ -308,7 +313,7 @@ class Competition:
         for name in set(estimators) - {*evaluated, *self._failures}:
             LOGGER.warning("%s: not evaluated: no drive has the signals that it needs.", name)
 
-    def _prior(self, learner: Learner, identified: Identified | None) -> Cohort | None:
+    def _prior(self, learner: Learner, identified: IdentifiedVehicle | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""
         name, feature_set = learner.plan.request.prior, learner.plan.feature_set
         if name is None:
@@ -325,12 +330,12 @@ class Competition:
         return self._priors[key]
 
     def _tune(
-        self, held_out: Segments, identified: Identified | None
+        self, held_out: Segments, identified: IdentifiedVehicle | None
     ) -> Iterator[tuple[str, FittedEstimator]]:
         """Tune filters in the car of the file and in the identified car."""
         if self.measured is None:
             return
-        rolling = on_signals(rolling_sideslip, self.measured.car(Fitted()))
+        rolling = on_signals(rolling_sideslip, self.measured.vehicle())
         yield "kinematic", FittedEstimator("geometry", rolling)
         cars: dict[str, tuple[str, VehicleParameters]] = {}
         if self.vehicle is not None and (
@@ -398,21 +403,21 @@ WHEELS_LAG = 0.1
 """Share of a new sample in the acceleration from wheel speeds."""
 
 
-def with_acceleration(drive: HeldOutDrive, car: Measured) -> HeldOutDrive:
+def with_acceleration(drive: HeldOutDrive, car: VehicleMeasures) -> HeldOutDrive:
     """Derive ax from wheel speeds where none is logged."""
     signals = drive.signals
     if np.isfinite(signals.ax_mps2).any():
         return drive
     try:
-        speed = measured_speed_mps(signals, car.car(Fitted()))
+        speed = measured_speed_mps(signals, car.vehicle())
     except DataError:
         return drive
     ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
     return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
 
 
-def _moving(drive: HeldOutDrive, car: Measured) -> HeldOutDrive:
+def _moving(drive: HeldOutDrive, car: VehicleMeasures) -> HeldOutDrive:
     """Drop the labels of rows in which the wheels show that the car rests."""
     with suppress(DataError):
-        return without_rest(drive, car.car(Fitted()))
+        return without_rest(drive, car.vehicle())
     return drive

@@ -11,7 +11,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured_evaluation as module
-from fleet_slip.evaluation.identify import Fitted, Identified, Measured
+from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.measured_evaluation import identified_prior
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.job import update_grams
@@ -149,14 +149,16 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What is left out must not be in the prior by way of the car."""
-    car = Measured(name="own", mass_kg=1500, front_axle_m=1.2, rear_axle_m=1.5)
+    car = VehicleMeasures(name="own", mass_kg=1500, front_axle_m=1.2, rear_axle_m=1.5)
     seen: list[int] = []
     simulated: list[float] = []
 
-    def identify(measured: Measured, drives: list[object], executor: object) -> Identified:
+    def identify(
+        measured: VehicleMeasures, drives: list[object], executor: object
+    ) -> IdentifiedVehicle:
         seen.append(len(drives))
-        fitted = Fitted(stiffness_rear=1.0 + len(seen) / 100)
-        return Identified(measured.car(fitted), fitted.noise, 0.0)
+        fitted = FitParameters(stiffness_rear=1.0 + len(seen) / 100)
+        return IdentifiedVehicle(measured.vehicle(fitted), fitted.noise, 0.0)
 
     def simulate(_: Catalog, campaign: object, feature_set: str, executor: object) -> object:
         vehicle = identified_prior(campaign)  # type: ignore[arg-type]
@@ -164,7 +166,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
         simulated.append(vehicle.suspension.rear_stiffness_factor)
         return prior
 
-    found = Identified(car.car(Fitted()), Fitted().noise, 0.0)
+    found = IdentifiedVehicle(car.vehicle(), FitParameters().noise, 0.0)
     file = tmp_path / "own.toml"
     file.write_text(found.as_campaign())
     campaign = load_campaign(str(file), SHIPPED_CONFIGS)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
-from fleet_slip.evaluation.identify import Coordinates, Descent, descend
+from fleet_slip.evaluation.tuning import Coordinates, Optimum, minimize
 from tests.support.once import require_no_failed_run
 
 
@@ -46,18 +46,19 @@ LITTLE_S = 4
 
 def briefly(
     residuals: Callable[[FloatArray], FloatArray],
-    at: Coordinates[Any],
-    begins: Sequence[FloatArray],
-) -> Descent:
+    coordinates: Coordinates[Any],
+    starts: Sequence[FloatArray],
+) -> Optimum:
     """Search from the first begin alone, and not to the end."""
-    return descend(residuals, at, begins[0], rounds=2)
+    return minimize(residuals, coordinates, starts[0], max_steps=2)
 
 
 def call(root: Path, *words: str) -> str:
     """Run a command, its searches short; what stops it is raised."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fleet_slip.evaluation.filters.TUNING_S", LITTLE_S)
-        patch.setattr("fleet_slip.evaluation.identify.search", briefly)
+        patch.setattr("fleet_slip.evaluation.identify.minimize_from", briefly)
+        patch.setattr("fleet_slip.evaluation.tuning.minimize_from", briefly)
         result = CliRunner().invoke(app, ["--root", str(root), *words])
     require_no_failed_run(root)
     if result.exception is not None:

@@ -18,8 +18,13 @@ from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import kalman
 from fleet_slip.evaluation.evaluation_document import _ranking_table, store_evaluation
 from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
-from fleet_slip.evaluation.filters import FILTERS, FilterEstimate, PublishedEstimate, class_car
-from fleet_slip.evaluation.identify import checksum_of_sources
+from fleet_slip.evaluation.filters import (
+    FILTERS,
+    FilterEstimate,
+    PublishedEstimate,
+    checksum_of_sources,
+    class_car,
+)
 from fleet_slip.evaluation.scenario_evaluation import rank
 from fleet_slip.evaluation.single_track import read_drive
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visible_signals

@@ -19,9 +19,10 @@ from fleet_slip.evaluation.held_out import (
     folds_of,
     read_measured_drives,
 )
-from fleet_slip.evaluation.identify import Fitted, Identified, Measured, Tuned
+from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.measured_evaluation import with_acceleration
 from fleet_slip.evaluation.single_track import DriveSignals
+from fleet_slip.evaluation.tuning import TuningResult
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -76,7 +77,7 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     car, still = load_vehicle("d_class_sedan", SHIPPED_CONFIGS), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
-    logged, measured = replace(a_drive(0), signals=signals), Measured.of(car)
+    logged, measured = replace(a_drive(0), signals=signals), VehicleMeasures.of_vehicle(car)
     assert with_acceleration(logged, measured) is logged
     missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
     assert with_acceleration(missing, measured).signals.ax_mps2[100:] == pytest.approx(
@@ -216,15 +217,15 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
 ) -> None:
     judged: list[float] = []
 
-    def untuned(_: object, start: Any, *rest: Any) -> Tuned[Any]:
+    def untuned(_: object, start: Any, *rest: Any) -> TuningResult[Any]:
         judged.append(float(np.mean([np.isfinite(one.sideslip_rad).mean() for one in rest[1]])))
-        return Tuned(start, 0.0)
+        return TuningResult(start, 0.0)
 
     monkeypatch.setattr(filters, "tune", untuned)
     monkeypatch.setattr(
         measured_evaluation,
         "identify",
-        lambda measured, *_: Identified(measured.car(Fitted()), ekf.EkfNoise(), 0.0),
+        lambda measured, *_: IdentifiedVehicle(measured.vehicle(), ekf.EkfNoise(), 0.0),
     )
     one = "drive_id = 'smoke-2024-05-01-0001'"
     found = fleet_slip.open(smoke_copy).evaluate_measured("smoke", one).content

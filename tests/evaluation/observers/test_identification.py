@@ -14,28 +14,26 @@ from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation import identify as identifying
+from fleet_slip.evaluation.filters import checksum_of_sources
 from fleet_slip.evaluation.identify import (
-    Fitted,
-    Identified,
-    Measured,
-    checksum_of_sources,
+    IdentifiedVehicle,
+    VehicleMeasures,
     identify,
     identify_held_out,
-    rmse_rad,
-    tune,
 )
 from fleet_slip.evaluation.kalman import FilterNoise
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.evaluation.tuning import rmse_rad, tune
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 from tests.support.drives import noisy, simulated_drive, slalom
 
 CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
-MEASURED = Measured.of(CAR)
+MEASURED = VehicleMeasures.of_vehicle(CAR)
 
 
 @pytest.fixture(scope="module")
-def identified(drive: LabelledDrive, executor: Executor) -> Identified:
+def identified(drive: LabelledDrive, executor: Executor) -> IdentifiedVehicle:
     return identify(MEASURED, [drive], executor)
 
 
@@ -50,23 +48,23 @@ def rmse_deg(estimate: np.ndarray, drive: LabelledDrive) -> float:
 
 def test_the_start_knows_nothing_but_what_was_measured() -> None:
     stiffer = CAR.with_tyres(stiffness_factor=0.8)
-    assert Measured.of(stiffer) == MEASURED
-    body = MEASURED.car(Fitted()).body
+    assert VehicleMeasures.of_vehicle(stiffer) == MEASURED
+    body = MEASURED.vehicle().body
     assert body.mass_kg == pytest.approx(CAR.body.mass_kg)
     assert body.yaw_inertia_kgm2 != pytest.approx(CAR.body.yaw_inertia_kgm2, rel=0.01)
 
 
 def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
-    drive: LabelledDrive, identified: Identified
+    drive: LabelledDrive, identified: IdentifiedVehicle
 ) -> None:
     found = identified
-    before = rmse_deg(ekf.estimate(drive.signals, MEASURED.car(Fitted()), ekf.EkfNoise()), drive)
+    before = rmse_deg(ekf.estimate(drive.signals, MEASURED.vehicle(), ekf.EkfNoise()), drive)
     assert rmse_deg(ekf.estimate(drive.signals, found.car, found.noise), drive) < 0.7 * before
     assert found.held_out_rad is None
 
 
 def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
-    drive: LabelledDrive, identified: Identified, executor: Executor
+    drive: LabelledDrive, identified: IdentifiedVehicle, executor: Executor
 ) -> None:
     exact, missing = drive.signals, np.full(len(drive.signals), np.nan)
     road = (exact.steer_fl_rad + exact.steer_fr_rad) / 2
@@ -90,7 +88,7 @@ def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
 
 
 def test_a_parameter_at_its_bound_and_one_that_drives_do_not_tell_are_said(
-    drive: LabelledDrive, identified: Identified, executor: Executor
+    drive: LabelledDrive, identified: IdentifiedVehicle, executor: Executor
 ) -> None:
     assert not identified.at_bounds
     assert {"friction", "yaw_inertia"} <= {*identified.not_identifiable}, "nobody slides"
@@ -116,7 +114,7 @@ def test_what_was_left_out_is_measured_without_it(drive: LabelledDrive, executor
 
 
 @dataclass(frozen=True)
-class Recorder(Identified):
+class Recorder(IdentifiedVehicle):
     """A car that records every drive it estimates, beside those it was identified from."""
 
     training: tuple[float, ...] = ()
@@ -137,7 +135,7 @@ def test_no_car_is_measured_on_a_drive_that_it_was_identified_from(
     ]
     estimated: list[tuple[float, tuple[float, ...]]] = []
 
-    def record(measured: Measured, drives: Sequence[LabelledDrive], _: Executor) -> Recorder:
+    def record(measured: VehicleMeasures, drives: Sequence[LabelledDrive], _: Executor) -> Recorder:
         training = tuple(float(one.signals.ax_mps2[0]) for one in drives)
         return Recorder(CAR, ekf.EkfNoise(), 0.0, training=training, estimated=(estimated,))
 
