@@ -16,11 +16,11 @@ from typing import Any
 
 from benchmarks.harness import durations
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 

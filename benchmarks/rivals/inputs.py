@@ -19,9 +19,9 @@ from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.compute import read_drives
 from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import assign_folds
-from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment
+from fleet_slip.warehouse.gram_reader import cohort_files
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 

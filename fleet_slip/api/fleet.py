@@ -266,7 +266,7 @@ class Fleet(HealthAndUpkeep):
         set, `StorageError`, `ConflictError` and `ClusterError`.
         """
         from fleet_slip.grams.job import update_grams
-        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.warehouse.gram_reader import cohort_files
         from fleet_slip.warehouse.predicate import parse_cohort
 
         among = None

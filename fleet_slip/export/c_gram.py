@@ -29,6 +29,8 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import pluralize
+from fleet_slip.calibration.intercept import intercept_columns
+from fleet_slip.calibration.receiver_delay import delay_columns
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
@@ -59,9 +61,7 @@ from fleet_slip.grams.on_board import (
     counted_sets,
     most_rows,
 )
-from fleet_slip.grams.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.straight_on import levels_of
 from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.gram import packed_size
 
@@ -151,7 +151,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     sets = (plain, OnBoard(label, counted, columns), delays, whole(CALIBRATION))
     if manifest.through_origin:
         return sets
-    base, levels = levels_of(catalog, manifest)
+    base, levels = intercept_columns(catalog, name, manifest.signals)
     source = counted_set[catalog.identity(base)]
     columns = tuple(name for name in source.columns if name in {*levels, label})
     return (*sets, OnBoard(label, source, columns))

@@ -12,11 +12,11 @@ from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
-from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received
+from fleet_slip.grams.gram_files import recorded_cars
 from fleet_slip.grams.job import transaction_name
-from fleet_slip.grams.receiver_delay import recorded_cars
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
+from fleet_slip.warehouse.gram_rows import find_backlog, is_of_received, is_received
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4

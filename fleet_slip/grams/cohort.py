@@ -33,7 +33,6 @@ from fleet_slip.grams.folding import (
     require_divided,
 )
 from fleet_slip.grams.gram_files import Hashes
-from fleet_slip.grams.reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.grams.weights import FULL, weighted
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
@@ -45,6 +44,7 @@ from fleet_slip.regression.drives import (
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.rendering import Remark
+from fleet_slip.warehouse.gram_reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 

@@ -13,14 +13,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
+from fleet_slip.calibration.car_calibration import calibration_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.course import BESIDE, TURNED
 from fleet_slip.catalog.definitions import ParameterFactor
 from fleet_slip.catalog.drive_sources import ALL_DRIVES
-from fleet_slip.grams.calibration import calibration_of
-from fleet_slip.grams.gram_files import by_signals, gram_table
-from fleet_slip.grams.reader import OpenedGrams
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
+from fleet_slip.warehouse.gram_reader import OpenedGrams
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.predicate import parse_predicate
 
 # Removes what a gyroscope's bias and scale do to the Gram rows of changes, drive by drive.

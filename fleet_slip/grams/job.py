@@ -15,27 +15,30 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Progress, no_progress, pluralize
+from fleet_slip.calibration.receiver_delay import course_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
+    files_of_other_delay,
     files_to_rewrite,
-    find_backlog,
     find_superseded,
-    is_of_received,
-    is_received,
-    named_files,
     require_active,
-    rows_of_set,
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.reader import cohort_files
-from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
+from fleet_slip.warehouse.gram_reader import cohort_files
+from fleet_slip.warehouse.gram_rows import (
+    find_backlog,
+    is_of_received,
+    is_received,
+    named_files,
+    rows_of_set,
+)
 from fleet_slip.warehouse.predicate import parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 

@@ -49,15 +49,12 @@ from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.compute import Parts
 from fleet_slip.grams.gram_files import (
-    by_signals,
     files_to_rewrite,
     gram_digests,
-    gram_table,
     in_schema,
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.reader import BATCH_ROWS
 from fleet_slip.ingest.formats.parquet_footer import (
     DELTA_BYTE_ARRAY,
     RowGroup,
@@ -70,6 +67,8 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.erasure_log import ErasureLog
+from fleet_slip.warehouse.gram_reader import BATCH_ROWS
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # The feature sets that cars can count: their columns, the ranges of these, and their definition.

@@ -8,12 +8,12 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
+from fleet_slip.calibration.car_calibration import three_digits
+from fleet_slip.calibration.intercept import InterceptEstimate, estimate_intercept
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.drive_sources import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
-from fleet_slip.grams.calibration import three_digits
-from fleet_slip.grams.reader import open_grams
 from fleet_slip.models.acceptance import judge
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -30,7 +30,6 @@ from fleet_slip.models.manifest import (
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
-from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.training_checks import (
     require_in_time,
     require_sound_course,
@@ -38,6 +37,7 @@ from fleet_slip.models.training_checks import (
 )
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -261,24 +261,31 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
     change_s = catalog.feature_set(name).change_s
     if not change_s:
         return manifest
-    found = StraightOn(Fraction(0), {}, None, 0.0, 0)
+    estimate = InterceptEstimate()
     if not manifest.through_origin:
         predicate = parse_cohort(catalog.signals, manifest.trained_on.cohort)
-        found = straight_on(warehouse, predicate, manifest)
+        coefficients = {
+            term.signal: term.coefficient_exact * Fraction(term.scale_exact)
+            for term in manifest.terms
+        }
+        estimate = estimate_intercept(warehouse, predicate, name, coefficients)
     learned = LearnedFrom(
         label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
-        cars=found.cars,
+        cars=estimate.cars,
         intercept_uncertainty_deg=(
-            None if found.uncertainty is None else three_digits(math.degrees(found.uncertainty))
+            None
+            if estimate.uncertainty is None
+            else three_digits(math.degrees(estimate.uncertainty))
         ),
-        intercept_spread_deg=math.degrees(found.spread),
+        intercept_spread_deg=math.degrees(estimate.std_between_cars),
     )
     scales = catalog.input_scales
     terms = (
-        _term(catalog, column, slope / scales[column], {}) for column, slope in found.slopes.items()
+        _term(catalog, column, slope / scales[column], {})
+        for column, slope in estimate.slopes.items()
     )
-    own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
+    own = {"intercept": float(estimate.intercept), "intercept_exact": estimate.intercept}
     origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
     return manifest.model_copy(update={**own, **origin})
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.base import canonical_json, document_of, sha256_of
+from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
@@ -16,7 +17,7 @@ from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, Served, load_cohort
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
 from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
-from fleet_slip.models.label_noise import WithoutLabel, label_noise_deg, without_label
+from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     COURSE_FEATURES,
     COURSE_MODELS,
@@ -101,7 +102,7 @@ class Selection(Answer):
     config_sha256: str = ""
     weighed: Mapping[str, Weighed] = field(default_factory=dict)
     full: int = 1
-    without_label: WithoutLabel | None = None
+    without_label: CourseLabelQuality | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
     asked_condition: str = TRAINING_DRIVES
@@ -282,7 +283,8 @@ def answer_request(
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
         plan = SelectionPlan.of(catalog, replace(request, models=LOGGED_MODELS))
         answer = _answer(warehouse, plan, predicate)
-    told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
+    cohort, error_deg = answer.cohort, answer.winner.model.pooled.rmse_deg
+    told = assess_course_label(warehouse, cohort.feature_set, cohort.predicate, error_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
     known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
     return replace(known, request=request, asked_condition=predicate)

@@ -14,8 +14,8 @@ from fleet_slip.rendering import Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import describe_cohort
 
 if TYPE_CHECKING:
+    from fleet_slip.calibration.course_label import CourseLabelQuality
     from fleet_slip.grams.weights import Weighed
-    from fleet_slip.models.label_noise import WithoutLabel
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 
@@ -140,7 +140,7 @@ def _label_noise(selection: "Selection") -> Remark:
     )
 
 
-def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
+def _without_label(told: "CourseLabelQuality") -> Iterator[Remark]:
     """Yield what changes of the course tell of the angle, and what they do not."""
     over = ", ".join(f"{one:g}" for one in told.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"

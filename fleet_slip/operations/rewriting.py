@@ -22,7 +22,7 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
+from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.job import land_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
@@ -41,6 +41,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.erasure_log import ErasureSubject
+from fleet_slip.warehouse.gram_rows import is_received, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -37,7 +37,6 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import wide_grams
-from fleet_slip.grams.gram_files import is_of_received, is_received, named_files
 from fleet_slip.grams.job import reconcile
 from fleet_slip.grams.on_board import counted_sets, impossible_rows
 from fleet_slip.models.registry import Registry
@@ -54,6 +53,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
+from fleet_slip.warehouse.gram_rows import is_of_received, is_received, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[

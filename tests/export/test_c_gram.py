@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
+from fleet_slip.calibration.intercept import PLANE
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.c_gram import sets_on_board
@@ -22,7 +23,6 @@ from fleet_slip.export.files import export_files
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.on_board import counted_sets
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.straight_on import PLANE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.storage.folder import Folder

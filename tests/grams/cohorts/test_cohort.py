@@ -10,15 +10,15 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
-from fleet_slip.grams import reader
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import GramReader
 from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weights, weighted
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.warehouse import gram_reader
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse, open_tables
 from tests.support.catalog import CATALOG, SIGNALS
@@ -137,7 +137,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         found.append(given)
         return open_tables(*given)
 
-    monkeypatch.setattr(reader, "open_tables", counting)
+    monkeypatch.setattr(gram_reader, "open_tables", counting)
     return found
 
 
@@ -148,11 +148,11 @@ def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
         land_another(warehouse, number)
         assert [len(load_cohort(warehouse).drives) for _ in range(3)] == [number + 1] * 3
         assert len(opened) == number + 1
-    monkeypatch.setattr(reader, "USES", 3)
+    monkeypatch.setattr(gram_reader, "USES", 3)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 3
-    monkeypatch.setattr(reader, "KEPT_BYTES", 0)
+    monkeypatch.setattr(gram_reader, "KEPT_BYTES", 0)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 4

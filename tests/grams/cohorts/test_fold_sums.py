@@ -9,16 +9,16 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError
-from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import answer_request, select
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
+from fleet_slip.warehouse import gram_reader
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS

@@ -16,11 +16,11 @@ from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
 from fleet_slip.grams.check import check_grams, differing_drives, grams_of
 from fleet_slip.grams.compute import aggregate, compute_grams
-from fleet_slip.grams.gram_files import find_backlog, gram_table, is_of_received, named_files
 from fleet_slip.grams.job import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
+from fleet_slip.warehouse.gram_rows import find_backlog, gram_table, is_of_received, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
