@@ -17,7 +17,7 @@ from fleet_slip.regression.gram import GramTable, packed_position
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.predicate import Predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 CourseMoments = Mapping[str, Mapping[str, FloatArray]]
 """Sums of products of 1, `COLUMNS` and the label in SI units, by car and drive, shape (6, 6)."""

@@ -25,7 +25,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, LinearModel, fit
 from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import Predicate
-from fleet_slip.warehouse.tables import Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 PLANE = ("curvature_mean_16", "yaw_rate_speed_mean_16")
 """Regressors of the columns of a model, beside a constant."""
