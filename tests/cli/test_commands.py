@@ -270,7 +270,7 @@ def test_a_changed_campaign_is_refused_and_changes_nothing(
     before = run_command(*asked, root=root_to_fail_in).json
     changed = run_command("simulate", "./mine.toml", root=root_to_fail_in)
     assert changed.exit_code == 7
-    assert "was changed since this day was simulated" in changed.stderr
+    assert "has changed since this day was simulated" in changed.stderr
     assert run_command(*asked, root=root_to_fail_in).json == before
 
 
