@@ -17,7 +17,7 @@ from typing import Any
 from benchmarks.harness import durations
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.gram_reader import GramReader
@@ -52,7 +52,7 @@ def main(root: str, predicate: str) -> None:
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
         "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(lambda: answer_request(warehouse, TABLE, predicate)),
+        "select_ms": median_ms(lambda: run_selection(warehouse, TABLE, predicate)),
     }
     print(json.dumps(figures))
 

@@ -78,7 +78,7 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
             "cross-validation needs at least two folds, and the cohort is one drive, or one trip: "
             f"drives of a car less than {LONGEST_PAUSE_S // 60} minutes apart. Add logs, or hold "
             "out parts of the time: fleet-slip gram --features blocks, then fleet-slip publish "
-            "NAME --features blocks --by part"
+            "NAME --features blocks --group-by part"
         )
     if count == EACH:
         if (number := len(set(values))) > MOST_FOLDS:

@@ -36,7 +36,7 @@ def with_line_fitted(
     """Return a request of a set with a line, which is fitted if none is kept; others as they are.
 
     `asked` is the cohort, `predicate` what of it has no fault. The Gram rows of the set, and those
-    that the line needs, are made. Raises as `answer_request`.
+    that the line needs, are made. Raises as `run_selection`.
     """
     catalog = warehouse.catalog
     plan = SelectionPlan.of(catalog, request)
@@ -88,10 +88,10 @@ def _kept_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStage
 def fit_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStageModel:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
-    Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
+    Raises as `run_selection`, and `QuestionError` if its estimate would not be exact.
     """
     catalog = warehouse.catalog
-    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], by="drive"))
+    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], group_by="drive"))
     reason = f"model list {about['models']} fits the first-stage model on them"
     ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)
     cohort = load_cohort(warehouse, predicate, plan.feature_set)

@@ -14,7 +14,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.drive_sources import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
-from fleet_slip.models.acceptance import judge
+from fleet_slip.models.acceptance import review_challenger
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -46,9 +46,18 @@ from fleet_slip.warehouse.warehouse import Warehouse
 COHORT = "cohort"
 """Key of the predicate that was asked, where cars were left out of it."""
 
-_WHAT = {"models", "model", "nested", "features", "label", "rank", "criterion", "all_subsets"}
-_WHAT |= {"search", "most"}
-"""What says which models are compared: who asks for one of these asks for all anew."""
+_MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "criterion"}
+_MODEL_OPTIONS |= {"all_subsets", "search", "max_features"}
+"""Options that define which models are compared: with one of these, none is taken from before."""
+
+_STORED_NAMES = {
+    "order": "nested",
+    "ranking": "rank",
+    "tolerance": "worth",
+    "max_features": "most",
+    "group_by": "by",
+}
+"""Names of options in manifests, where they differ: versions of earlier releases have them."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +75,9 @@ def asked_of(selection: Selection) -> dict[str, Any] | None:
     fell_back = not asked and selection.model_list == LOGGED_MODELS
     if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
         return None
+    stored = {_STORED_NAMES.get(name, name): value for name, value in asked.items()}
     whole = selection.asked_condition == selection.cohort.predicate.text
-    return asked if whole else {**asked, COHORT: selection.asked_condition}
+    return stored if whole else {**stored, COHORT: selection.asked_condition}
 
 
 def recipe_for(
@@ -80,7 +90,7 @@ def recipe_for(
         return Recipe(request, cohort or TRAINING_DRIVES)
     chosen_from = before.manifest.selected_by.model_list
     was = with_all_drives(before.manifest.trained_on.cohort)
-    if asked.keys() & _WHAT:
+    if asked.keys() & _MODEL_OPTIONS:
         wanted = request
         told = f"not as {before.reference}, chosen from {chosen_from}"
     else:
@@ -111,9 +121,12 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
     cohort = with_all_drives(manifest.trained_on.cohort)
     if chosen.asked is None:
         return _of_list(version), cohort
-    known = {field.name for field in fields(SelectionRequest)}
-    asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
-    return SelectionRequest(**asked), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
+    options: dict[str, Any] = {
+        field.name: chosen.asked[stored]
+        for field in fields(SelectionRequest)
+        if (stored := _STORED_NAMES.get(field.name, field.name)) in chosen.asked
+    }
+    return SelectionRequest(**options), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
 
 
 def _of_list(version: ModelVersion) -> SelectionRequest:
@@ -132,8 +145,8 @@ def _of_list(version: ModelVersion) -> SelectionRequest:
     return SelectionRequest(models=name)
 
 
-def is_up_to_date(
-    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
+def is_current(
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, tolerance: str | None
 ) -> bool:
     """Return whether a selection from a model list would come to this manifest again.
 
@@ -156,12 +169,12 @@ def is_up_to_date(
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
         warehouse.grams.snapshot().version,
         models,
-        checksum_of_list(model_list, worth),
+        checksum_of_list(model_list, tolerance),
         package_version("fleet-slip"),
     )
 
 
-def challenger_of(
+def build_challenger(
     warehouse: Warehouse,
     registry: Registry,
     selection: Selection,
@@ -501,14 +514,14 @@ def _decide(
     if champion and champion.manifest.same_estimator(manifest):
         return _Decision("The champion is the same model.", champion)
     held = registry.history(manifest.name).held_by(CHAMPION)
-    judgement = judge(registry, champion, manifest, selection)
+    review = review_challenger(registry, champion, manifest, selection)
     if not force and not candidate:
-        judgement.require_passed(manifest.name)
-    if champion and judgement.drifts and not (force or candidate or held):
-        reason = f"The champion stays: it is significantly better. {judgement.reason}"
+        review.require_passed(manifest.name)
+    if champion and review.is_significantly_worse and not (force or candidate or held):
+        reason = f"The champion stays: it is significantly better. {review.reason}"
         return _Decision(reason, champion)
-    best = None if judgement.problems else judgement.best
-    return _Decision(judgement.reason, None, candidate or held is not None, held, best)
+    best = None if review.problems else review.best
+    return _Decision(review.reason, None, candidate or held is not None, held, best)
 
 
 def _why(name: str, held: AliasMove | None) -> str:

@@ -32,7 +32,7 @@ from fleet_slip.models.request import (
     load_model_list,
     name_inputs,
     nested_candidates,
-    parse_worth,
+    parse_tolerance,
     require_inputs,
     require_odd,
 )
@@ -196,7 +196,7 @@ def select(
     cohort: Cohort,
     candidates: Sequence[CandidateModel],
     folds: Folding,
-    worth: Tolerance | None = None,
+    tolerance: Tolerance | None = None,
     searches: Sequence[Search] = (),
     inputs: Sequence[str] = (),
     *,
@@ -204,9 +204,9 @@ def select(
 ) -> Selection:
     """Cross-validate each candidate, and what searches find among inputs; choose the winner.
 
-    `worth` overrides the rule of the first search. Candidates with absent or dependent signals are
-    skipped, with the reason, and so are searches that need more drives. Raises `DataError` if none
-    is left, or no drive has the label.
+    `tolerance` overrides the rule of the first search. Skips candidates with absent or dependent
+    signals, and searches that need more drives. Raises `DataError` if none is left, or no drive has
+    the label.
     """
     divided = cohort.folds(folds.by, folds.count)
     catalog = cohort.catalog
@@ -231,14 +231,14 @@ def select(
             skipped[one.name] = str(error)
     searched: list[SearchedModels] = []
     for search in searches:
-        if cohort.drive_count < search.fewest_drives:
-            few = f"it needs {search.fewest_drives} drives, and there are {cohort.drive_count}"
+        if cohort.drive_count < search.min_drives:
+            few = f"it needs {search.min_drives} drives, and there are {cohort.drive_count}"
             skipped[f"{search.name or search.method} (search)"] = few
         elif among := search.among(inputs):
-            most = search.most
-            if search.columns_per_drive and folds.by != PARTS:
-                most = min(most, search.columns_per_drive * cohort.drive_count)
-            bounded = search.model_copy(update={"most": most})
+            most = search.max_features
+            if search.max_features_per_drive and folds.by != PARTS:
+                most = min(most, search.max_features_per_drive * cohort.drive_count)
+            bounded = search.model_copy(update={"max_features": most})
             try:
                 found = search_models(cohort, among, folds, bounded, intercept=intercept)
             except DataError as error:  # no drive, or not one in each fold, has all inputs
@@ -249,7 +249,7 @@ def select(
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate model can be fitted: {reasons}")
-    winner = choose_by(searches[0] if searches else None, models, worth)
+    winner = choose_by(searches[0] if searches else None, models, tolerance)
     return Selection(
         cohort,
         folds,
@@ -265,7 +265,7 @@ GIVEN = "given"
 """The name of a model whose inputs were asked for one by one."""
 
 
-def answer_request(
+def run_selection(
     warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
 ) -> Selection:
     """Select on a predicate's drives, without the columns of the usual list by that of signals.
@@ -303,9 +303,9 @@ class SelectionPlan:
     def of(cls, catalog: Catalog, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-        by_inputs = request.nested or request.ordered or request.search
+        by_inputs = request.order or request.is_ordered or request.search
         if not (request.models or request.model or by_inputs):
-            logged = request.features or request.by == PARTS
+            logged = request.features or request.group_by == PARTS
             usual = LOGGED_MODELS if logged else DEFAULT_MODELS
             request = replace(request, models=COURSE_MODELS if request.label else usual)
         model_list = _given(catalog, request)
@@ -315,7 +315,7 @@ class SelectionPlan:
             request = replace(request, label=model_list.label)
             request.check()
         listed = model_list.folds if model_list else Folding()
-        folds = make_folding(request.by or listed.by, request.folds, listed.count)
+        folds = make_folding(request.group_by or listed.by, request.folds, listed.count)
         return cls(request, model_list, folds, _feature_set(catalog, request, model_list))
 
     def choose(self, cohort: Cohort) -> Selection:
@@ -330,7 +330,7 @@ class SelectionPlan:
             full *= FULL if weighed else 1
         if prior := cohort.prior:
             found = weigh_prior(cohort, prior, self)
-        elif self.request.ordered:
+        elif self.request.is_ordered:
             found = _search(cohort, self.request, self.folds)
         else:
             found = _compare_listed(cohort, self.request, self.model_list, self.folds)
@@ -340,9 +340,9 @@ class SelectionPlan:
 def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
     request, folds = plan.request, plan.folds
     distances = bool(
-        request.nested and not request.ordered and not _searches_of(request, plan.model_list)
+        request.order and not request.is_ordered and not _searches_of(request, plan.model_list)
     )
-    of_drives = request.ordered or request.robust or request.half_life
+    of_drives = request.is_ordered or request.robust or request.half_life
     whole = of_drives or distances  # else the sum of each fold suffices
     cohort = load_cohort(warehouse, predicate, plan.feature_set, None if whole else folds)
     if request.prior:
@@ -352,7 +352,7 @@ def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Select
         cohort = replace(cohort, prior=prior)
     answer = plan.choose(cohort)
     if distances:
-        inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
+        inputs = inputs_of(answer.cohort, request.order or WHOLE_SET)
         told = try_distances(answer.cohort, inputs, folds, request)
         answer = replace(answer, distances=told)
     return answer
@@ -398,8 +398,8 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
 def _weigh_drives(cohort: Cohort, plan: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
     """Return a cohort whose lost drives count less, by a model of all compared inputs."""
     request, model_list = plan.request, plan.model_list
-    inputs = inputs_of(cohort, request.nested or WHOLE_SET)
-    if model_list and model_list.model and not (request.nested or request.search):
+    inputs = inputs_of(cohort, request.order or WHOLE_SET)
+    if model_list and model_list.model and not (request.order or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
     lost = lost_drives(cohort.serving(inputs), intercept=request.intercept)
@@ -445,11 +445,11 @@ def _compare_listed(
 ) -> Selection:
     listed = model_list.model if model_list else ()
     searches = _searches_of(request, model_list)
-    worth = None if request.worth is None else parse_worth(request.worth)
-    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if searches else ()
+    tolerance = None if request.tolerance is None else parse_tolerance(request.tolerance)
+    inputs = inputs_of(cohort, request.order or WHOLE_SET) if searches else ()
     nested = (
-        nested_candidates(inputs_of(cohort, request.nested))
-        if request.nested and not searches
+        nested_candidates(inputs_of(cohort, request.order))
+        if request.order and not searches
         else ()
     )
     candidates = (*listed, *nested)
@@ -462,28 +462,33 @@ def _compare_listed(
             search=searches,
         )
         name = request.models or (GIVEN if request.model else None)
-        label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+        label = "+".join(filter(None, [name, f"order:{request.order}" if nested else None]))
         compared = described.sha256
     else:
         (search,) = searches
-        content = {"inputs": list(inputs), **search.model_dump(include={"method", "most", "rule"})}
-        label = f"search:{search.method} {search.most}"
+        content = {
+            "inputs": list(inputs),
+            **search.as_dict(include={"method", "max_features", "rule"}),
+        }
+        label = f"search:{search.method} {search.max_features}"
         compared = sha256_of(canonical_json(content))
-    found = select(cohort, candidates, folds, worth, searches, inputs, intercept=request.intercept)
-    checksum = _checksum(compared, request.worth, request.intercept)
+    found = select(
+        cohort, candidates, folds, tolerance, searches, inputs, intercept=request.intercept
+    )
+    checksum = _checksum(compared, request.tolerance, request.intercept)
     return replace(found, model_list=label, config_sha256=checksum)
 
 
-def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
+def checksum_of_list(model_list: ModelList, tolerance: str | None) -> str | None:
     """Return the `config_sha256` of a selection from a list, None for one that only searches."""
-    return _checksum(model_list.sha256, worth, True) if model_list.model else None
+    return _checksum(model_list.sha256, tolerance, True) if model_list.model else None
 
 
-def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
+def _checksum(compared: str, tolerance: str | None, intercept: bool) -> str:
     """Return the checksum of what is compared, and of what else is asked for and not usual."""
     unusual: dict[str, Any] = {}
-    if worth is not None:
-        unusual["worth"] = worth
+    if tolerance is not None:
+        unusual["worth"] = tolerance
     if not intercept:
         unusual["intercept"] = False
     return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
@@ -493,20 +498,22 @@ def _searches_of(request: SelectionRequest, model_list: ModelList | None) -> tup
     if request.search:
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
-        asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        options: dict[str, Any] = {"method": request.search}
+        if request.max_features:
+            options["max_features"] = request.max_features
         if request.label:
-            # The noise of the course hides in the error what a column is worth to the angle.
-            asked["rule"] = "best"
-        return (Search.model_validate(asked),)
+            # The noise of the course exceeds the gain of a column: compare correlations.
+            options["rule"] = "best"
+        return (Search.model_validate(options),)
     return model_list.search if model_list else ()
 
 
 def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Selection:
-    nested = request.nested or WHOLE_SET
+    nested = request.order or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
-    ranking = ALL_SUBSETS if request.all_subsets else request.rank or "declared"
-    rule = Rule(ranking, criterion, parse_worth(request.worth))
+    ranking = ALL_SUBSETS if request.all_subsets else request.ranking or "declared"
+    rule = Rule(ranking, criterion, parse_tolerance(request.tolerance))
     found = select_inputs(cohort, inputs, folds, rule, request)
     described = ModelList(
         description="Inputs to choose from",
@@ -524,8 +531,8 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Select
         {},
         choice=found.choice,
         intercept=request.intercept,
-        model_list=f"nested:{nested} {rule.ranking} {rule.criterion}",
+        model_list=f"order:{nested} {rule.ranking} {rule.criterion}",
         config_sha256=_checksum(
-            sha256_of(canonical_json(content)), request.worth, request.intercept
+            sha256_of(canonical_json(content)), request.tolerance, request.intercept
         ),
     )

@@ -18,7 +18,7 @@ from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.models.acceptance import find_lacks, load_floor
+from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
@@ -53,7 +53,7 @@ def require_sound_drives(
     over.
     """
     found, looked_at, measured = _look(warehouse, manifest, made)
-    lacks = find_lacks(load_floor(warehouse.configs), manifest)
+    lacks = missing_evidence(load_thresholds(warehouse.configs), manifest)
     if measured and len(manifest.terms) > settled and lacks:
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "

@@ -195,4 +195,4 @@ def test_a_fleet_without_receivers_is_told_so(smoke_copy: Path) -> None:
     with pytest.raises(DataError, match="no course to learn from"):
         cohort.select(label="course", model=COLUMNS)
     with pytest.raises(DataError, match="no course to learn from"):
-        cohort.select(label="course", nested="ay", rank="declared")
+        cohort.select(label="course", order="ay", ranking="declared")

@@ -47,7 +47,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, models: Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         update_grams(Warehouse(LocalFolder(root)), feature_set="gated")
-        answer(root, "publish", "roads", "--models", str(models), "--worth", "0.0001deg")
+        answer(root, "publish", "roads", "--models", str(models), "--tolerance", "0.0001deg")
 
     return made_once(tmp_path_factory, "gated_model", make)
 

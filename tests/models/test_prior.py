@@ -111,8 +111,8 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
 @pytest.mark.parametrize(
     "words",
     [
-        ("--nested", "ay,yaw_rate"),
-        ("--rank", "tstat"),
+        ("--order", "ay,yaw_rate"),
+        ("--ranking", "tstat"),
         ("--label", "course"),
     ],
 )
@@ -253,12 +253,12 @@ def fleet(tmp_path: Path) -> Fleet:
 
 
 def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: Fleet) -> None:
-    robust = fleet.cohort().select(nested=TWO, robust=True)
+    robust = fleet.cohort().select(order=TWO, robust=True)
     assert list(robust.weighed) == ["d06"]
     assert robust.weighed["d06"].times > 10 and robust.weighed["d06"].weight == 0
-    others = fleet.cohort("vehicle_id <> 'it''s me'").select(nested=TWO)
+    others = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO)
     assert robust.winner.model.model == others.winner.model.model
-    plain = fleet.cohort().select(nested=TWO)
+    plain = fleet.cohort().select(order=TWO)
     assert plain.winner.model.pooled.rmse_deg > 2 * robust.winner.model.pooled.rmse_deg
     assert plain.as_dict()["drives"] == 1 + robust.as_dict()["drives"]
 
@@ -266,16 +266,16 @@ def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: 
 def test_the_command_names_it_and_the_version_keeps_how(
     fleet: Fleet, run_command: RunCommand
 ) -> None:
-    told = run_command("select", "--nested", TWO, "--robust")
+    told = run_command("select", "--order", TWO, "--robust")
     assert told.exit_code == 0
     assert "d06: its error is " in told.stderr and "the weight 0.00" in told.stderr
     before = run_command("diagnose", "--signals", TWO)
     assert "d06: its error is " in before.stderr
     before_json = run_command("diagnose", "--signals", TWO, "--json").json
     assert list(before_json["drives_weighed"]) == ["d06"]
-    document = run_command("select", "--nested", TWO, "--robust", "--json").json
+    document = run_command("select", "--order", TWO, "--robust", "--json").json
     assert document["drives_weighed"]["d06"]["weight"] == 0
-    made = run_command("publish", "safe", "--nested", TWO, "--robust", "--force")
+    made = run_command("publish", "safe", "--order", TWO, "--robust", "--force")
     assert made.exit_code == 0, made.stderr
     manifest = fleet.model("safe").manifest
     assert manifest.selected_by.asked is not None and manifest.selected_by.asked["robust"]
@@ -285,9 +285,9 @@ def test_the_command_names_it_and_the_version_keeps_how(
 
 
 def test_honest_drives_keep_their_weight(fleet: Fleet) -> None:
-    honest = fleet.cohort("vehicle_id <> 'it''s me'").select(nested=TWO, robust=True)
+    honest = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO, robust=True)
     assert honest.weighed == {}
-    few = fleet.cohort("drive_id < 'd05'").select(nested=TWO, robust=True)
+    few = fleet.cohort("drive_id < 'd05'").select(order=TWO, robust=True)
     assert few.weighed == {}
 
 

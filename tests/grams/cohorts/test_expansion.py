@@ -142,7 +142,7 @@ def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
 def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
     fleet = fleet_slip.open(filled.root)
     chosen = fleet.cohort("true").select(
-        nested="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
+        order="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
     )
     version = fleet.publish("calibrated", chosen, force=True).version
     manifest = version.manifest

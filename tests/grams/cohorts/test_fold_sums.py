@@ -13,7 +13,7 @@ from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
 from fleet_slip.grams.job import update_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import answer_request, select
+from fleet_slip.models.select import run_selection, select
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
@@ -155,7 +155,7 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     query = "SELECT count(*) FROM grams"
     with connect(tmp_path, query=query) as database:
         assert database.execute(query).fetchone() == (20,)
-    assert answer_request(warehouse, SelectionRequest()).cohort.drive_count == 20
+    assert run_selection(warehouse, SelectionRequest()).cohort.drive_count == 20
 
 
 def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:
