@@ -43,7 +43,7 @@ def main(root: str, predicate: str) -> None:
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:
         sums = load_cohort(source, predicate, folding=FOLDS).folds("drive", FOLDS.count)
-        fit(sums.serving(INPUTS, label).total, INPUTS, label)
+        fit(sums.complete_cases(INPUTS, label).total, INPUTS, label)
 
     with GramReader(warehouse) as reader:
         again_ms = median_ms(lambda: fitted_from_disk(reader))
@@ -51,7 +51,9 @@ def main(root: str, predicate: str) -> None:
         "gram_rows": len(cohort.drives),
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
-        "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
+        "fit_ms": median_ms(
+            lambda: fit(cohort.complete_cases(INPUTS).table.total(), INPUTS, label)
+        ),
         "select_ms": median_ms(lambda: run_selection(warehouse, TABLE, predicate)),
     }
     print(json.dumps(figures))

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.training import LearnReport, RunReport
     from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.job import GramReport
-    from fleet_slip.grams.on_board import CountedReport
+    from fleet_slip.grams.on_board import OnboardImport
     from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
@@ -213,16 +213,16 @@ class Fleet(HealthAndUpkeep):
         return sorted(reports, key=lambda report: order[report.file])
 
     @record_call
-    def ingest_counted(self, file: Path | str) -> "CountedReport":
+    def import_onboard_grams(self, file: Path | str) -> "OnboardImport":
         """Bring in Gram rows that cars counted: a Parquet table (`docs/export.md`).
 
         It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
         forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
         """
-        from fleet_slip.grams.on_board import ingest_counted
+        from fleet_slip.grams.on_board import import_onboard_grams
 
         with step("ingest") as figures:
-            report = ingest_counted(self.warehouse, Path(file))
+            report = import_onboard_grams(self.warehouse, Path(file))
             figures.rows = report.rows if report.new else 0
         return report
 

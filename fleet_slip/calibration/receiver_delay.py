@@ -27,7 +27,7 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.erasure_log import find_erased
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table, is_received, rows_of_set
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table, is_onboard, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SPAN, STEP, STEPS = 40, 5, 12
@@ -262,7 +262,7 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
     def batches() -> Iterator[pa.RecordBatch]:
         identity = warehouse.catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
-            counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
+            counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_onboard(rows))
             for column, names in erased.by_column.items():
                 returned = pc.is_in(rows[column].cast(pa.string()), pa.array(names, pa.string()))
                 counts = pc.and_(counts, pc.invert(returned))

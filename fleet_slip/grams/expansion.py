@@ -31,7 +31,7 @@ from fleet_slip.warehouse.predicate import parse_predicate
 # then zero, and products add up over drives.
 
 
-def swept(table: GramTable) -> GramTable:
+def without_constant_columns(table: GramTable) -> GramTable:
     """Return the table without `BESIDE`, the turned `TURNED`, and what is constant in a drive."""
     signals = tuple(name for name in table.signals if name not in BESIDE)
     kept = [table.signals.index(name) for name in signals]
@@ -81,7 +81,7 @@ class Expansion:
             if self.sweep:
                 if TURNED not in names.split(","):
                     continue  # these drives have no change
-                table = swept(gram_table(names, rows))
+                table = without_constant_columns(gram_table(names, rows))
             else:
                 table = gram_table(names, rows)
             if not self.columns:

@@ -23,11 +23,11 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.gram_rows import (
-    RECEIVED_NAME,
+    ONBOARD_PREFIX,
     by_signals,
     gram_table,
-    is_of_received,
-    is_received,
+    is_onboard,
+    is_onboard_file,
     rows_of_set,
 )
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -119,9 +119,9 @@ def _together(parts: Sequence[pa.Table]) -> pa.Table:
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
     """Write a file for each feature set, and others for received rows, not to be computed again."""
-    came = is_received(rows)
+    came = is_onboard(rows)
     actions = []
-    for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):
+    for prefix, some in ((ONBOARD_PREFIX, came), ("", pc.invert(came))):
         mine = _only(rows, some)
         for identity in sorted(mine["feature_set"].unique().to_pylist()):
             part = _only(mine, pc.equal(mine["feature_set"], identity))
@@ -144,7 +144,9 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
         file
         for file in grams.files
         if file.path in merged
-        or (stale and not is_of_received(file) and not stale.isdisjoint(_log_files_of(grams, file)))
+        or (
+            stale and not is_onboard_file(file) and not stale.isdisjoint(_log_files_of(grams, file))
+        )
     ]
 
 
@@ -200,7 +202,7 @@ def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[
 
     The logs count, and the rows that cars sent go, those of other feature sets with them.
     """
-    paths = {grams.table.uri(file.path): file.path for file in grams.files if is_of_received(file)}
+    paths = {grams.table.uri(file.path): file.path for file in grams.files if is_onboard_file(file)}
     if not paths or not new_rows:
         return set(), set()
     statement = read_sql("jobs", "superseded.sql").format(plain=PLAIN)

@@ -34,8 +34,8 @@ from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile
 from fleet_slip.warehouse.gram_reader import cohort_files
 from fleet_slip.warehouse.gram_rows import (
     find_backlog,
-    is_of_received,
-    is_received,
+    is_onboard,
+    is_onboard_file,
     named_files,
     rows_of_set,
 )
@@ -283,7 +283,7 @@ def _write_merged(
     some. Returns what adds the new files, the files that give way to them, and how many rows left
     that cars had sent, of drives whose logs have come since.
     """
-    looked_for = any(is_of_received(file) for file in grams.files)
+    looked_for = any(is_onboard_file(file) for file in grams.files)
     replaced: list[TableFile] = []
     superseded = 0
 
@@ -302,7 +302,7 @@ def _write_merged(
                 pc.equal(rows["feature_set"], identity), pc.is_in(rows["file"], computed)
             )
             ids = rows["drive_id"].cast(pa.string())
-            sent = pc.and_(is_received(rows), pc.is_in(ids, logged))
+            sent = pc.and_(is_onboard(rows), pc.is_in(ids, logged))
             superseded += pc.sum(sent).as_py() or 0
             yield rows.filter(pc.invert(pc.or_(dropped, sent)))
 
@@ -315,7 +315,7 @@ def _write_merged(
 # They count while their log file is active: one commit exchanges both.
 
 
-def land_ahead(
+def commit_ahead(
     warehouse: Warehouse, new: Sequence[AddAction], replaced: Collection[TableFile]
 ) -> None:
     """Land the Gram rows of new log files, of the feature sets that replaced ones have.

@@ -168,7 +168,7 @@ class ChallengerEvaluation:
 
     def complete_folds(self, folds: CohortFolds) -> Folds:
         """Return the folds of drives with all signals. Raises `DataError` without."""
-        return folds.serving(self.signals, self.catalog.signals.label, sparse=True)
+        return folds.complete_cases(self.signals, self.catalog.signals.label, sparse=True)
 
     def folds_of(self, cohort: Cohort, mask: BoolArray) -> Folds:
         """Return the masked drives in the groups of the whole cohort. Raises `DataError`."""

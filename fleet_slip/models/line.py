@@ -96,11 +96,11 @@ def fit_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStageMo
     ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)
     cohort = load_cohort(warehouse, predicate, plan.feature_set)
     signals, label = plan.choose(cohort).winner.model.signals, catalog.signals.label
-    served = cohort.serving(signals)
+    served = cohort.complete_cases(signals)
     drives = served.drives["drive_id"].to_pylist()
     hashed = FOLDS if len(set(drives)) > FOLDS else None
     assignment = assign_folds(drives, "drive", FOLDS)
-    folds = CohortFolds.from_tables([served.table], assignment).serving(signals, label)
+    folds = CohortFolds.from_tables([served.table], assignment).complete_cases(signals, label)
     unit = catalog.input_scales[label] / Fraction(about["scale"])
     columns = [
         catalog.definition(name) or catalog.rows([name]).get(name) or Definition(of=name)

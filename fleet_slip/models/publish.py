@@ -229,7 +229,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             feature_set=catalog.identity(selection.cohort.feature_set),
             drives=winner.drives,
             vehicles=selection.cohort.count_vehicles_with(wanted),
-            drives_without_log=selection.cohort.count_received_with(wanted) or None,
+            drives_without_log=selection.cohort.count_onboard_with(wanted) or None,
             rows=selection.trained_rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,

@@ -178,7 +178,7 @@ def search_models(
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
     label = cohort.catalog.signals.label
-    folds = cohort.folds(folding.by, folding.count).serving(inputs, label, sparse=True)
+    folds = cohort.folds(folding.by, folding.count).complete_cases(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
         seen = gram if intercept else gram.about_origin()

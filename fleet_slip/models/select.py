@@ -14,9 +14,9 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
-from fleet_slip.grams.cohort import Cohort, Served, load_cohort
+from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
-from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
+from fleet_slip.grams.weights import FULL, DownweightedDrive, age_weights, robust_weights
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     COURSE_FEATURES,
@@ -60,7 +60,7 @@ from fleet_slip.rendering import Answer, Part
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
-def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
+def outlier_drives(served: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
     """Return the drives that `robust` counts less, the most unusual first."""
     table = served.table if intercept else served.table.about_origin()
     weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
@@ -100,7 +100,7 @@ class Selection(Answer):
     intercept: bool = True
     model_list: str = ""
     config_sha256: str = ""
-    weighed: Mapping[str, Weighed] = field(default_factory=dict)
+    weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
     full: int = 1
     without_label: CourseLabelQuality | None = None
     label_noise_deg: float | None = None
@@ -161,7 +161,7 @@ class Selection(Answer):
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
             "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.count_received_with(),
+            "drives_without_log": self.cohort.count_onboard_with(),
             "drives_left_out": self.cohort.left_out,
             "intercept": self.intercept,
             "folds": {
@@ -169,7 +169,7 @@ class Selection(Answer):
                 "count": len(self.models[0].folds),
             },
             "skipped": self.skipped,
-            "drives_weighed": document_of(self.weighed),
+            "drives_weighed": document_of(self.weighted),
             "label_noise_deg": self.label_noise_deg,
         }
         for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
@@ -320,21 +320,21 @@ class SelectionPlan:
 
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
-        weighed: dict[str, Weighed] = {}
+        weighted: dict[str, DownweightedDrive] = {}
         full = 1
         if self.request.half_life:
             days = cohort.drives["day"].to_pylist()
-            cohort, full = cohort.weighed(age_weights(days, self.request.half_life)), FULL
+            cohort, full = cohort.weighted(age_weights(days, self.request.half_life)), FULL
         if self.request.robust:
-            cohort, weighed = _weigh_drives(cohort, self)
-            full *= FULL if weighed else 1
+            cohort, weighted = _weigh_drives(cohort, self)
+            full *= FULL if weighted else 1
         if prior := cohort.prior:
             found = weigh_prior(cohort, prior, self)
         elif self.request.is_ordered:
             found = _search(cohort, self.request, self.folds)
         else:
             found = _compare_listed(cohort, self.request, self.model_list, self.folds)
-        return replace(found, weighed=weighed, full=full)
+        return replace(found, weighted=weighted, full=full)
 
 
 def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
@@ -376,13 +376,15 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
     named = next((one.inputs for one in searches if one.inputs), ())
     signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
-    weighed = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighed.folds(plan.folds.by, plan.folds.count).serving(signals, label, sparse=True)
+    weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
+    folds = weighted.folds(plan.folds.by, plan.folds.count).complete_cases(
+        signals, label, sparse=True
+    )
     choose = least_squares(signals, label, intercept=plan.request.intercept)
     joined = cross_validate("prior", folds, choose, cohort.catalog.input_scales)
     told = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
-        f"the weight {weighed.weight}, {winner.pooled.rmse_deg:.4f} deg without."
+        f"the weight {weighted.weight}, {winner.pooled.rmse_deg:.4f} deg without."
     )
     models = (*first.models, joined)
     if joined.pooled.rmse > winner.pooled.rmse * (1 + 1 / cohort.drive_count):
@@ -392,22 +394,24 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
         return replace(first, cohort=unused, models=models, winner=chosen)
     reason = f"The prior stays. {told}"
     chosen = replace(first.winner, model=joined, reason=reason)
-    return replace(first, cohort=weighed, models=models, winner=chosen)
+    return replace(first, cohort=weighted, models=models, winner=chosen)
 
 
-def _weigh_drives(cohort: Cohort, plan: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
+def _weigh_drives(
+    cohort: Cohort, plan: SelectionPlan
+) -> tuple[Cohort, dict[str, DownweightedDrive]]:
     """Return a cohort whose lost drives count less, by a model of all compared inputs."""
     request, model_list = plan.request, plan.model_list
     inputs = inputs_of(cohort, request.order or WHOLE_SET)
     if model_list and model_list.model and not (request.order or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
-    lost = lost_drives(cohort.serving(inputs), intercept=request.intercept)
+    lost = outlier_drives(cohort.complete_cases(inputs), intercept=request.intercept)
     if not lost:
         return cohort, {}
     of_drive = {name: round(one.weight * FULL) for name, one in lost.items()}
     parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
-    return cohort.weighed(parts), lost
+    return cohort.weighted(parts), lost
 
 
 def _given(catalog: Catalog, request: SelectionRequest) -> ModelList | None:

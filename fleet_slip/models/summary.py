@@ -15,7 +15,7 @@ from fleet_slip.warehouse.predicate import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.calibration.course_label import CourseLabelQuality
-    from fleet_slip.grams.weights import Weighed
+    from fleet_slip.grams.weights import DownweightedDrive
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 
@@ -32,7 +32,7 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
         )
 
 
-def lost_remarks(drives: Mapping[str, "Weighed"]) -> Iterator[Remark]:
+def outlier_remarks(drives: Mapping[str, "DownweightedDrive"]) -> Iterator[Remark]:
     """Yield which drives `robust` counts less, and why."""
     for drive, one in drives.items():
         yield Remark(f"{drive}: {one.reason}.")
@@ -164,11 +164,11 @@ def _without_label(told: "CourseLabelQuality") -> Iterator[Remark]:
 def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     yield from remark_without_information(selection.rows_without, selection.cohort.rows)
-    if without_log := selection.cohort.count_received_with():
+    if without_log := selection.cohort.count_onboard_with():
         without = pluralize(without_log, "drive")
         yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
-    yield from lost_remarks(selection.weighed)
+    yield from outlier_remarks(selection.weighted)
     if selection.remark:
         yield Remark(selection.remark)
     if selection.without_label is not None:

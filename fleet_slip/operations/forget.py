@@ -49,7 +49,7 @@ from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.gram_rows import is_of_received
+from fleet_slip.warehouse.gram_rows import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 PENDING_SHOWN = 5
@@ -339,7 +339,7 @@ def retain(
     except OverflowError:
         raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
     days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
-    for file in filter(is_of_received, warehouse.grams.snapshot().files):
+    for file in filter(is_onboard_file, warehouse.grams.snapshot().files):
         days.append(pc.max(warehouse.grams.read(file.path, ["day"])["day"]).as_py())
     if days and max(days) < before:
         raise RefusedError(

@@ -47,18 +47,18 @@ def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     return values.reshape(-1, width)
 
 
-def is_received(rows: pa.Table) -> pa.ChunkedArray:
+def is_onboard(rows: pa.Table) -> pa.ChunkedArray:
     """Return which rows of `grams` came without a log."""
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
-RECEIVED_NAME = "received-"
+ONBOARD_PREFIX = "received-"
 """Before the name of a file of rows that cars sent."""
 
 
-def is_of_received(file: TableFile) -> bool:
+def is_onboard_file(file: TableFile) -> bool:
     """Whether a Gram file holds rows that cars sent."""
-    return file.path.startswith(RECEIVED_NAME)
+    return file.path.startswith(ONBOARD_PREFIX)
 
 
 def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
@@ -104,10 +104,10 @@ def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
     done: set[str] = set()
     named: set[str] = set()
     for file in grams.files:
-        if is_of_received(file):  # of no log
+        if is_onboard_file(file):  # of no log
             continue
         pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
-        named.update(pairs["file"].filter(pc.invert(is_received(pairs))).to_pylist())
+        named.update(pairs["file"].filter(pc.invert(is_onboard(pairs))).to_pylist())
         done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
     return done, named
 

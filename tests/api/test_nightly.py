@@ -154,7 +154,7 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
             matrix = np.column_stack([told[name].astype(np.int64) for name in names])
             gram = Gram.from_counts(names, matrix)
             rows.append(row_of(gram, f"VIN{car}", START_S + 86_400 * night))
-        fleet.ingest_counted(write_counted(tmp_path / f"{night}", rows))
+        fleet.import_onboard_grams(write_counted(tmp_path / f"{night}", rows))
         report = give(place, night)
         assert (report.exit_code, report.drives, report.champion) == (
             0,

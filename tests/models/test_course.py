@@ -129,7 +129,7 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
         )
         sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))
     edge = fleet_slip.open(tmp_path / "edge")
-    edge.ingest_counted(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
+    edge.import_onboard_grams(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
     found = without_label(edge)
     assert found.trained_on.drives_without_log == found.trained_on.drives == len(logged)
     assert (found.intercept, found.terms) == (taught.intercept, taught.terms)

@@ -72,7 +72,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     warehouse = Warehouse(LocalFolder(root))
     manifest = Registry(LocalFolder(root), CATALOG).resolve("roads").manifest
     cohort = load_cohort(warehouse, "true", "gated")
-    total = cohort.serving(manifest.signals).table.total()
+    total = cohort.complete_cases(manifest.signals).table.total()
     fitted = fit(total, manifest.signals, manifest.label.signal)
     figures = error_sums(fitted.model, total).figures(SIGNALS[manifest.label.signal].exact_scale)
     scored = answer(root, "score", "roads", "--cohort", "true")

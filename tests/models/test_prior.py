@@ -75,7 +75,12 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
     weight = found.cohort.weight
     signals = (*INPUTS.split(","), SIGNALS.label)
     (simulated,) = prior.tables
-    real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total().restrict(signals)
+    real = (
+        load_cohort(fleet.warehouse)
+        .complete_cases(INPUTS.split(","))
+        .table.total()
+        .restrict(signals)
+    )
     both = with_mark(real, 1).scaled(weight.denominator)
     both += with_mark(simulated.total().restrict(signals), 0).scaled(weight.numerator)
     assert 0 < weight < 1
@@ -254,8 +259,8 @@ def fleet(tmp_path: Path) -> Fleet:
 
 def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: Fleet) -> None:
     robust = fleet.cohort().select(order=TWO, robust=True)
-    assert list(robust.weighed) == ["d06"]
-    assert robust.weighed["d06"].times > 10 and robust.weighed["d06"].weight == 0
+    assert list(robust.weighted) == ["d06"]
+    assert robust.weighted["d06"].times > 10 and robust.weighted["d06"].weight == 0
     others = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO)
     assert robust.winner.model.model == others.winner.model.model
     plain = fleet.cohort().select(order=TWO)
@@ -286,9 +291,9 @@ def test_the_command_names_it_and_the_version_keeps_how(
 
 def test_honest_drives_keep_their_weight(fleet: Fleet) -> None:
     honest = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO, robust=True)
-    assert honest.weighed == {}
+    assert honest.weighted == {}
     few = fleet.cohort("drive_id < 'd05'").select(order=TWO, robust=True)
-    assert few.weighed == {}
+    assert few.weighted == {}
 
 
 def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> None:
@@ -306,8 +311,8 @@ def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> Non
     land(warehouse, "all", *drives)
     update_grams(warehouse)
     found = fleet_slip.open(tmp_path / "data").cohort().select(model=TWO, robust=True)
-    assert list(found.weighed) == ["d05"] and 0 < found.weighed["d05"].weight < 1
-    part = round(16 * found.weighed["d05"].weight)
+    assert list(found.weighted) == ["d05"] and 0 < found.weighted["d05"].weight < 1
+    part = round(16 * found.weighted["d05"].weight)
     assert found.trained_rows == (1100 * 16 + 100 * part) // 16
     repeated = np.concatenate(
         [np.repeat(one, part if i == 5 else 16, axis=0) for i, one in enumerate(rows)]

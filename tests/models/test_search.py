@@ -69,7 +69,7 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
 ) -> None:
     cohort = cohort_of(drives)
     found = select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
-    folds = cohort.folds("drive", 5).serving(INPUTS, LABEL)
+    folds = cohort.folds("drive", 5).complete_cases(INPUTS, LABEL)
     for model in found.models:
         procedure = least_squares(model.signals, LABEL)
         alone = cross_validate("alone", folds, procedure, CATALOG.input_scales)

@@ -188,7 +188,7 @@ def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> N
 def test_it_takes_gram_rows_of_cars_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
     fleet.migrate()
     fleet.gram()
-    report = fleet.ingest_counted(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
+    report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
     assert report.gram_rows == 1
     fleet.forget(vehicle="VIN1")
     assert not fleet.verify(full=True).damage

@@ -232,7 +232,7 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
     for day in range(3):
         path = tmp_path / f"day-{day}"
         write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
         fleet.cohort().examine()
         assert len(asked) == day + 1
         assert f"2024-05-0{day + 1}" in asked[-1]

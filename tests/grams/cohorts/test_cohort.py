@@ -14,7 +14,7 @@ from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weights, weighted
+from fleet_slip.grams.weights import FULL, MAX_LOST_SHARE, DriveWeights, robust_weights, weighted
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse import gram_reader
@@ -59,7 +59,7 @@ def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
 def test_a_car_counts_once() -> None:
     assert cohort().count_vehicles_with(["ax"]) == 1
     assert cohort().count_vehicles_with(["steering_wheel"]) == 0
-    assert cohort().count_received_with(["ax"]) == 1
+    assert cohort().count_onboard_with(["ax"]) == 1
     assert (cohort().rows, cohort().drive_count) == (40, 3)
 
 
@@ -109,7 +109,7 @@ def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) ->
         mine = [one for one, fold in zip(drives, fold_of, strict=True) if fold == number]
         assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
     assert training.folds.total.n == 20 * 80
-    table = cohort.serving(INPUTS).table
+    table = cohort.complete_cases(INPUTS).table
     assert np.array_equal(training.drives.moments, DriveMoments.from_table(table).moments)
 
 
@@ -227,7 +227,7 @@ def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
     found = robust_weights(DriveMoments.from_table(table))
     lost = (table.n * (FULL - found.parts)).sum() / (FULL * table.n.sum())
-    assert 0 < lost <= MOST_LOST
+    assert 0 < lost <= MAX_LOST_SHARE
 
 
 def test_the_order_and_the_size_of_counts_do_not_matter() -> None:

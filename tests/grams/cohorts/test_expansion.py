@@ -123,7 +123,7 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
 def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
     summed = load_cohort(filled, "true", "fleet", Folding(by="vehicle", count=10))
     total = load_cohort(filled, "true", "fleet").tables[0].total()
-    found = summed.folds("vehicle", 10).serving(WANTED[:-1], WANTED[-1]).total
+    found = summed.folds("vehicle", 10).complete_cases(WANTED[:-1], WANTED[-1]).total
     assert found == total.restrict(WANTED)
     assert "understeer_ay" not in summed.gram_condition(["understeer_ay"])
     assert "ay_mean_16" in summed.gram_condition(["understeer_ay"])

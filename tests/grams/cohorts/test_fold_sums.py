@@ -92,7 +92,7 @@ def test_days_add_up_to_those_of_the_drives(
         land(warehouse, str(number), *rows, day=DAY + timedelta(days=number))
     update_grams(warehouse)
     for inputs in (["ax"], ["ax", "steering_wheel"]):
-        served = load_cohort(warehouse).serving(inputs)
+        served = load_cohort(warehouse).complete_cases(inputs)
         sums = sum_days(warehouse, inputs)
         monkeypatch.setattr(gram_reader, "BATCH_ROWS", 7)
         assert sum_days(warehouse, inputs) == sums

@@ -227,7 +227,7 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     winner = next(model for model in answer.models if len(model.signals) == 4)
     answer = replace(answer, winner=replace(answer.winner, model=winner))
     found = champion_rules.compare(answer, [version]).challenger
-    groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).serving(
+    groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).complete_cases(
         CHOICE, LABEL, sparse=True
     )
     assert found.fold_names == groups.names
