@@ -78,7 +78,7 @@ class FleetCohort(Rooted):
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
-        from fleet_slip.grams.job import ensure_grams
+        from fleet_slip.grams.update import ensure_grams
         from fleet_slip.models.line import with_line_fitted
         from fleet_slip.models.select import SelectionPlan, run_selection
 

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from fleet_slip.api.session import Session
     from fleet_slip.api.training import LearnReport, RunReport
     from fleet_slip.grams.check import CheckReport
-    from fleet_slip.grams.job import GramReport
     from fleet_slip.grams.on_board import OnboardImport
+    from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
@@ -265,7 +265,7 @@ class Fleet(HealthAndUpkeep):
         from the Gram rows of `signals`. Progress is in rows. Raises `QuestionError` for an unknown
         set, `StorageError`, `ConflictError` and `ClusterError`.
         """
-        from fleet_slip.grams.job import update_grams
+        from fleet_slip.grams.update import update_grams
         from fleet_slip.warehouse.gram_reader import cohort_files
         from fleet_slip.warehouse.predicate import parse_cohort
 

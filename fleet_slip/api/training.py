@@ -15,7 +15,7 @@ from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.grams.job import GramReport
+    from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication

@@ -19,9 +19,9 @@ from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
+from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
-from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.predict import Predictor

@@ -13,7 +13,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import recorded_cars
-from fleet_slip.grams.job import transaction_name
+from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
 from fleet_slip.warehouse.gram_rows import find_backlog, is_onboard, is_onboard_file

@@ -21,7 +21,8 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
-from fleet_slip.grams.expansion import expansion_of
+from fleet_slip.grams.calibrated_columns import expansion_of
+from fleet_slip.grams.drive_weights import FULL, weighted
 from fleet_slip.grams.folding import (
     EACH,
     FOLD_KEYS,
@@ -33,7 +34,6 @@ from fleet_slip.grams.folding import (
     require_blocks,
 )
 from fleet_slip.grams.gram_files import Hashes
-from fleet_slip.grams.weights import FULL, weighted
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,

@@ -29,7 +29,7 @@ from fleet_slip.columns.column_sql import with_absent, with_columns
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.errors import DataError, QuestionError, StorageError
-from fleet_slip.grams.changes import Fixes
+from fleet_slip.grams.course_changes import Fixes
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files

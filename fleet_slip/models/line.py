@@ -13,7 +13,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.job import ensure_grams
+from fleet_slip.grams.update import ensure_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.folds import CohortFolds

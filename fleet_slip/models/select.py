@@ -15,8 +15,8 @@ from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
+from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
-from fleet_slip.grams.weights import FULL, DownweightedDrive, age_weights, robust_weights
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     COURSE_FEATURES,

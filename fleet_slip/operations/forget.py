@@ -18,7 +18,7 @@ from pydantic import Field
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.job import reconcile
+from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
     RETENTION_HOURS,

@@ -21,7 +21,7 @@ from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
-from fleet_slip.grams.job import ensure_grams
+from fleet_slip.grams.update import ensure_grams
 from fleet_slip.operations.quality_report import SensorFault, examine_drives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.peers import thresholds

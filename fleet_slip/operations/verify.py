@@ -37,8 +37,8 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import wide_grams
-from fleet_slip.grams.job import reconcile
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
+from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.rendering import Answer, Part, Remark, TextTable

@@ -40,7 +40,7 @@ from fleet_slip.catalog.calibration_parameters import (
 )
 from fleet_slip.catalog.course import TURNED, turned_scale
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram

@@ -34,7 +34,7 @@ from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import load_model_list
 from fleet_slip.quality.course_relation import CourseRelation, relate
 from fleet_slip.regression.gram import Gram, GramTable

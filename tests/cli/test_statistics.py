@@ -12,7 +12,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import TICKS, counts, drive
 from tests.support.catalog import CATALOG

@@ -9,7 +9,7 @@ import pytest
 from fleet_slip.columns.column_sql import column_query
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.regression.inference import infer_classically
 from fleet_slip.regression.least_squares import fit

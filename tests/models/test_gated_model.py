@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.least_squares import fit

@@ -14,8 +14,8 @@ from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import Fitted, Identified, Measured
 from fleet_slip.evaluation.measured_evaluation import identified_prior
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.weights import age_weights
+from fleet_slip.grams.drive_weights import age_weights
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan

@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, QuestionError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import SelectedBy
 from fleet_slip.models.publish import asked_of, recipe_for
 from fleet_slip.models.registry import Registry

@@ -13,7 +13,7 @@ from scipy import stats
 
 import fleet_slip
 from fleet_slip.errors import DataError, UsageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest

@@ -14,9 +14,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.grams import job
+from fleet_slip.grams import update
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import Registry
@@ -213,7 +213,7 @@ def test_no_gram_row_of_a_forgotten_car_lands_after_the_erasure(
     warehouse = fill(tmp_path, "alfa")
     land(warehouse, "new", drive("beta", 1))
     just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True), "grams")
-    monkeypatch.setattr(job, "require_active", lambda *_: None)  # killed before its last look
+    monkeypatch.setattr(update, "require_active", lambda *_: None)  # killed before its last look
     update_grams(warehouse)
     assert not mentions(tmp_path, "beta")
 

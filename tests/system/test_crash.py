@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify

@@ -11,10 +11,16 @@ import pytest
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
+from fleet_slip.grams.drive_weights import (
+    FULL,
+    MAX_LOST_SHARE,
+    DriveWeights,
+    robust_weights,
+    weighted,
+)
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.weights import FULL, MAX_LOST_SHARE, DriveWeights, robust_weights, weighted
+from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse import gram_reader

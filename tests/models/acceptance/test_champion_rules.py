@@ -11,7 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.models.publish import Publication, manifest_of, publish_challenger, would_publish
 from fleet_slip.models.registry import CANDIDATE, Registry
