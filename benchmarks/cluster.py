@@ -15,7 +15,7 @@ from pathlib import Path
 from benchmarks.harness import durations, peak_bytes
 from fleet_slip.compute.cluster import cluster_executor
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.simulate import simulate_campaign

@@ -30,13 +30,13 @@ from deltalake import DeltaTable
 from benchmarks.crash_commands import COMMANDS, Command, prepare_inputs
 from benchmarks.harness import call, forked, load_code
 from fleet_slip.errors import PendingError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS
-from fleet_slip.grams.on_board import counted_sets
+from fleet_slip.grams.on_board import onboard_feature_sets
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.erasure_log import ErasureLog
+from fleet_slip.warehouse.gram_rows import BEING_WRITTEN_HOURS
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 
@@ -217,7 +217,7 @@ def run(kills: int, seed: int, names: list[str]) -> Counter[tuple[str, str]]:
     with tempfile.TemporaryDirectory() as folder:
         inputs = prepare_inputs(Path(folder))
         load_code(inputs["campaign"])
-        counted_sets(CATALOG)  # once for all forks
+        onboard_feature_sets(CATALOG)  # once for all forks
         chosen = [command for command in COMMANDS if command.name in names]
         for place, command in enumerate(chosen):
             share = kills // len(chosen) + (place < kills % len(chosen))

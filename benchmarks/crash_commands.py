@@ -20,7 +20,7 @@ SIMULATE = ("simulate", "{campaign}", "--threads", "1")
 INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")
 REPLACE = ("ingest", "{measured}", "--mapping", "{corrected}", "--replace")
 PUBLISH = ("publish", "sideslip")
-WORSE = ("publish", "sideslip", "--nested", "ax", "--force")
+WORSE = ("publish", "sideslip", "--order", "ax", "--force")
 
 MAPPING = """
 name = "logger"

@@ -36,7 +36,7 @@ READING: tuple[tuple[str, ...], ...] = (
     ("models", "--json"),
     ("show", "smoke", "--json"),
     ("select", "--json"),
-    ("select", "--nested", "ay,yaw_rate", "--rank", "correlation", "--json"),
+    ("select", "--order", "ay,yaw_rate", "--ranking", "correlation", "--json"),
     ("score", "smoke", "--json"),
     ("quality", "--json"),
     ("diagnose", "smoke", "--json"),

@@ -180,7 +180,7 @@ def fill(root: Path) -> None:
     given = str(campaign(root))
     for step in (
         ("run", "--campaign", given, "--days", "8", "--threads", "1"),
-        ("publish", "smoke", "--nested", "ay,yaw_rate", "--force"),
+        ("publish", "smoke", "--order", "ay,yaw_rate", "--force"),
         ("forget", "--drive", "smoke-2024-05-01-0000", "--now"),
     ):
         _require_done(command(root, *step))

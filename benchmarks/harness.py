@@ -23,7 +23,7 @@ from typing import Any
 
 import fleet_slip
 from fleet_slip.cli.main import main as fleet_slip_main
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.simulate import simulate_campaign, simulate_logs

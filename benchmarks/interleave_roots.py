@@ -46,8 +46,8 @@ description = "Pressure in a tyre"
 
 """
 
-TRAINING = ("--cohort", "vehicle_model = 'van'", "--by", "vehicle")
-PUBLISH = ("publish", "sideslip", *TRAINING, "--nested", "ay", "--force")
+TRAINING = ("--cohort", "vehicle_model = 'van'", "--group-by", "vehicle")
+PUBLISH = ("publish", "sideslip", *TRAINING, "--order", "ay", "--force")
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "simulate": ("simulate", "{campaign}", "--threads", "1"),
@@ -164,7 +164,7 @@ def _fill(root: Path, inputs: Inputs) -> None:
         ("ingest", known["old"], "--mapping", known["mapping"]),
         ("gram",),
         PUBLISH,
-        ("publish", "sideslip", *TRAINING, "--nested", "ax", "--force"),
+        ("publish", "sideslip", *TRAINING, "--order", "ax", "--force"),
         ("ingest", known["later"], "--mapping", known["mapping"]),
     ):
         ended = Running(root, arguments, inputs.environment()).end()

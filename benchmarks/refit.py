@@ -16,11 +16,11 @@ from typing import Any
 
 from benchmarks.harness import durations
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.reader import GramReader
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 
@@ -43,7 +43,7 @@ def main(root: str, predicate: str) -> None:
 
     def fitted_from_disk(source: Warehouse | GramReader) -> None:
         sums = load_cohort(source, predicate, folding=FOLDS).folds("drive", FOLDS.count)
-        fit(sums.serving(INPUTS, label).total, INPUTS, label)
+        fit(sums.complete_cases(INPUTS, label).total, INPUTS, label)
 
     with GramReader(warehouse) as reader:
         again_ms = median_ms(lambda: fitted_from_disk(reader))
@@ -51,8 +51,10 @@ def main(root: str, predicate: str) -> None:
         "gram_rows": len(cohort.drives),
         "read_and_fit_ms": median_ms(lambda: fitted_from_disk(warehouse)),
         "read_again_and_fit_ms": again_ms,
-        "fit_ms": median_ms(lambda: fit(cohort.serving(INPUTS).table.total(), INPUTS, label)),
-        "select_ms": median_ms(lambda: answer_request(warehouse, TABLE, predicate)),
+        "fit_ms": median_ms(
+            lambda: fit(cohort.complete_cases(INPUTS).table.total(), INPUTS, label)
+        ),
+        "select_ms": median_ms(lambda: run_selection(warehouse, TABLE, predicate)),
     }
     print(json.dumps(figures))
 

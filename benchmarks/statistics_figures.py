@@ -51,7 +51,7 @@ def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
         name for name, yes in zip(cohort.drives["drive_id"].to_pylist(), mask, strict=True) if yes
     ]
     assignment = by_hash(ids, 5)
-    folds = CohortFolds.from_tables([table], assignment).serving(NINE, LABEL)
+    folds = CohortFolds.from_tables([table], assignment).complete_cases(NINE, LABEL)
     return TrainingFolds(folds, DriveMoments.from_table(table), SCALES), assignment.fold
 
 

@@ -29,6 +29,7 @@ from benchmarks.rivals.learners import (
     one_thread,
 )
 from benchmarks.rivals.tree_filter import fit_tree_filter
+from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import (
     FILTERS,
@@ -38,7 +39,6 @@ from fleet_slip.evaluation.filters import (
     TuningDrives,
 )
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
-from fleet_slip.grams.calibration import calibrate
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor

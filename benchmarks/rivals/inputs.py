@@ -15,13 +15,13 @@ from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_col
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
 from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.grams.compute import read_drives
-from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.folding import assign_folds
-from fleet_slip.grams.reader import cohort_files
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment
+from fleet_slip.warehouse.gram_reader import cohort_files
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 

@@ -26,7 +26,7 @@ from typing_extensions import Doc
 from fleet_slip.base import Progress, no_progress, require_extra
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.compute.tasks import LocalThreads
-from fleet_slip.models.request import DEFAULT_MODELS, WORTH
+from fleet_slip.models.request import DEFAULT_MODELS, TOLERANCE
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import current_run_id, recording
 
@@ -237,7 +237,7 @@ class NightRequest:
         TRAINING_DRIVES
     )
     models: Annotated[str, MODELS] = DEFAULT_MODELS
-    worth: Annotated[str | None, WORTH] = None
+    tolerance: Annotated[str | None, TOLERANCE] = None
     candidate: Annotated[bool, Doc("Publish as a candidate, even what is not worse.")] = False
     retention: Annotated[
         str | None, Doc("A retention file. Default: retention.toml of the configs.")

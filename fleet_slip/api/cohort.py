@@ -78,9 +78,9 @@ class FleetCohort(Rooted):
         Raises what `examine` raises, `UsageError` for options that do not go together or an invalid
         list, and `DataError` if no model can be fitted.
         """
-        from fleet_slip.grams.job import ensure_grams
+        from fleet_slip.grams.update import ensure_grams
         from fleet_slip.models.line import with_line_fitted
-        from fleet_slip.models.select import SelectionPlan, answer_request
+        from fleet_slip.models.select import SelectionPlan, run_selection
 
         examined = self.examine()
         with examined.explaining():
@@ -94,7 +94,7 @@ class FleetCohort(Rooted):
                     reason=f"model list {DEFAULT_MODELS} needs them",
                     max_rows=WINDOW_ROWS,
                 )
-            found = answer_request(self.warehouse, request, examined.cohort)
+            found = run_selection(self.warehouse, request, examined.cohort)
         return replace(found, examined=str(examined))
 
     def diagnose(

@@ -36,7 +36,7 @@ from fleet_slip.base import last_day
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.request import DEFAULT_MODELS, WORTH
+from fleet_slip.models.request import DEFAULT_MODELS, TOLERANCE
 from fleet_slip.storage.runs import LOGGER, step
 
 if TYPE_CHECKING:
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from fleet_slip.api.session import Session
     from fleet_slip.api.training import LearnReport, RunReport
     from fleet_slip.grams.check import CheckReport
-    from fleet_slip.grams.job import GramReport
-    from fleet_slip.grams.on_board import CountedReport
+    from fleet_slip.grams.on_board import OnboardImport
+    from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
@@ -213,16 +213,16 @@ class Fleet(HealthAndUpkeep):
         return sorted(reports, key=lambda report: order[report.file])
 
     @record_call
-    def ingest_counted(self, file: Path | str) -> "CountedReport":
+    def import_onboard_grams(self, file: Path | str) -> "OnboardImport":
         """Bring in Gram rows that cars counted: a Parquet table (`docs/export.md`).
 
         It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
         forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
         """
-        from fleet_slip.grams.on_board import ingest_counted
+        from fleet_slip.grams.on_board import import_onboard_grams
 
         with step("ingest") as figures:
-            report = ingest_counted(self.warehouse, Path(file))
+            report = import_onboard_grams(self.warehouse, Path(file))
             figures.rows = report.rows if report.new else 0
         return report
 
@@ -265,8 +265,8 @@ class Fleet(HealthAndUpkeep):
         from the Gram rows of `signals`. Progress is in rows. Raises `QuestionError` for an unknown
         set, `StorageError`, `ConflictError` and `ClusterError`.
         """
-        from fleet_slip.grams.job import update_grams
-        from fleet_slip.grams.reader import cohort_files
+        from fleet_slip.grams.update import update_grams
+        from fleet_slip.warehouse.gram_reader import cohort_files
         from fleet_slip.warehouse.predicate import parse_cohort
 
         among = None
@@ -319,7 +319,7 @@ class Fleet(HealthAndUpkeep):
         through: Annotated[date | str | None, THROUGH] = None,
         name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None,
         models: Annotated[str, MODELS] = DEFAULT_MODELS,
-        worth: Annotated[str | None, WORTH] = None,
+        tolerance: Annotated[str | None, TOLERANCE] = None,
         workers: Workers = None,
         progress: ShowStep | None = None,
     ) -> "RunReport":
@@ -331,7 +331,7 @@ class Fleet(HealthAndUpkeep):
         step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
         """
         from fleet_slip.api.training import RunReport, Training
-        from fleet_slip.models.request import parse_worth
+        from fleet_slip.models.request import parse_tolerance
         from fleet_slip.simulation.campaign import load_campaign
 
         begun = time.monotonic()
@@ -339,7 +339,7 @@ class Fleet(HealthAndUpkeep):
         if isinstance(chosen, str):
             chosen = load_campaign(chosen, self.warehouse.configs)
         model_name = require_model_name(name or chosen.name)
-        parse_worth(worth)  # before anything is written
+        parse_tolerance(tolerance)  # before anything is written
         predicate = f"campaign = '{chosen.name}'"
         with self._alone("run", chosen.name):
             with open_workers(self.root, workers) as executor:
@@ -350,7 +350,7 @@ class Fleet(HealthAndUpkeep):
                     workers=executor,
                     progress=of_step(progress, f"simulate {chosen.name}"),
                 )
-                training = Training(model_name, predicate, models, worth)
+                training = Training(model_name, predicate, models, tolerance)
                 grams = training.gram(self, executor, progress)
             selection, publication, refusal = training.publish(self, replace_marked=True)
         return RunReport(
@@ -437,13 +437,13 @@ class Fleet(HealthAndUpkeep):
         model on this machine waits for the first, and says so.
 
         What goes wrong in a step is in the report, whose `problem` is what a command fails with;
-        later steps go on where they can. Raises `UsageError` for an invalid name or worth, and
+        later steps go on where they can. Raises `UsageError` for an invalid name or tolerance, and
         `StorageError` if the night cannot be recorded.
         """
         from fleet_slip.api.nightly import Night
-        from fleet_slip.models.request import parse_worth
+        from fleet_slip.models.request import parse_tolerance
 
-        parse_worth(request.worth)
+        parse_tolerance(request.tolerance)
         require_model_name(request.name)
         with self._alone("nightly", request.name):
             return Night(self, request).run()

@@ -93,11 +93,11 @@ class PublishedModels(Rooted):
         that contradict any car; `UsageError` for an invalid name, and
         what `FleetCohort.select` raises.
         """
-        from fleet_slip.models.publish import challenger_of, publish_challenger
+        from fleet_slip.models.publish import build_challenger, publish_challenger
 
         how = {"force": force, "candidate": candidate}
         registry, selection = self.registry(), self._chosen(name, choice)
-        manifest = challenger_of(self.warehouse, registry, selection, name, **how)
+        manifest = build_challenger(self.warehouse, registry, selection, name, **how)
         return publish_challenger(registry, manifest, selection, **how)
 
     def would_publish(
@@ -109,13 +109,13 @@ class PublishedModels(Rooted):
         candidate: bool = False,
     ) -> "DryRun":
         """Tell what `publish` of the same would come to, a refusal too; nothing is written."""
-        from fleet_slip.models.publish import DryRun, challenger_of, would_publish
+        from fleet_slip.models.publish import DryRun, build_challenger, would_publish
 
         how = {"force": force, "candidate": candidate}
         registry = self.registry()
         try:
             selection = self._chosen(name, choice)
-            manifest = challenger_of(self.warehouse, registry, selection, name, **how)
+            manifest = build_challenger(self.warehouse, registry, selection, name, **how)
             return would_publish(registry, manifest, selection, **how)
         except RefusedError as error:
             return DryRun(name, False, str(error), refused=True)

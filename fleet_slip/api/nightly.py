@@ -60,7 +60,7 @@ class Night:
 
     def __post_init__(self) -> None:
         one = self.asked
-        self.training = Training(one.name, one.cohort, one.models, one.worth)
+        self.training = Training(one.name, one.cohort, one.models, one.tolerance)
         self.night = date_of(one.night, "night") or date.today()
 
     def run(self) -> NightReport:
@@ -225,7 +225,7 @@ class Night:
         return "done", f"{told}within its limits.{left_out}"
 
     def _publish(self) -> Told:
-        if made := self.training.made_already(self.fleet):
+        if made := self.training.current_champion(self.fleet):
             return "done", f"{made.version.reference} is up to date."
         selection = self.training.select(self.fleet)
         name = self.training.name

@@ -26,7 +26,7 @@ from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.calibration import Calibration
+    from fleet_slip.calibration.car_calibration import Calibration
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.operations.find_drives import VacuumReport
     from fleet_slip.operations.forget import ForgetReport, RetentionReport
@@ -99,7 +99,7 @@ class HealthAndUpkeep(JudgedModels):
         Gram rows of `calibration`. Raises `DataError` without these or without drives,
         and `QuestionError` for an invalid predicate.
         """
-        from fleet_slip.grams.calibration import calibrate
+        from fleet_slip.calibration.car_calibration import calibrate
         from fleet_slip.warehouse.predicate import parse_cohort
 
         predicate = parse_cohort(self.warehouse.catalog.signals, cohort)

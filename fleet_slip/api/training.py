@@ -15,7 +15,7 @@ from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.grams.job import GramReport
+    from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Training:
-    """What trains a model every night: cohort, model list, `worth` of a signal."""
+    """What trains a model every night: cohort, model list, `tolerance` of a signal."""
 
     name: str
     cohort: str
     models: str
-    worth: str | None = None
+    tolerance: str | None = None
     label: "Label | None" = None
 
     @classmethod
@@ -70,23 +70,23 @@ class Training:
             for name in names
         )
 
-    def made_already(self, fleet: "Fleet") -> "Publication | None":
+    def current_champion(self, fleet: "Fleet") -> "Publication | None":
         """Return the champion if a selection would come to it again, whatever it looks at."""
-        from fleet_slip.models.publish import Publication, is_up_to_date
+        from fleet_slip.models.publish import Publication, is_current
         from fleet_slip.operations.marked_models import marked_models
 
         champion = fleet.registry().champion(self.name)
         if champion is None or champion.reference in marked_models(fleet.warehouse):
             return None
         manifest = champion.manifest
-        if not is_up_to_date(manifest, fleet.warehouse, self.cohort, self.models, self.worth):
+        if not is_current(manifest, fleet.warehouse, self.cohort, self.models, self.tolerance):
             return None
         return Publication(champion, False, "The champion was made from the same data and list.")
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, which a night has examined."""
         cohort = fleet.cohort(self.cohort, include_faulty=True)
-        return cohort.select(models=self.models, worth=self.worth, label=self.label)
+        return cohort.select(models=self.models, tolerance=self.tolerance, label=self.label)
 
     def publish(
         self, fleet: "Fleet", *, replace_marked: bool = False
@@ -95,7 +95,7 @@ class Training:
 
         There is no selection if the champion is up to date.
         """
-        if made := self.made_already(fleet):
+        if made := self.current_champion(fleet):
             return None, made, ""
         with step("select"):
             selection = self.select(fleet)

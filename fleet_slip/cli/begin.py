@@ -188,9 +188,9 @@ def select(everything: All = False) -> None:
 
     Compare a list of models: fleet-slip select --models table1
 
-    Find an order and a place to stop: fleet-slip select --rank backward --criterion bic
+    Find an order and a place to stop: fleet-slip select --ranking backward --criterion bic
 
-    Choose among many columns: fleet-slip select --features windows --search exchange --most 12
+    Choose among many columns: fleet-slip select --features windows --search exchange
 
     Search all subsets: fleet-slip select --all-subsets --criterion cv
     """

@@ -79,7 +79,7 @@ def ingest(
     if mapping is None:
         if dry_run or replace:
             raise UsageError("give --mapping: only tables of Gram rows (docs/export.md) have none.")
-        counted = [fleet.ingest_counted(file) for file in files]
+        counted = [fleet.import_onboard_grams(file) for file in files]
         if json:
             print_json(counted)
         else:

@@ -22,7 +22,7 @@ from fleet_slip.rendering import TextTable
 from fleet_slip.resources import Configs, folder
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.job import GramReport
+    from fleet_slip.grams.update import GramReport
 
 ALL_SETS = "all"
 """Instead of the name of a feature set: every one."""

@@ -19,7 +19,7 @@ DETAILS: dict[str, dict[str, Any]] = {
     "days": {"min": 1},
     "folds": {"metavar": "NUMBER|each"},
     "max_age_hours": {"min": 0},
-    "most": {"min": 1, "max": 200},
+    "max_features": {"min": 1, "max": 200},
     "retention_hours": {"min": 1, "max": 168},
     "target_rows": {"min": 1},
     "what": {"metavar": "SCENARIO|DRIVE"},

@@ -19,9 +19,9 @@ from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
+from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
-from fleet_slip.grams.compute import Parts, counts_of, drive_sums, gram_rows
-from fleet_slip.grams.expansion import CarCounts
+from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.predict import Predictor
@@ -181,7 +181,7 @@ class Learner:
         if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
         workspace = Workspace(ColumnPlan.of_set(catalog, name))
-        parts = Parts.of_set(feature_set)
+        parts = DriveBlocks.of_set(feature_set)
         attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
         rows = [
             row
@@ -227,7 +227,7 @@ def _quarter_name(drive_id: str, quarter: int) -> str:
 def _gram_rows(
     label: str,
     workspace: Workspace,
-    parts: Parts,
+    parts: DriveBlocks,
     drive: HeldOutDrive,
     quarter: int,
     attributes: Mapping[str, Any],

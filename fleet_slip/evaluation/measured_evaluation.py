@@ -56,8 +56,8 @@ from fleet_slip.evaluation.single_track import (
     measured_speed_mps,
     without_rest,
 )
+from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.publish import recipe_of

@@ -180,7 +180,7 @@ class SignalOrders:
 def compare_orders(cohort: Cohort, signals: Sequence[str]) -> SignalOrders:
     """Rank signals in every way and by subsets. Raises `DataError` if no drive has them all."""
     label = cohort.catalog.signals.label
-    total = cohort.serving(signals).table.total()
+    total = cohort.complete_cases(signals).table.total()
     best = best_subsets(total, signals, label, count=1)
     threshold = best[-1].best.r_squared - NEGLIGIBLE_R_SQUARED
     needed = {}

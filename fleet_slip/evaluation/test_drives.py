@@ -16,7 +16,7 @@ from fleet_slip.catalog.signals import Identifier, SignalCatalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.drive_plans import Drivers, FleetPlan, load_by_name

@@ -251,7 +251,7 @@ def _other_cars(
     line = traffic.profile.track.centre_line(SPACING_M)
     stations = _smooth(station_m)[frames]
     for frame, (station, x, y, along) in enumerate(zip(stations, *line.at(stations), strict=True)):
-        ahead, aside, turned = traffic.others_at(station).T
+        ahead, aside, turned = traffic.other_cars_at(station).T
         cosine, sine = np.cos(along), np.sin(along)
         places[frame] = np.stack(
             [x + cosine * ahead - sine * aside, y + sine * ahead + cosine * aside, along + turned]

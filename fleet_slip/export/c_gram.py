@@ -29,6 +29,8 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import pluralize
+from fleet_slip.calibration.intercept import intercept_columns
+from fleet_slip.calibration.receiver_delay import delay_columns
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
@@ -51,17 +53,15 @@ from fleet_slip.export.c import StepWriter, helper_texts, keep_lines, start_line
 from fleet_slip.export.program import Input, Steps
 from fleet_slip.export.templating import field_names, fill_template
 from fleet_slip.grams.on_board import (
+    MAX_SIGNALS,
     MOST_COLUMNS,
-    MOST_SIGNALS,
     ROWS_IN_A_SUM,
-    CountedSet,
+    OnboardFeatureSet,
     Range,
-    counted_sets,
     most_rows,
+    onboard_feature_sets,
 )
-from fleet_slip.grams.receiver_delay import delay_columns
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.straight_on import levels_of
 from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.gram import packed_size
 
@@ -84,7 +84,7 @@ class OnBoard:
     """
 
     label: str
-    of: CountedSet
+    of: OnboardFeatureSet
     columns: tuple[str, ...]
     complete: bool = False
 
@@ -116,7 +116,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     Raises `QuestionError` if the model's feature set is defined otherwise now, and `RefusedError`
     for one that cars cannot count.
     """
-    label, counted_set = catalog.signals.label, counted_sets(catalog)
+    label, counted_set = catalog.signals.label, onboard_feature_sets(catalog)
 
     def whole(name: str) -> OnBoard:
         counted = counted_set[catalog.identity(name)]
@@ -139,10 +139,10 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
         for name in over_time
         if any(part.fact for part in catalog.time_columns[name].definition.parts)
     ]
-    if unknown or len(columns) > MOST_SIGNALS:
+    if unknown or len(columns) > MAX_SIGNALS:
         has = unknown[0] if unknown else pluralize(len(columns), "column")
         raise RefusedError(
-            f"{manifest.name} has {has}: cars count up to {MOST_SIGNALS} columns of a feature set, "
+            f"{manifest.name} has {has}: cars count up to {MAX_SIGNALS} columns of a feature set, "
             "and no properties of the car. Export without them: fleet-slip export NAME --to c"
         )
     delay = counted_set[catalog.identity(DELAY)]
@@ -151,7 +151,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     sets = (plain, OnBoard(label, counted, columns), delays, whole(CALIBRATION))
     if manifest.through_origin:
         return sets
-    base, levels = levels_of(catalog, manifest)
+    base, levels = intercept_columns(catalog, name, manifest.signals)
     source = counted_set[catalog.identity(base)]
     columns = tuple(name for name in source.columns if name in {*levels, label})
     return (*sets, OnBoard(label, source, columns))

@@ -12,11 +12,11 @@ from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
-from fleet_slip.grams.gram_files import find_backlog, is_of_received, is_received
-from fleet_slip.grams.job import transaction_name
-from fleet_slip.grams.receiver_delay import recorded_cars
+from fleet_slip.grams.gram_files import recorded_cars
+from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
+from fleet_slip.warehouse.gram_rows import find_backlog, is_onboard, is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4
@@ -140,9 +140,9 @@ def _in_one_order(grams: DriveGrams) -> DriveGrams:
 def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[str, tuple[str, ...]]:
     """Return the paths of the Gram files with rows of the logged signals of each log file."""
     found: dict[str, tuple[str, ...]] = {}
-    for path in (gram_file.path for gram_file in grams if not is_of_received(gram_file)):
+    for path in (gram_file.path for gram_file in grams if not is_onboard_file(gram_file)):
         pairs = warehouse.grams.read_combinations(path, ["feature_set", "file"])
-        mine = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_received(pairs)))
+        mine = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_onboard(pairs)))
         for file in pairs.filter(mine)["file"].to_pylist():
             found[file] = (*found.get(file, ()), path)
     return found

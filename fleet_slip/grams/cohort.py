@@ -21,7 +21,8 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
-from fleet_slip.grams.expansion import expansion_of
+from fleet_slip.grams.calibrated_columns import expansion_of
+from fleet_slip.grams.drive_weights import FULL, weighted
 from fleet_slip.grams.folding import (
     EACH,
     FOLD_KEYS,
@@ -30,11 +31,9 @@ from fleet_slip.grams.folding import (
     Folding,
     FoldKey,
     assign_folds,
-    require_divided,
+    require_blocks,
 )
 from fleet_slip.grams.gram_files import Hashes
-from fleet_slip.grams.reader import HASHES, GramReader, OpenedGrams, open_grams
-from fleet_slip.grams.weights import FULL, weighted
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,
@@ -45,6 +44,7 @@ from fleet_slip.regression.drives import (
 from fleet_slip.regression.folds import CohortFolds
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.rendering import Remark
+from fleet_slip.warehouse.gram_reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -59,7 +59,7 @@ def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:
 
 
 @dataclass(frozen=True)
-class Served:
+class CompleteCases:
     """The drives of a cohort with all of some signals: a Gram row and metadata each, in order."""
 
     table: GramTable
@@ -145,7 +145,7 @@ class Cohort:
         """Return the number of cars trained on that have all of some signals."""
         return int(pc.count_distinct(_lines_with(self.drives, signals)["vehicle_hash"]).as_py())
 
-    def count_received_with(self, signals: Collection[str] = ()) -> int:
+    def count_onboard_with(self, signals: Collection[str] = ()) -> int:
         """Return the number of drives trained on without a log that have all of some signals."""
         rows = _lines_with(self.drives, signals)
         received = rows.filter(pc.equal(rows["source"].cast(pa.string()), RECEIVED))
@@ -171,24 +171,24 @@ class Cohort:
         if self.sums is not None and self.source is not None:
             again = load_cohort(self.source, self.predicate, self.feature_set, folding)
             return again._own_folds(by, count)
-        require_divided(self.catalog, self.feature_set, by)
+        require_blocks(self.catalog, self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         return CohortFolds.from_tables(
             self.tables, assign_folds(values, by, count), self.drive_numbers
         )
 
-    def serving(self, inputs: Sequence[str]) -> Served:
+    def complete_cases(self, inputs: Sequence[str]) -> CompleteCases:
         """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
         if self.sums is not None and self.source is not None:
-            return load_cohort(self.source, self.predicate, self.feature_set).serving(inputs)
+            return load_cohort(self.source, self.predicate, self.feature_set).complete_cases(inputs)
         table, mask = complete_cases(self.tables, [*inputs, self.catalog.signals.label])
         rows = np.flatnonzero(mask)
         _, first, number = np.unique(
             self.drive_numbers[rows], return_index=True, return_inverse=True
         )
         if len(first) == len(rows):
-            return Served(table, self.drives.take(rows))
-        return Served(table.merged(number), self.drives.take(rows[first]))
+            return CompleteCases(table, self.drives.take(rows))
+        return CompleteCases(table.merged(number), self.drives.take(rows[first]))
 
     def part(self, wanted: BoolArray) -> "Cohort":
         """Return the cohort with some of its Gram rows only; the mask lists them all."""
@@ -197,7 +197,7 @@ class Cohort:
         kept = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
         return replace(self, tables=tuple(kept), drives=self.drives.filter(pa.array(wanted)))
 
-    def weighed(self, parts: IntArray) -> "Cohort":
+    def weighted(self, parts: IntArray) -> "Cohort":
         """Return the cohort with each of its Gram rows so many times, and `FULL` times the others.
 
         Rows of weight zero are left out.
@@ -206,7 +206,7 @@ class Cohort:
         each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
         prior = self.prior
         if prior is not None:
-            prior = prior.weighed(np.full(len(prior.drives), FULL))
+            prior = prior.weighted(np.full(len(prior.drives), FULL))
         tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
         return replace(kept, tables=tables, prior=prior)
 
@@ -238,7 +238,7 @@ def load_cohort(
     catalog = source.catalog
     predicate = parse_cohort(catalog.signals, predicate)
     if folding is not None:
-        require_divided(catalog, feature_set, folding.by)
+        require_blocks(catalog, feature_set, folding.by)
     with open_grams(source, feature_set, predicate) as opened:
         if folding is None:
             rows = opened.rows(predicate)
@@ -427,11 +427,11 @@ def sum_days(
         days: list[date] = found.to_pylist()
         sums, lines = _add_up(opened, predicate, days, lambda rows: _places(rows["day"], found))
         left_out = opened.count_left_out(predicate)
-    serving = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
-    if not serving:
+    complete_cases = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
+    if not complete_cases:
         raise missing_signals_error(signals)
     grams = [
-        sum((one[day].restrict(signals) for one in serving), Gram.zero(signals))
+        sum((one[day].restrict(signals) for one in complete_cases), Gram.zero(signals))
         for day in range(len(days))
     ]
     of_drives = _lines_with(lines, signals).group_by("drive_hash").aggregate([("fold", "min")])
@@ -449,7 +449,7 @@ def sum_days(
 
 
 def clustered_moments(
-    served: Served,
+    served: CompleteCases,
     cluster: ClusterUnit | None = None,
     *,
     intercept: bool = True,
@@ -485,11 +485,11 @@ def drive_folds(
         raise QuestionError(
             f"with folds by {folding.by} there are no drives to hold out. Fold by drive for this."
         )
-    served = cohort.serving(inputs)
+    served = cohort.complete_cases(inputs)
     assignment = assign_folds(
         served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
     )
     label, scales = cohort.catalog.signals.label, cohort.catalog.input_scales
-    folds = CohortFolds.from_tables([served.table], assignment).serving(inputs, label)
+    folds = CohortFolds.from_tables([served.table], assignment).complete_cases(inputs, label)
     moments = clustered_moments(served, cluster, intercept=intercept)
     return TrainingFolds(folds, moments, scales, intercept), assignment.fold

@@ -29,7 +29,7 @@ from fleet_slip.columns.column_sql import with_absent, with_columns
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
 from fleet_slip.errors import DataError, QuestionError, StorageError
-from fleet_slip.grams.changes import Fixes
+from fleet_slip.grams.course_changes import Fixes
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
@@ -114,7 +114,7 @@ def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
 
 
 @dataclass(frozen=True)
-class Parts:
+class DriveBlocks:
     """How the rows of a drive are divided: by blocks of time, or by what they change over.
 
     Of several `times` that columns change over, each has all rows.
@@ -124,7 +124,7 @@ class Parts:
     times: tuple[str, ...] = ()
 
     @classmethod
-    def of_set(cls, one: FeatureSet) -> "Parts":
+    def of_set(cls, one: FeatureSet) -> "DriveBlocks":
         """Return what divides the rows of a feature set."""
         times = tuple(f"{time_s:f} s" for time_s in one.change_s)
         return cls(one.block_ticks, times if len(times) > 1 else ())
@@ -151,7 +151,7 @@ _SEPARATOR = ",\n            "
 BITS = 63
 """Bits of a BIGINT that are no sign."""
 
-MOST_SUMS = 8_000
+MAX_SUMS = 8_000
 """Sums of a grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
 longer than its block of 262,144 bytes."""
 
@@ -162,7 +162,7 @@ def has_statement(catalog: Catalog, feature_set: str) -> bool:
     k, windows = len(resolved.columns), catalog.definitions(feature_set)
     slopes = any(isinstance(row.made, Slope) for row in rows_behind(windows).values())
     divided = resolved.change_ticks or resolved.block_ticks
-    return not (divided or slopes) and k + k * (k + 1) // 2 <= MOST_SUMS
+    return not (divided or slopes) and k + k * (k + 1) // 2 <= MAX_SUMS
 
 
 def gram_statement(
@@ -385,7 +385,7 @@ def _rows_of_drive(
     drive: DriveCounts,
     metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
-    parts = Parts.of_set(feature_set)
+    parts = DriveBlocks.of_set(feature_set)
     try:
         if feature_set.change_ticks:
             late = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
@@ -398,7 +398,10 @@ def _rows_of_drive(
 
 
 def gram_rows(
-    found: "Mapping[Kind, PartSums]", columns: Sequence[str], parts: Parts, known: Mapping[str, Any]
+    found: "Mapping[Kind, BlockSums]",
+    columns: Sequence[str],
+    parts: DriveBlocks,
+    known: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
     """Yield the Gram rows of a drive's sums with what is known of it, sorted as by SQL."""
     for absent, part in sorted(found):
@@ -416,7 +419,7 @@ def gram_rows(
 
 
 @dataclass
-class PartSums:
+class BlockSums:
     """Sums of the rows of a drive, or of a part of it, that have the same columns."""
 
     size: int
@@ -447,11 +450,13 @@ Kind = tuple[int, int]
 """Which columns rows lack, a number of one bit each, and which part of the drive they are."""
 
 
-def drive_sums(workspace: Workspace, parts: Parts, counts: DriveCounts) -> dict[Kind, PartSums]:
+def drive_sums(
+    workspace: Workspace, parts: DriveBlocks, counts: DriveCounts
+) -> dict[Kind, BlockSums]:
     """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
     plan, total = workspace.plan, len(counts.ticks)
     _require_64_bits(total, max(plan.limits))
-    found: dict[Kind, PartSums] = {}
+    found: dict[Kind, BlockSums] = {}
     for rows, block, clipped in workspace.blocks(counts):
         _add_by_kind(found, block, clipped, parts.numbers(counts.ticks[rows]))
     return found
@@ -463,11 +468,11 @@ def change_sums(
     counts: DriveCounts,
     times: Sequence[int],
     late: int = 0,
-) -> dict[Kind, PartSums]:
+) -> dict[Kind, BlockSums]:
     """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
     _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
     fixes = Fixes(course_units(signals), workspace, counts, late)
-    found: dict[Kind, PartSums] = {}
+    found: dict[Kind, BlockSums] = {}
     for part, apart in enumerate(times):
         rows, columns, clipped = fixes.changes(apart)
         _add_by_kind(found, columns, clipped, np.full(len(rows), part))
@@ -480,12 +485,12 @@ def _require_64_bits(rows: int, largest: int) -> None:
 
 
 def _add_by_kind(
-    found: dict[Kind, PartSums], columns: FloatArray, clipped: FloatArray, numbers: IntArray
+    found: dict[Kind, BlockSums], columns: FloatArray, clipped: FloatArray, numbers: IntArray
 ) -> None:
     """Add rows of several kinds, given the part of each, so many at once as are exact."""
     for (absent, part), rows in _kinds(columns, numbers):
         has = [i for i in range(len(columns)) if not absent >> i & 1]
-        sums = found.setdefault((absent, part), PartSums(len(has)))
+        sums = found.setdefault((absent, part), BlockSums(len(has)))
         for first in range(0, len(rows), BLOCK_ROWS):
             some = rows[first : first + BLOCK_ROWS]
             block = columns if len(some) == len(clipped) else columns.take(some, axis=1)

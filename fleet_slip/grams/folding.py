@@ -37,7 +37,7 @@ EACH: Literal["each"] = "each"
 
 FoldCount: TypeAlias = Annotated[int, Field(ge=2, le=1000)] | Literal["each"]
 
-MOST_FOLDS = 10_000
+MAX_FOLDS = 10_000
 """Each fold is an exact fit of every model."""
 
 
@@ -61,7 +61,7 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
         ) from None
 
 
-def require_divided(catalog: Catalog, feature_set: str, by: str) -> None:
+def require_blocks(catalog: Catalog, feature_set: str, by: str) -> None:
     """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
     if by == PARTS and not catalog.feature_set(feature_set).block_ticks:
         divided = ", ".join(name for name, entry in catalog.sets.items() if entry.block_ticks)
@@ -78,12 +78,12 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
             "cross-validation needs at least two folds, and the cohort is one drive, or one trip: "
             f"drives of a car less than {LONGEST_PAUSE_S // 60} minutes apart. Add logs, or hold "
             "out parts of the time: fleet-slip gram --features blocks, then fleet-slip publish "
-            "NAME --features blocks --by part"
+            "NAME --features blocks --group-by part"
         )
     if count == EACH:
-        if (number := len(set(values))) > MOST_FOLDS:
+        if (number := len(set(values))) > MAX_FOLDS:
             raise DataError(
-                f"the cohort has {number:,}, and at most {MOST_FOLDS:,} can be folds of their own. "
+                f"the cohort has {number:,}, and at most {MAX_FOLDS:,} can be folds of their own. "
                 f"Fold by another key than {by}, or say how many folds."
             )
         return by_value(values)

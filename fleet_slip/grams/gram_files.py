@@ -3,11 +3,9 @@
 Each file is of one feature set; they are neither too many nor too large.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from hashlib import blake2b, sha256
 from itertools import accumulate
-from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -16,55 +14,26 @@ from deltalake.transaction import AddAction
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.catalog.course import COURSE_LATE
 from fleet_slip.catalog.drive_sources import RECEIVED_FILES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import ConflictError
-from fleet_slip.regression.gram import GramTable, packed_size
+from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
 from fleet_slip.warehouse.database import open_database, reading_files
+from fleet_slip.warehouse.gram_rows import (
+    ONBOARD_PREFIX,
+    by_signals,
+    gram_table,
+    is_onboard,
+    is_onboard_file,
+    rows_of_set,
+)
 from fleet_slip.warehouse.warehouse import Warehouse
 
 Hashes = NDArray[np.uint64]
 """Hashes of drives or cars: what tells one from others, in 8 bytes."""
-
-
-Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
-
-
-def by_signals(batch: Rows) -> Iterator[tuple[str, Rows, BoolArray]]:
-    """Yield each set of signals in some Gram rows, its rows, and which those are."""
-    names = batch["signals"].unique().to_pylist()
-    if len(names) == 1:
-        yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
-        return
-    for signals in names:
-        mask = pc.equal(batch["signals"], signals)
-        yield signals, batch.filter(mask), np.asarray(mask)
-
-
-def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
-    """Return Gram rows, all of the same signals, as arrays."""
-    names = tuple(signals.split(","))
-    k = len(names)
-    return GramTable(
-        names,
-        rows["n"].to_numpy(),
-        _matrix(rows["sums"], k),
-        _matrix(rows["products"], packed_size(k)),
-    )
-
-
-def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
-    chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
-    parts = [chunk.flatten().to_numpy() for chunk in chunks]
-    values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
-    return values.reshape(-1, width)
-
-
-def is_received(rows: pa.Table) -> pa.ChunkedArray:
-    """Return which rows of `grams` came without a log."""
-    return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
 def hash_names(ids: pa.Array | pa.ChunkedArray) -> Hashes:
@@ -125,9 +94,6 @@ FILE_ROWS = 100_000
 FILE_BYTES = 2**28
 """Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
 
-RECEIVED_NAME = "received-"
-"""Before the name of a file of rows that cars sent."""
-
 SMALL_FILES_MAX = 32
 """So many small Gram files may stand side by side before a commit merges some."""
 
@@ -153,9 +119,9 @@ def _together(parts: Sequence[pa.Table]) -> pa.Table:
 
 def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
     """Write a file for each feature set, and others for received rows, not to be computed again."""
-    came = is_received(rows)
+    came = is_onboard(rows)
     actions = []
-    for prefix, some in ((RECEIVED_NAME, came), ("", pc.invert(came))):
+    for prefix, some in ((ONBOARD_PREFIX, came), ("", pc.invert(came))):
         mine = _only(rows, some)
         for identity in sorted(mine["feature_set"].unique().to_pylist()):
             part = _only(mine, pc.equal(mine["feature_set"], identity))
@@ -171,11 +137,6 @@ def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
     return rows if pc.all(some).as_py() else rows.filter(some)
 
 
-def is_of_received(file: TableFile) -> bool:
-    """Whether a Gram file holds rows that cars sent."""
-    return file.path.startswith(RECEIVED_NAME)
-
-
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
     """Return the Gram files that name stale log files, and small ones to merge, if too many."""
     merged = _files_to_merge(grams)
@@ -183,7 +144,9 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
         file
         for file in grams.files
         if file.path in merged
-        or (stale and not is_of_received(file) and not stale.isdisjoint(_log_files_of(grams, file)))
+        or (
+            stale and not is_onboard_file(file) and not stale.isdisjoint(_log_files_of(grams, file))
+        )
     ]
 
 
@@ -231,19 +194,6 @@ def in_schema(rows: pa.Table, schema: pa.Schema) -> pa.Table:
     return pa.table(columns, schema=schema)
 
 
-def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
-    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
-    for file in grams.files:
-        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
-        if not pc.any(mine).as_py():
-            continue
-        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
-        rows = grams.table.read(file.path, [name for name in columns if name in there])
-        for name in sorted(set(columns).difference(there)):
-            rows = rows.append_column(name, pa.nulls(len(rows)))
-        yield rows.filter(mine)
-
-
 _COMPARED = ("drive_id", "feature_set", "vehicle_id", "day", "signals", "n", "sums", "products")
 
 
@@ -252,7 +202,7 @@ def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[
 
     The logs count, and the rows that cars sent go, those of other feature sets with them.
     """
-    paths = {grams.table.uri(file.path): file.path for file in grams.files if is_of_received(file)}
+    paths = {grams.table.uri(file.path): file.path for file in grams.files if is_onboard_file(file)}
     if not paths or not new_rows:
         return set(), set()
     statement = read_sql("jobs", "superseded.sql").format(plain=PLAIN)
@@ -265,56 +215,6 @@ def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[
     return {drive for drive, _ in found}, {paths[file] for _, file in found}
 
 
-# How the tables `logs` and `grams` differ.
-
-BEING_WRITTEN_HOURS = 1.0
-"""A file that no commit ever knew and that is younger may belong to a job that is running."""
-
-
-@dataclass(frozen=True)
-class Backlog:
-    """How `grams` and `logs` differ."""
-
-    missing: tuple[TableFile, ...]
-    stale: frozenset[str]
-    """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
-
-
-def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
-    """Compare active log files with those that Gram rows of a feature set's `identity` name."""
-    done, named = named_files(grams, identity)
-    active = {file.path for file in logs.files}
-    return Backlog(
-        missing=tuple(file for file in logs.files if file.path not in done),
-        stale=frozenset(named - active - _about_to_land(logs, named - active)),
-    )
-
-
-def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
-    """Return the log files that Gram rows of a feature set name, and those that any name."""
-    done: set[str] = set()
-    named: set[str] = set()
-    for file in grams.files:
-        if is_of_received(file):  # of no log
-            continue
-        pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
-        named.update(pairs["file"].filter(pc.invert(is_received(pairs))).to_pylist())
-        done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
-    return done, named
-
-
-def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
-    """Return the log files that a job has written and not committed: their Gram rows land first."""
-    if not paths:
-        return set()
-    written = {
-        file.path
-        for file in logs.table.folder.files()
-        if file.path in paths and file.age_hours < BEING_WRITTEN_HOURS
-    }
-    return written.difference(logs.removals) if written else set()
-
-
 def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
     """Raise `ConflictError` if the logs have lost a file whose Gram rows are landing."""
     lost = {file.path for file in files} - {file.path for file in logs.files}
@@ -323,3 +223,35 @@ def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
             f"{logs.table.folder}: other processes keep removing files, such as {min(lost)}. Run "
             "the same command again."
         )
+
+
+# Delays of receivers that the courses in Gram rows were corrected for.
+
+
+def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
+    """Return the log files that have Gram rows of a set with another delay than their cars have."""
+    return {
+        name
+        for name, car, recorded in _recorded(grams, identity)
+        if recorded != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
+    }
+
+
+def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
+    """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
+    return {
+        car: recorded
+        for name, car, recorded in _recorded(grams, identity)
+        if name == log_file and recorded
+    }
+
+
+def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
+    """Return each log file, car and delay that Gram rows of a set are of; 0 where none is known."""
+    found: set[tuple[str, str, int]] = set()
+    for rows in rows_of_set(grams, identity, "file", "vehicle_id", COURSE_LATE):
+        files, cars, recorded = (
+            rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE)
+        )
+        found.update(zip(files, cars, (late or 0 for late in recorded), strict=True))
+    return found

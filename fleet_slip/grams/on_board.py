@@ -47,17 +47,14 @@ from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S, Signal
 from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
-from fleet_slip.grams.compute import Parts
+from fleet_slip.grams.compute import DriveBlocks
 from fleet_slip.grams.gram_files import (
-    by_signals,
     files_to_rewrite,
     gram_digests,
-    gram_table,
     in_schema,
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.reader import BATCH_ROWS
 from fleet_slip.ingest.formats.parquet_footer import (
     DELTA_BYTE_ARRAY,
     RowGroup,
@@ -70,6 +67,8 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.erasure_log import ErasureLog
+from fleet_slip.warehouse.gram_reader import BATCH_ROWS
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # The feature sets that cars can count: their columns, the ranges of these, and their definition.
@@ -82,7 +81,7 @@ Range = tuple[int, int]
 ROWS_IN_A_SUM = 2**31 - 1
 """Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
 
-MOST_SIGNALS = 32
+MAX_SIGNALS = 32
 """That a car counts of a set."""
 
 MOST_COLUMNS = 512
@@ -90,7 +89,7 @@ MOST_COLUMNS = 512
 
 
 @dataclass(frozen=True)
-class CountedSet:
+class OnboardFeatureSet:
     """A feature set that cars can count.
 
     Attributes:
@@ -123,7 +122,7 @@ class CountedSet:
         return tuple(self.ranges)
 
 
-def counted_sets(catalog: Catalog) -> dict[str, CountedSet]:
+def onboard_feature_sets(catalog: Catalog) -> dict[str, OnboardFeatureSet]:
     """Return the sets by their identities, which Gram rows carry, the logged signals first."""
     sets = {}
     for name in (PLAIN, *catalog.sets):
@@ -134,7 +133,7 @@ def counted_sets(catalog: Catalog) -> dict[str, CountedSet]:
     return sets
 
 
-def _counted(catalog: Catalog, name: str, identity: str) -> CountedSet:
+def _counted(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
     signals, resolved = catalog.signals, catalog.feature_set(name)
     used = {*resolved.signals, *([COURSE, YAW_RATE] if resolved.change_ticks else [signals.label])}
     used |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
@@ -146,13 +145,13 @@ def _counted(catalog: Catalog, name: str, identity: str) -> CountedSet:
     ]
     content = defined if name == PLAIN else [identity, defined]
     digest = sha256_of(canonical_json(content))
-    return CountedSet(
+    return OnboardFeatureSet(
         name,
         identity,
         {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
         tuple(made_of),
         resolved.change_ticks,
-        Parts.of_set(resolved).times or (None,),
+        DriveBlocks.of_set(resolved).times or (None,),
         resolved.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )
@@ -214,7 +213,7 @@ def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict
 
 
 def impossible_rows(
-    rows: pa.Table, sets: Mapping[str, CountedSet]
+    rows: pa.Table, sets: Mapping[str, OnboardFeatureSet]
 ) -> Iterator[tuple[dict[str, Any], str]]:
     """Yield the Gram rows that no drive can have, and why, given the sets by their names there.
 
@@ -286,7 +285,7 @@ ONE_AT_A_TIME = "receive"
 
 
 @dataclass(frozen=True)
-class CountedReport(Answer):
+class OnboardImport(Answer):
     """What became of a file of Gram rows: whether it is new, its drives, and rows behind them."""
 
     file: str
@@ -304,7 +303,7 @@ class CountedReport(Answer):
         )
 
 
-def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
+def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
     """Load the Gram rows of a file, once. Raises `InputError`, `RepeatedError`, `ConflictError`."""
     content = read_named_file(file, MAX_FILE_BYTES, InputError)
     table = _read(file, content)
@@ -312,10 +311,10 @@ def ingest_counted(warehouse: Warehouse, file: Path) -> CountedReport:
     transaction = AppTransaction(f"receive/{digest}", 1)
     drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py()
     new = warehouse.grams.snapshot().landed(transaction.name) is None
-    report = CountedReport(str(file), new, len(table), drives, rows or 0)
+    report = OnboardImport(str(file), new, len(table), drives, rows or 0)
     if not new:
         return report
-    sets = counted_sets(warehouse.catalog)
+    sets = onboard_feature_sets(warehouse.catalog)
     _require_possible(sets, file, table)
     new_rows = _gram_rows(sets, table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
     numbered = _numbered(_with_digests(new_rows))
@@ -475,7 +474,7 @@ MAX_PAGES = 2**18
 
 
 def _gram_rows(
-    sets: Mapping[str, CountedSet], table: pa.Table, schema: pa.Schema, name: str
+    sets: Mapping[str, OnboardFeatureSet], table: pa.Table, schema: pa.Schema, name: str
 ) -> pa.Table:
     """Return rows of `grams`."""
     identities = {counted.key: identity for identity, counted in sets.items()}
@@ -514,7 +513,7 @@ def _require_different(file: Path, rows: pa.Table) -> None:
             _refuse(file, row, drive, f"is there twice, first as {quote_name(other)}")
 
 
-def _require_possible(sets: Mapping[str, CountedSet], file: Path, table: pa.Table) -> None:
+def _require_possible(sets: Mapping[str, OnboardFeatureSet], file: Path, table: pa.Table) -> None:
     """Raise `InputError` for the first row that no drive can have."""
     by_key = {counted.key: counted for counted in sets.values()}
     described = [

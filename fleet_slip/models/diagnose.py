@@ -6,9 +6,9 @@ from typing import Literal
 
 from fleet_slip.base import pluralize
 from fleet_slip.grams.cohort import Cohort, clustered_moments
-from fleet_slip.grams.weights import Weighed
-from fleet_slip.models.select import lost_drives
-from fleet_slip.models.summary import lost_remarks
+from fleet_slip.grams.drive_weights import DownweightedDrive
+from fleet_slip.models.select import outlier_drives
+from fleet_slip.models.summary import outlier_remarks
 from fleet_slip.regression.choice import nested_fits
 from fleet_slip.regression.drives import ClusterUnit
 from fleet_slip.regression.inference import (
@@ -42,7 +42,7 @@ class Diagnosis(Answer):
         "effective_rows=evidence.rows design_effect=evidence.design_effect "
         "r_squared=fitted.r_squared residual_std=naive.residual_std condition_number "
         "variance_inflation=inflation by_rows=naive.estimates by_clusters=robust.estimates "
-        "drives_weighed=weighed?"
+        "drives_weighed=weighted?"
     )
 
     fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
@@ -54,7 +54,7 @@ class Diagnosis(Answer):
     condition_number: float
     evidence: Evidence
     units: Mapping[str, str]
-    weighed: Mapping[str, Weighed] = field(default_factory=dict)
+    weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
 
     @property
     def clusters(self) -> int:
@@ -88,7 +88,7 @@ class Diagnosis(Answer):
                 "only one drive: standard errors take its rows as independent, which they are "
                 "not at 100 Hz, and are far too small."
             )
-        yield from lost_remarks(self.weighed)
+        yield from outlier_remarks(self.weighted)
 
 
 def diagnose(
@@ -104,7 +104,7 @@ def diagnose(
     """
     catalog = cohort.catalog
     label, scales = catalog.signals.label, catalog.input_scales
-    served = cohort.serving(inputs)
+    served = cohort.complete_cases(inputs)
     moments = clustered_moments(served, cluster, intercept=intercept)
     # A single drive tells nothing of how drives differ: then errors are by rows.
     alone = moments.unit == "drive" and len(moments) == 1
@@ -123,5 +123,5 @@ def diagnose(
         evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
         units={name: catalog.input(name).unit for name in inputs}
         | {INTERCEPT: catalog.signals[label].unit},
-        weighed=lost_drives(served, intercept=intercept),
+        weighted=outlier_drives(served, intercept=intercept),
     )

@@ -13,7 +13,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.job import ensure_grams
+from fleet_slip.grams.update import ensure_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan
 from fleet_slip.regression.folds import CohortFolds
@@ -36,7 +36,7 @@ def with_line_fitted(
     """Return a request of a set with a line, which is fitted if none is kept; others as they are.
 
     `asked` is the cohort, `predicate` what of it has no fault. The Gram rows of the set, and those
-    that the line needs, are made. Raises as `answer_request`.
+    that the line needs, are made. Raises as `run_selection`.
     """
     catalog = warehouse.catalog
     plan = SelectionPlan.of(catalog, request)
@@ -88,19 +88,19 @@ def _kept_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStage
 def fit_line(warehouse: Warehouse, about: About, predicate: str) -> FirstStageModel:
     """Choose a line from its model list, and fit it to all drives, and without each fold.
 
-    Raises as `answer_request`, and `QuestionError` if its estimate would not be exact.
+    Raises as `run_selection`, and `QuestionError` if its estimate would not be exact.
     """
     catalog = warehouse.catalog
-    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], by="drive"))
+    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], group_by="drive"))
     reason = f"model list {about['models']} fits the first-stage model on them"
     ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)
     cohort = load_cohort(warehouse, predicate, plan.feature_set)
     signals, label = plan.choose(cohort).winner.model.signals, catalog.signals.label
-    served = cohort.serving(signals)
+    served = cohort.complete_cases(signals)
     drives = served.drives["drive_id"].to_pylist()
     hashed = FOLDS if len(set(drives)) > FOLDS else None
     assignment = assign_folds(drives, "drive", FOLDS)
-    folds = CohortFolds.from_tables([served.table], assignment).serving(signals, label)
+    folds = CohortFolds.from_tables([served.table], assignment).complete_cases(signals, label)
     unit = catalog.input_scales[label] / Fraction(about["scale"])
     columns = [
         catalog.definition(name) or catalog.rows([name]).get(name) or Definition(of=name)

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.simulate import simulate_campaign
 from fleet_slip.storage.local import LocalFolder

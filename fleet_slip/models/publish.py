@@ -8,13 +8,13 @@ from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
 
+from fleet_slip.calibration.car_calibration import three_digits
+from fleet_slip.calibration.intercept import InterceptEstimate, estimate_intercept
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.drive_sources import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
-from fleet_slip.grams.calibration import three_digits
-from fleet_slip.grams.reader import open_grams
-from fleet_slip.models.acceptance import judge
+from fleet_slip.models.acceptance import review_challenger
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -30,7 +30,6 @@ from fleet_slip.models.manifest import (
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
 from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
 from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
-from fleet_slip.models.straight_on import StraightOn, straight_on
 from fleet_slip.models.training_checks import (
     require_in_time,
     require_sound_course,
@@ -38,6 +37,7 @@ from fleet_slip.models.training_checks import (
 )
 from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
+from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -46,9 +46,18 @@ from fleet_slip.warehouse.warehouse import Warehouse
 COHORT = "cohort"
 """Key of the predicate that was asked, where cars were left out of it."""
 
-_WHAT = {"models", "model", "nested", "features", "label", "rank", "criterion", "all_subsets"}
-_WHAT |= {"search", "most"}
-"""What says which models are compared: who asks for one of these asks for all anew."""
+_MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "criterion"}
+_MODEL_OPTIONS |= {"all_subsets", "search", "max_features"}
+"""Options that define which models are compared: with one of these, none is taken from before."""
+
+_STORED_NAMES = {
+    "order": "nested",
+    "ranking": "rank",
+    "tolerance": "worth",
+    "max_features": "most",
+    "group_by": "by",
+}
+"""Names of options in manifests, where they differ: versions of earlier releases have them."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +75,9 @@ def asked_of(selection: Selection) -> dict[str, Any] | None:
     fell_back = not asked and selection.model_list == LOGGED_MODELS
     if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
         return None
+    stored = {_STORED_NAMES.get(name, name): value for name, value in asked.items()}
     whole = selection.asked_condition == selection.cohort.predicate.text
-    return asked if whole else {**asked, COHORT: selection.asked_condition}
+    return stored if whole else {**stored, COHORT: selection.asked_condition}
 
 
 def recipe_for(
@@ -80,7 +90,7 @@ def recipe_for(
         return Recipe(request, cohort or TRAINING_DRIVES)
     chosen_from = before.manifest.selected_by.model_list
     was = with_all_drives(before.manifest.trained_on.cohort)
-    if asked.keys() & _WHAT:
+    if asked.keys() & _MODEL_OPTIONS:
         wanted = request
         told = f"not as {before.reference}, chosen from {chosen_from}"
     else:
@@ -111,9 +121,12 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
     cohort = with_all_drives(manifest.trained_on.cohort)
     if chosen.asked is None:
         return _of_list(version), cohort
-    known = {field.name for field in fields(SelectionRequest)}
-    asked: dict[str, Any] = {name: one for name, one in chosen.asked.items() if name in known}
-    return SelectionRequest(**asked), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
+    options: dict[str, Any] = {
+        field.name: chosen.asked[stored]
+        for field in fields(SelectionRequest)
+        if (stored := _STORED_NAMES.get(field.name, field.name)) in chosen.asked
+    }
+    return SelectionRequest(**options), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
 
 
 def _of_list(version: ModelVersion) -> SelectionRequest:
@@ -132,8 +145,8 @@ def _of_list(version: ModelVersion) -> SelectionRequest:
     return SelectionRequest(models=name)
 
 
-def is_up_to_date(
-    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, worth: str | None
+def is_current(
+    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, tolerance: str | None
 ) -> bool:
     """Return whether a selection from a model list would come to this manifest again.
 
@@ -156,12 +169,12 @@ def is_up_to_date(
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
         warehouse.grams.snapshot().version,
         models,
-        checksum_of_list(model_list, worth),
+        checksum_of_list(model_list, tolerance),
         package_version("fleet-slip"),
     )
 
 
-def challenger_of(
+def build_challenger(
     warehouse: Warehouse,
     registry: Registry,
     selection: Selection,
@@ -216,7 +229,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             feature_set=catalog.identity(selection.cohort.feature_set),
             drives=winner.drives,
             vehicles=selection.cohort.count_vehicles_with(wanted),
-            drives_without_log=selection.cohort.count_received_with(wanted) or None,
+            drives_without_log=selection.cohort.count_onboard_with(wanted) or None,
             rows=selection.trained_rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
@@ -261,24 +274,31 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
     change_s = catalog.feature_set(name).change_s
     if not change_s:
         return manifest
-    found = StraightOn(Fraction(0), {}, None, 0.0, 0)
+    estimate = InterceptEstimate()
     if not manifest.through_origin:
         predicate = parse_cohort(catalog.signals, manifest.trained_on.cohort)
-        found = straight_on(warehouse, predicate, manifest)
+        coefficients = {
+            term.signal: term.coefficient_exact * Fraction(term.scale_exact)
+            for term in manifest.terms
+        }
+        estimate = estimate_intercept(warehouse, predicate, name, coefficients)
     learned = LearnedFrom(
         label="course",
         change_s=float(change_s[0]) if len(change_s) == 1 else tuple(map(float, change_s)),
-        cars=found.cars,
+        cars=estimate.cars,
         intercept_uncertainty_deg=(
-            None if found.uncertainty is None else three_digits(math.degrees(found.uncertainty))
+            None
+            if estimate.uncertainty is None
+            else three_digits(math.degrees(estimate.uncertainty))
         ),
-        intercept_spread_deg=math.degrees(found.spread),
+        intercept_spread_deg=math.degrees(estimate.std_between_cars),
     )
     scales = catalog.input_scales
     terms = (
-        _term(catalog, column, slope / scales[column], {}) for column, slope in found.slopes.items()
+        _term(catalog, column, slope / scales[column], {})
+        for column, slope in estimate.slopes.items()
     )
-    own = {"intercept": float(found.intercept), "intercept_exact": found.intercept}
+    own = {"intercept": float(estimate.intercept), "intercept_exact": estimate.intercept}
     origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
     return manifest.model_copy(update={**own, **origin})
 
@@ -494,14 +514,14 @@ def _decide(
     if champion and champion.manifest.same_estimator(manifest):
         return _Decision("The champion is the same model.", champion)
     held = registry.history(manifest.name).held_by(CHAMPION)
-    judgement = judge(registry, champion, manifest, selection)
+    review = review_challenger(registry, champion, manifest, selection)
     if not force and not candidate:
-        judgement.require_passed(manifest.name)
-    if champion and judgement.drifts and not (force or candidate or held):
-        reason = f"The champion stays: it is significantly better. {judgement.reason}"
+        review.require_passed(manifest.name)
+    if champion and review.is_significantly_worse and not (force or candidate or held):
+        reason = f"The champion stays: it is significantly better. {review.reason}"
         return _Decision(reason, champion)
-    best = None if judgement.problems else judgement.best
-    return _Decision(judgement.reason, None, candidate or held is not None, held, best)
+    best = None if review.problems else review.best
+    return _Decision(review.reason, None, candidate or held is not None, held, best)
 
 
 def _why(name: str, held: AliasMove | None) -> str:

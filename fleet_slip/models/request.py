@@ -20,7 +20,7 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import Identifier
-from fleet_slip.config import Config, load_config
+from fleet_slip.config import Config, load_config, refuse_renamed
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
@@ -43,195 +43,207 @@ Label = Literal["course"]
 COURSE_MODELS = COURSE_FEATURES = "course"
 """The model list, and the feature set, that are taken for it."""
 
-DEFAULT_MOST = 24
+DEFAULT_MAX_FEATURES = 24
 
-WORTH = Doc(
-    "The smallest gain that is worth a signal: as an angle such as 0.025deg, the root of the "
+TOLERANCE = Doc(
+    "Smallest gain that justifies another signal: an angle such as 0.025deg, the root of the "
     "difference of the mean squared errors, in which the label's noise cancels; or a share of the "
-    "RMSE, such as 2%. Of the models that fall less short of the best, or by no more than one "
-    "standard error of the difference, that with the fewest signals wins. Default: 0.025deg, or "
-    "the rule of the list."
+    "RMSE, such as 2%. Among the models that are worse than the best by less than this, or by at "
+    "most one standard error of the difference, the one with the fewest signals wins. Default: "
+    "0.025deg, or the rule of the list."
 )
 
 CLUSTER = Doc(
-    "What is independent evidence: vehicle, since a car's drives share its biases and tyres, or "
+    "Unit of independent evidence: vehicle, since drives of a car share its biases and tyres, or "
     "drive. Default: vehicle where there are several, else drive."
 )
 
-_WORTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
+_TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """How models are compared and one is chosen; without options, by the usual list."""
+    """Options of a selection; the default compares the default model list."""
 
     models: Annotated[
         str | None,
         Doc(
-            f"A model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
-            f"{LOGGED_MODELS} with `features` or without its Gram rows, unless `nested` or an "
+            f"Model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
+            f"{LOGGED_MODELS} with `features` or without its Gram rows, unless `order` or an "
             "option that searches is given."
         ),
     ] = None
     model: Annotated[
         str | None,
-        Doc(
-            "The inputs of the one model to take, separated by commas, such as "
-            '"ax, ay, yaw_rate", instead of a list.'
-        ),
+        Doc("Inputs of a single model, separated by commas, instead of a list."),
     ] = None
-    nested: Annotated[
+    order: Annotated[
         str | None,
         Doc(
-            "Add the nested models of an order of signals, separated by commas; 'catalogue' is all "
-            "inputs in the order of configs/signals.toml, a family of windows or gates its "
-            "columns."
+            "Compare the nested models of an order of signals, separated by commas; 'catalogue' is "
+            "all inputs in the order of configs/signals.toml. A family of windows or gates stands "
+            "for its columns."
         ),
     ] = None
     features: Annotated[
         str | None,
         Doc(
             "Feature set of configs/features.toml, computed before with: fleet-slip gram "
-            "--features NAME. Default: what the list says, else the logged signals."
+            "--features NAME. Default: the list's, else the logged signals."
         ),
     ] = None
     label: Annotated[
         Label | None,
         Doc(
-            "course: learn without a reference sensor, from changes of the course over ground. "
-            "Feature set and model list are then those called course, unless others are named."
+            "course: learn from changes of the course over ground, without a reference sensor. "
+            "The default feature set and model list are then those called course."
         ),
     ] = None
-    by: Annotated[
+    group_by: Annotated[
         FoldKey | None,
-        Doc("What a fold is made of. Default: what the list says."),
+        Doc("Column that defines the folds. Default: the list's."),
     ] = None
     folds: Annotated[
         int | str | None,
         Doc(
-            "Number of folds, or each: every drive, or whatever folds are made of, is a fold of "
-            "its own. Default: what the list says."
+            "Number of folds, or each: every drive (or value of `group_by`) is a fold. Default: "
+            "the list's."
         ),
     ] = None
-    rank: Annotated[
+    ranking: Annotated[
         str | None,
-        Doc(f"Rank the inputs of `nested` first: {', '.join(RANKINGS)}. Default: declared."),
+        Doc(f"Rank the inputs of `order` first: {', '.join(RANKINGS)}. Default: declared."),
     ] = None
     criterion: Annotated[
         str | None,
         Doc(
-            "What decides how many of the ranked inputs are kept: cv (the smallest model that "
-            f"falls negligibly short of the best; see `worth`), {', '.join(CRITERIA)}. Default: cv."
+            "Criterion for the number of ranked inputs: cv (the smallest model that is negligibly "
+            f"worse than the best; see `tolerance`), {', '.join(CRITERIA)}. Default: cv."
         ),
     ] = None
-    worth: Annotated[str | None, WORTH] = None
+    tolerance: Annotated[str | None, TOLERANCE] = None
     all_subsets: Annotated[
-        bool, Doc("Search all subsets of the inputs of `nested` instead of an order.")
+        bool, Doc("Search all subsets of the inputs of `order` instead of nested models.")
     ] = False
     robust: Annotated[
         bool,
         Doc(
-            "Let drives whose error is more than three times that of the median drive count less, "
-            "and say which; diagnose says it before."
+            "Down-weight outlier drives (error above three times the median). Lists them; see "
+            "diagnose."
         ),
     ] = False
     cluster: Annotated[ClusterUnit | None, CLUSTER] = None
     intercept: Annotated[
         bool,
         Doc(
-            "Whether models have an intercept. Without it they go through the origin: a car that "
-            "drives straight on then has no side-slip, and no sensor an offset."
+            "Fit an intercept. Without it a car that drives straight has no side-slip, and no "
+            "sensor an offset."
         ),
     ] = True
     search: Annotated[
         str | None,
         Doc(
-            f"Search among the inputs of `nested`, or all: {', '.join(METHODS)}; the search is "
-            "made again in every fold. Adds its models of 1, 2, ... columns."
+            f"Search among the inputs of `order`, or all: {', '.join(METHODS)}. Every fold repeats "
+            "the search. Adds its models of 1, 2, ... columns."
         ),
     ] = None
-    most: Annotated[int | None, Doc(f"Most columns of `search`. Default: {DEFAULT_MOST}.")] = None
+    max_features: Annotated[
+        int | None,
+        Doc(f"Maximum number of columns of `search`. Default: {DEFAULT_MAX_FEATURES}."),
+    ] = None
     half_life: Annotated[
         int | None,
         Doc(
-            "Days after which a drive counts half as much, a quarter after twice as many, and so "
-            "on, before the cohort's newest day."
+            "Age in days, before the cohort's newest day, at which the weight of a drive is halved."
         ),
     ] = None
     prior: Annotated[
         str | None,
         Doc(
-            "A campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
-            "training, with the weight that serves the cohort's held-out drives best, zero among "
-            "them: fleet-slip identify --campaign."
+            "Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
+            "training unless held-out drives are worse with them: fleet-slip identify --campaign."
         ),
     ] = None
 
     @property
-    def ordered(self) -> bool:
-        """Whether inputs are ranked or searched, rather than given models compared."""
-        return bool(self.rank or self.criterion or self.all_subsets)
+    def is_ordered(self) -> bool:
+        """True if inputs are ranked, or all subsets searched, instead of comparing a list."""
+        return bool(self.ranking or self.criterion or self.all_subsets)
+
+    @property
+    def has_inputs(self) -> bool:
+        """True if the options themselves define the models, so that no list is needed."""
+        return bool(self.model or self.order or self.is_ordered or self.search)
 
     def check(self) -> None:
-        """Raise `UsageError` for options that do not go together."""
-        parse_worth(self.worth)
-        if self.ordered and self.models:
-            raise UsageError(
-                "a list of models is compared by cross-validation as it stands: leave out "
-                "models, or rank, criterion and all_subsets, which search among the inputs of "
-                "nested."
-            )
-        if self.model and (self.models or self.nested or self.ordered or self.search):
-            raise UsageError(
-                "model names the inputs itself: leave out models, nested, rank, criterion, "
-                "all_subsets and search, or leave out model."
-            )
-        if self.rank and self.all_subsets:
-            raise UsageError("a search of all subsets needs no order: leave out rank.")
-        if self.most and not self.search:
-            raise UsageError("most limits a search: give search, too.")
-        if self.cluster and not (self.ordered or self.nested):
-            raise UsageError(
-                "cluster says what is independent evidence for nested, rank, criterion and "
-                "all_subsets: leave it out."
-            )
-        ranked = self.ordered or (self.nested and not self.search)
-        if self.prior and (self.label or ranked):
-            raise UsageError(
-                "a prior works with a model list, one model or a search: leave out label, rank, "
-                "criterion, all_subsets, and nested without search."
-            )
-        if self.half_life is not None and self.half_life < 1:
-            raise UsageError("half_life: give a whole number of days, at least 1.")
-        if self.search and self.ordered:
-            raise UsageError(
-                "a search is made again in every fold, and looks at folds alone: leave out rank, "
-                "criterion and all_subsets."
-            )
+        """Raise `UsageError` for options that exclude each other."""
+        parse_tolerance(self.tolerance)
+        ranks_order = self.is_ordered or bool(self.order and not self.search)
+        conflicts = (
+            (
+                self.is_ordered and self.models,
+                "a list of models is compared by cross-validation: leave out models, or ranking, "
+                "criterion and all_subsets, which search among the inputs of order.",
+            ),
+            (
+                self.model and (self.models or self.order or self.is_ordered or self.search),
+                "model names the inputs: leave out models, order, ranking, criterion, all_subsets "
+                "and search, or leave out model.",
+            ),
+            (
+                self.ranking and self.all_subsets,
+                "a search of all subsets needs no ranking: leave out ranking.",
+            ),
+            (
+                self.max_features and not self.search,
+                "max_features limits a search: add search, or leave it out.",
+            ),
+            (
+                self.cluster and not (self.is_ordered or self.order),
+                "cluster applies to order, ranking, criterion and all_subsets: leave it out.",
+            ),
+            (
+                self.prior and (self.label or ranks_order),
+                "a prior works with a model list, one model or a search: leave out label, ranking, "
+                "criterion, all_subsets, and order without search.",
+            ),
+            (
+                self.half_life is not None and self.half_life < 1,
+                "half_life: give a whole number of days, at least 1.",
+            ),
+            (
+                self.search and self.is_ordered,
+                "a search is repeated in every fold and judged by folds alone: leave out ranking, "
+                "criterion and all_subsets.",
+            ),
+        )
+        for applies, message in conflicts:
+            if applies:
+                raise UsageError(message)
 
 
-def parse_worth(text: str | None) -> Tolerance:
-    """Return a gain from text such as `0.025deg` or `2%`, or the usual one. Raises `UsageError`."""
+def parse_tolerance(text: str | None) -> Tolerance:
+    """Return a tolerance from text such as `0.025deg` or `2%`. Raises `UsageError`."""
     if text is None:
         return DEFAULT_TOLERANCE
-    found = _WORTH.fullmatch(text.strip())
-    if found is None:
+    match = _TOLERANCE.fullmatch(text.strip())
+    if match is None:
         raise UsageError(
-            f"worth = {text}: write an angle such as 0.025deg, or a share of the best RMSE such as "
-            "2%."
+            f"tolerance = {text}: write an angle such as 0.025deg, or a share of the best RMSE "
+            "such as 2%."
         )
-    amount = float(found[1])
+    amount = float(match[1])
     return (
         Tolerance(amount / 100, relative=True)
-        if found[2] == "%"
+        if match[2] == "%"
         else Tolerance(math.radians(amount))
     )
 
 
 # Model lists: the candidates that a selection compares, read from `configs/models/*.toml`.
 
-INPUTS_TOLD = 30
-"""Inputs, or families of them, in a message."""
+MAX_LISTED_INPUTS = 30
+"""Maximum number of inputs, or families of them, in a message."""
 
 
 def expand_families(names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
@@ -271,28 +283,56 @@ class CandidateModel(Config):
         return self
 
 
-class Search(Config):
-    """How to choose among many inputs: at most so many columns, by `rule`.
+RENAMED_KEYS = {
+    "most": "max_features",
+    "fewest_drives": "min_drives",
+    "columns_per_drive": "max_features_per_drive",
+}
+"""Keys of `Search`. Checksums and documents of versions keep the old names."""
 
-    `best` takes the best cross-validated correlation; `worth` the fewest columns whose error is
-    negligibly larger (`fleet_slip.regression.choice`); `standard error` the fewest whose error is
-    larger by at most one standard error over folds.
+
+class Search(Config):
+    """A search among many inputs for at most `max_features` columns.
+
+    The `rule` chooses the size: `best` has the best cross-validated correlation; `tolerance` the
+    fewest columns with a negligibly larger error (`fleet_slip.regression.choice`); `standard error`
+    the fewest with an error that is larger by at most one standard error over folds. A search needs
+    `min_drives`, and takes at most `max_features_per_drive` unless folds are parts of drives.
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=40)
-    """Of its models, before the number of columns. Default: the method."""
+    """Prefix of the names of its models. Default: the method."""
     inputs: Members | None = None
-    """What to search among, families by their members. Default: all of the feature set."""
+    """Columns to search among; a family stands for its members. Default: the feature set's."""
     method: Literal["forward", "backward", "exchange"] = "forward"
-    most: int = Field(default=DEFAULT_MOST, ge=1, le=200)
-    rule: Literal["best", "worth", "standard error"] = "worth"
-    fewest_drives: int = Field(default=0, ge=0)
-    """Of fewer drives nothing is searched for."""
-    columns_per_drive: int | None = Field(default=None, ge=1)
-    """At most so many columns for each drive, where whole drives are the folds."""
+    max_features: int = Field(
+        default=DEFAULT_MAX_FEATURES, ge=1, le=200, serialization_alias="most"
+    )
+    rule: Literal["best", "tolerance", "standard error"] = "tolerance"
+    min_drives: int = Field(default=0, ge=0, serialization_alias="fewest_drives")
+    max_features_per_drive: int | None = Field(
+        default=None, ge=1, serialization_alias="columns_per_drive"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_renamed(cls, content: Any) -> Any:
+        if isinstance(content, dict) and content.get("rule") == "worth":
+            raise ValueError('rule = "worth" is now called "tolerance": rename it')
+        return refuse_renamed(content, RENAMED_KEYS)
+
+    @property
+    def title(self) -> str:
+        """The name, or else the method."""
+        return self.name or self.method
+
+    def as_dict(self, **options: Any) -> dict[str, Any]:
+        """Return the content under the names of documents; see `RENAMED_KEYS`."""
+        content = self.model_dump(mode="json", by_alias=True, **options)
+        return content | ({"rule": "worth"} if content.get("rule") == "tolerance" else {})
 
     def among(self, inputs: Sequence[str]) -> tuple[str, ...]:
-        """Return which of a cohort's inputs are searched."""
+        """Return the inputs of a cohort that are searched."""
         return tuple(name for name in inputs if self.inputs is None or name in self.inputs)
 
 
@@ -319,7 +359,7 @@ class ModelList(Config):
 
     @field_serializer("search")
     def _as_written(self, search: tuple[Search, ...]) -> Any:
-        dumped = [one.model_dump(mode="json", exclude_defaults=True) for one in search]
+        dumped = [each.as_dict(exclude_defaults=True) for each in search]
         return dumped[0] if len(dumped) == 1 else dumped  # the checksum of a list with one
 
     @model_validator(mode="after")
@@ -415,5 +455,5 @@ def require_odd(catalog: Catalog, names: Sequence[str], feature_set: str) -> Non
 def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
     """Return names of inputs in a line, families by their own, and how many more there are."""
     names = list(catalog.families(inputs))
-    more = f" and {len(names) - INPUTS_TOLD} more (fleet-slip features)"
-    return ", ".join(names[:INPUTS_TOLD]) + (more if len(names) > INPUTS_TOLD else "")
+    more = f" and {len(names) - MAX_LISTED_INPUTS} more (fleet-slip features)"
+    return ", ".join(names[:MAX_LISTED_INPUTS]) + (more if len(names) > MAX_LISTED_INPUTS else "")

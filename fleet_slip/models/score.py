@@ -8,13 +8,13 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
+from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
-from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.compute import counts_of, drives_of_stream
-from fleet_slip.grams.expansion import CarCounts
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor

@@ -160,9 +160,9 @@ class SearchedModels:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON document needs."""
-        asked = self.search.model_dump(exclude_defaults=True, exclude={"inputs"})
-        usual = {name: getattr(self.search, name) for name in ("method", "most", "rule")}
-        return {**usual, **asked, "inputs": len(self.inputs), "sizes": len(self.models)}
+        main = self.search.as_dict(include={"method", "max_features", "rule"})
+        options = self.search.as_dict(exclude_defaults=True, exclude={"inputs"})
+        return {**main, **options, "inputs": len(self.inputs), "sizes": len(self.models)}
 
 
 def search_models(
@@ -178,11 +178,11 @@ def search_models(
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
     label = cohort.catalog.signals.label
-    folds = cohort.folds(folding.by, folding.count).serving(inputs, label, sparse=True)
+    folds = cohort.folds(folding.by, folding.count).complete_cases(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
         seen = gram if intercept else gram.about_origin()
-        sets = stepwise_order(seen, inputs, label, search.method, search.most)
+        sets = stepwise_order(seen, inputs, label, search.method, search.max_features)
         nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
         if sets and nested:
             return nested_fits(seen, sets[-1], label)[1:]
@@ -216,11 +216,11 @@ def searching(label: str, found: SearchedModels, size: int, *, intercept: bool) 
 
 
 def choose_by(
-    search: Search | None, models: Sequence[CrossValidation], asked: Tolerance | None = None
+    search: Search | None, models: Sequence[CrossValidation], tolerance: Tolerance | None = None
 ) -> Winner:
-    """Return the winner by the rule of a search; a worth that was asked for precedes it."""
-    if search is None or search.rule == "worth" or asked is not None:
-        return choose(models, asked or DEFAULT_TOLERANCE)
+    """Return the winner by a tolerance if one is given, else by the rule of a search."""
+    if search is None or search.rule == "tolerance" or tolerance is not None:
+        return choose(models, tolerance or DEFAULT_TOLERANCE)
     if search.rule == "standard error":
         return choose(models, ZERO_TOLERANCE)
     best = max(models, key=lambda model: model.sums.signed_r_squared)

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.base import canonical_json, document_of, sha256_of
+from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
-from fleet_slip.grams.cohort import Cohort, Served, load_cohort
+from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
+from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights
 from fleet_slip.grams.folding import PARTS, Folding, make_folding
-from fleet_slip.grams.weights import FULL, Weighed, age_weights, robust_weights
-from fleet_slip.models.label_noise import WithoutLabel, label_noise_deg, without_label
+from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     COURSE_FEATURES,
     COURSE_MODELS,
@@ -31,7 +32,7 @@ from fleet_slip.models.request import (
     load_model_list,
     name_inputs,
     nested_candidates,
-    parse_worth,
+    parse_tolerance,
     require_inputs,
     require_odd,
 )
@@ -59,7 +60,7 @@ from fleet_slip.rendering import Answer, Part
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
-def lost_drives(served: Served, *, intercept: bool) -> dict[str, Weighed]:
+def outlier_drives(served: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
     """Return the drives that `robust` counts less, the most unusual first."""
     table = served.table if intercept else served.table.about_origin()
     weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
@@ -99,9 +100,9 @@ class Selection(Answer):
     intercept: bool = True
     model_list: str = ""
     config_sha256: str = ""
-    weighed: Mapping[str, Weighed] = field(default_factory=dict)
+    weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
     full: int = 1
-    without_label: WithoutLabel | None = None
+    without_label: CourseLabelQuality | None = None
     label_noise_deg: float | None = None
     request: SelectionRequest = field(default_factory=SelectionRequest)
     asked_condition: str = TRAINING_DRIVES
@@ -160,7 +161,7 @@ class Selection(Answer):
             "drives": self.cohort.drive_count,
             "rows": self.cohort.rows,
             "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.count_received_with(),
+            "drives_without_log": self.cohort.count_onboard_with(),
             "drives_left_out": self.cohort.left_out,
             "intercept": self.intercept,
             "folds": {
@@ -168,7 +169,7 @@ class Selection(Answer):
                 "count": len(self.models[0].folds),
             },
             "skipped": self.skipped,
-            "drives_weighed": document_of(self.weighed),
+            "drives_weighed": document_of(self.weighted),
             "label_noise_deg": self.label_noise_deg,
         }
         for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
@@ -195,7 +196,7 @@ def select(
     cohort: Cohort,
     candidates: Sequence[CandidateModel],
     folds: Folding,
-    worth: Tolerance | None = None,
+    tolerance: Tolerance | None = None,
     searches: Sequence[Search] = (),
     inputs: Sequence[str] = (),
     *,
@@ -203,9 +204,9 @@ def select(
 ) -> Selection:
     """Cross-validate each candidate, and what searches find among inputs; choose the winner.
 
-    `worth` overrides the rule of the first search. Candidates with absent or dependent signals are
-    skipped, with the reason, and so are searches that need more drives. Raises `DataError` if none
-    is left, or no drive has the label.
+    `tolerance` overrides the rule of the first search. Skips candidates with absent or dependent
+    signals, and searches that need more drives. Raises `DataError` if none is left, or no drive has
+    the label.
     """
     divided = cohort.folds(folds.by, folds.count)
     catalog = cohort.catalog
@@ -230,14 +231,14 @@ def select(
             skipped[one.name] = str(error)
     searched: list[SearchedModels] = []
     for search in searches:
-        if cohort.drive_count < search.fewest_drives:
-            few = f"it needs {search.fewest_drives} drives, and there are {cohort.drive_count}"
+        if cohort.drive_count < search.min_drives:
+            few = f"it needs {search.min_drives} drives, and there are {cohort.drive_count}"
             skipped[f"{search.name or search.method} (search)"] = few
         elif among := search.among(inputs):
-            most = search.most
-            if search.columns_per_drive and folds.by != PARTS:
-                most = min(most, search.columns_per_drive * cohort.drive_count)
-            bounded = search.model_copy(update={"most": most})
+            most = search.max_features
+            if search.max_features_per_drive and folds.by != PARTS:
+                most = min(most, search.max_features_per_drive * cohort.drive_count)
+            bounded = search.model_copy(update={"max_features": most})
             try:
                 found = search_models(cohort, among, folds, bounded, intercept=intercept)
             except DataError as error:  # no drive, or not one in each fold, has all inputs
@@ -248,7 +249,7 @@ def select(
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate model can be fitted: {reasons}")
-    winner = choose_by(searches[0] if searches else None, models, worth)
+    winner = choose_by(searches[0] if searches else None, models, tolerance)
     return Selection(
         cohort,
         folds,
@@ -264,7 +265,7 @@ GIVEN = "given"
 """The name of a model whose inputs were asked for one by one."""
 
 
-def answer_request(
+def run_selection(
     warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
 ) -> Selection:
     """Select on a predicate's drives, without the columns of the usual list by that of signals.
@@ -282,7 +283,8 @@ def answer_request(
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
         plan = SelectionPlan.of(catalog, replace(request, models=LOGGED_MODELS))
         answer = _answer(warehouse, plan, predicate)
-    told = without_label(warehouse, answer.cohort, answer.winner.model.pooled.rmse_deg)
+    cohort, error_deg = answer.cohort, answer.winner.model.pooled.rmse_deg
+    told = assess_course_label(warehouse, cohort.feature_set, cohort.predicate, error_deg)
     noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
     known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
     return replace(known, request=request, asked_condition=predicate)
@@ -301,9 +303,9 @@ class SelectionPlan:
     def of(cls, catalog: Catalog, request: SelectionRequest) -> "SelectionPlan":
         """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
         request.check()
-        by_inputs = request.nested or request.ordered or request.search
+        by_inputs = request.order or request.is_ordered or request.search
         if not (request.models or request.model or by_inputs):
-            logged = request.features or request.by == PARTS
+            logged = request.features or request.group_by == PARTS
             usual = LOGGED_MODELS if logged else DEFAULT_MODELS
             request = replace(request, models=COURSE_MODELS if request.label else usual)
         model_list = _given(catalog, request)
@@ -313,34 +315,34 @@ class SelectionPlan:
             request = replace(request, label=model_list.label)
             request.check()
         listed = model_list.folds if model_list else Folding()
-        folds = make_folding(request.by or listed.by, request.folds, listed.count)
+        folds = make_folding(request.group_by or listed.by, request.folds, listed.count)
         return cls(request, model_list, folds, _feature_set(catalog, request, model_list))
 
     def choose(self, cohort: Cohort) -> Selection:
         """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
-        weighed: dict[str, Weighed] = {}
+        weighted: dict[str, DownweightedDrive] = {}
         full = 1
         if self.request.half_life:
             days = cohort.drives["day"].to_pylist()
-            cohort, full = cohort.weighed(age_weights(days, self.request.half_life)), FULL
+            cohort, full = cohort.weighted(age_weights(days, self.request.half_life)), FULL
         if self.request.robust:
-            cohort, weighed = _weigh_drives(cohort, self)
-            full *= FULL if weighed else 1
+            cohort, weighted = _weigh_drives(cohort, self)
+            full *= FULL if weighted else 1
         if prior := cohort.prior:
             found = weigh_prior(cohort, prior, self)
-        elif self.request.ordered:
+        elif self.request.is_ordered:
             found = _search(cohort, self.request, self.folds)
         else:
             found = _compare_listed(cohort, self.request, self.model_list, self.folds)
-        return replace(found, weighed=weighed, full=full)
+        return replace(found, weighted=weighted, full=full)
 
 
 def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
     request, folds = plan.request, plan.folds
     distances = bool(
-        request.nested and not request.ordered and not _searches_of(request, plan.model_list)
+        request.order and not request.is_ordered and not _searches_of(request, plan.model_list)
     )
-    of_drives = request.ordered or request.robust or request.half_life
+    of_drives = request.is_ordered or request.robust or request.half_life
     whole = of_drives or distances  # else the sum of each fold suffices
     cohort = load_cohort(warehouse, predicate, plan.feature_set, None if whole else folds)
     if request.prior:
@@ -350,7 +352,7 @@ def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Select
         cohort = replace(cohort, prior=prior)
     answer = plan.choose(cohort)
     if distances:
-        inputs = inputs_of(answer.cohort, request.nested or WHOLE_SET)
+        inputs = inputs_of(answer.cohort, request.order or WHOLE_SET)
         told = try_distances(answer.cohort, inputs, folds, request)
         answer = replace(answer, distances=told)
     return answer
@@ -374,13 +376,15 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
     named = next((one.inputs for one in searches if one.inputs), ())
     signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
-    weighed = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighed.folds(plan.folds.by, plan.folds.count).serving(signals, label, sparse=True)
+    weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
+    folds = weighted.folds(plan.folds.by, plan.folds.count).complete_cases(
+        signals, label, sparse=True
+    )
     choose = least_squares(signals, label, intercept=plan.request.intercept)
     joined = cross_validate("prior", folds, choose, cohort.catalog.input_scales)
     told = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
-        f"the weight {weighed.weight}, {winner.pooled.rmse_deg:.4f} deg without."
+        f"the weight {weighted.weight}, {winner.pooled.rmse_deg:.4f} deg without."
     )
     models = (*first.models, joined)
     if joined.pooled.rmse > winner.pooled.rmse * (1 + 1 / cohort.drive_count):
@@ -390,22 +394,24 @@ def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection
         return replace(first, cohort=unused, models=models, winner=chosen)
     reason = f"The prior stays. {told}"
     chosen = replace(first.winner, model=joined, reason=reason)
-    return replace(first, cohort=weighed, models=models, winner=chosen)
+    return replace(first, cohort=weighted, models=models, winner=chosen)
 
 
-def _weigh_drives(cohort: Cohort, plan: SelectionPlan) -> tuple[Cohort, dict[str, Weighed]]:
+def _weigh_drives(
+    cohort: Cohort, plan: SelectionPlan
+) -> tuple[Cohort, dict[str, DownweightedDrive]]:
     """Return a cohort whose lost drives count less, by a model of all compared inputs."""
     request, model_list = plan.request, plan.model_list
-    inputs = inputs_of(cohort, request.nested or WHOLE_SET)
-    if model_list and model_list.model and not (request.nested or request.search):
+    inputs = inputs_of(cohort, request.order or WHOLE_SET)
+    if model_list and model_list.model and not (request.order or request.search):
         listed = {name for one in model_list.model for name in one.signals}
         inputs = tuple(name for name in cohort.inputs if name in listed)
-    lost = lost_drives(cohort.serving(inputs), intercept=request.intercept)
+    lost = outlier_drives(cohort.complete_cases(inputs), intercept=request.intercept)
     if not lost:
         return cohort, {}
     of_drive = {name: round(one.weight * FULL) for name, one in lost.items()}
     parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
-    return cohort.weighed(parts), lost
+    return cohort.weighted(parts), lost
 
 
 def _given(catalog: Catalog, request: SelectionRequest) -> ModelList | None:
@@ -443,11 +449,11 @@ def _compare_listed(
 ) -> Selection:
     listed = model_list.model if model_list else ()
     searches = _searches_of(request, model_list)
-    worth = None if request.worth is None else parse_worth(request.worth)
-    inputs = inputs_of(cohort, request.nested or WHOLE_SET) if searches else ()
+    tolerance = None if request.tolerance is None else parse_tolerance(request.tolerance)
+    inputs = inputs_of(cohort, request.order or WHOLE_SET) if searches else ()
     nested = (
-        nested_candidates(inputs_of(cohort, request.nested))
-        if request.nested and not searches
+        nested_candidates(inputs_of(cohort, request.order))
+        if request.order and not searches
         else ()
     )
     candidates = (*listed, *nested)
@@ -460,28 +466,33 @@ def _compare_listed(
             search=searches,
         )
         name = request.models or (GIVEN if request.model else None)
-        label = "+".join(filter(None, [name, f"nested:{request.nested}" if nested else None]))
+        label = "+".join(filter(None, [name, f"order:{request.order}" if nested else None]))
         compared = described.sha256
     else:
         (search,) = searches
-        content = {"inputs": list(inputs), **search.model_dump(include={"method", "most", "rule"})}
-        label = f"search:{search.method} {search.most}"
+        content = {
+            "inputs": list(inputs),
+            **search.as_dict(include={"method", "max_features", "rule"}),
+        }
+        label = f"search:{search.method} {search.max_features}"
         compared = sha256_of(canonical_json(content))
-    found = select(cohort, candidates, folds, worth, searches, inputs, intercept=request.intercept)
-    checksum = _checksum(compared, request.worth, request.intercept)
+    found = select(
+        cohort, candidates, folds, tolerance, searches, inputs, intercept=request.intercept
+    )
+    checksum = _checksum(compared, request.tolerance, request.intercept)
     return replace(found, model_list=label, config_sha256=checksum)
 
 
-def checksum_of_list(model_list: ModelList, worth: str | None) -> str | None:
+def checksum_of_list(model_list: ModelList, tolerance: str | None) -> str | None:
     """Return the `config_sha256` of a selection from a list, None for one that only searches."""
-    return _checksum(model_list.sha256, worth, True) if model_list.model else None
+    return _checksum(model_list.sha256, tolerance, True) if model_list.model else None
 
 
-def _checksum(compared: str, worth: str | None, intercept: bool) -> str:
+def _checksum(compared: str, tolerance: str | None, intercept: bool) -> str:
     """Return the checksum of what is compared, and of what else is asked for and not usual."""
     unusual: dict[str, Any] = {}
-    if worth is not None:
-        unusual["worth"] = worth
+    if tolerance is not None:
+        unusual["worth"] = tolerance
     if not intercept:
         unusual["intercept"] = False
     return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
@@ -491,20 +502,22 @@ def _searches_of(request: SelectionRequest, model_list: ModelList | None) -> tup
     if request.search:
         if request.search not in METHODS:
             raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
-        asked = {"method": request.search, **({"most": request.most} if request.most else {})}
+        options: dict[str, Any] = {"method": request.search}
+        if request.max_features:
+            options["max_features"] = request.max_features
         if request.label:
-            # The noise of the course hides in the error what a column is worth to the angle.
-            asked["rule"] = "best"
-        return (Search.model_validate(asked),)
+            # The noise of the course exceeds the gain of a column: compare correlations.
+            options["rule"] = "best"
+        return (Search.model_validate(options),)
     return model_list.search if model_list else ()
 
 
 def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Selection:
-    nested = request.nested or WHOLE_SET
+    nested = request.order or WHOLE_SET
     inputs = inputs_of(cohort, nested)
     criterion = require_criterion(request.criterion or "cv")
-    ranking = ALL_SUBSETS if request.all_subsets else request.rank or "declared"
-    rule = Rule(ranking, criterion, parse_worth(request.worth))
+    ranking = ALL_SUBSETS if request.all_subsets else request.ranking or "declared"
+    rule = Rule(ranking, criterion, parse_tolerance(request.tolerance))
     found = select_inputs(cohort, inputs, folds, rule, request)
     described = ModelList(
         description="Inputs to choose from",
@@ -522,8 +535,8 @@ def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Select
         {},
         choice=found.choice,
         intercept=request.intercept,
-        model_list=f"nested:{nested} {rule.ranking} {rule.criterion}",
+        model_list=f"order:{nested} {rule.ranking} {rule.criterion}",
         config_sha256=_checksum(
-            sha256_of(canonical_json(content)), request.worth, request.intercept
+            sha256_of(canonical_json(content)), request.tolerance, request.intercept
         ),
     )

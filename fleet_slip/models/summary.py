@@ -14,8 +14,8 @@ from fleet_slip.rendering import Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import describe_cohort
 
 if TYPE_CHECKING:
-    from fleet_slip.grams.weights import Weighed
-    from fleet_slip.models.label_noise import WithoutLabel
+    from fleet_slip.calibration.course_label import CourseLabelQuality
+    from fleet_slip.grams.drive_weights import DownweightedDrive
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 
@@ -32,7 +32,7 @@ def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
         )
 
 
-def lost_remarks(drives: Mapping[str, "Weighed"]) -> Iterator[Remark]:
+def outlier_remarks(drives: Mapping[str, "DownweightedDrive"]) -> Iterator[Remark]:
     """Yield which drives `robust` counts less, and why."""
     for drive, one in drives.items():
         yield Remark(f"{drive}: {one.reason}.")
@@ -140,7 +140,7 @@ def _label_noise(selection: "Selection") -> Remark:
     )
 
 
-def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
+def _without_label(told: "CourseLabelQuality") -> Iterator[Remark]:
     """Yield what changes of the course tell of the angle, and what they do not."""
     over = ", ".join(f"{one:g}" for one in told.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
@@ -164,11 +164,11 @@ def _without_label(told: "WithoutLabel") -> Iterator[Remark]:
 def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     yield from remark_without_information(selection.rows_without, selection.cohort.rows)
-    if without_log := selection.cohort.count_received_with():
+    if without_log := selection.cohort.count_onboard_with():
         without = pluralize(without_log, "drive")
         yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
     yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
-    yield from lost_remarks(selection.weighed)
+    yield from outlier_remarks(selection.weighted)
     if selection.remark:
         yield Remark(selection.remark)
     if selection.without_label is not None:

@@ -11,19 +11,19 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.base import pluralize
+from fleet_slip.calibration.course_label import course_moments
+from fleet_slip.calibration.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.reader import GramReader, open_grams
-from fleet_slip.grams.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.models.acceptance import find_lacks, load_floor
+from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
+from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
 
@@ -53,7 +53,7 @@ def require_sound_drives(
     over.
     """
     found, looked_at, measured = _look(warehouse, manifest, made)
-    lacks = find_lacks(load_floor(warehouse.configs), manifest)
+    lacks = missing_evidence(load_thresholds(warehouse.configs), manifest)
     if measured and len(manifest.terms) > settled and lacks:
         raise RefusedError(
             f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "

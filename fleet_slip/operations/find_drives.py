@@ -14,12 +14,13 @@ from fleet_slip.base import pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import digest_counts
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.gram_files import BEING_WRITTEN_HOURS, gram_digests, read_rows
-from fleet_slip.grams.on_board import counted_sets
+from fleet_slip.grams.gram_files import gram_digests, read_rows
+from fleet_slip.grams.on_board import onboard_feature_sets
 from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
 from fleet_slip.warehouse.erasure_log import ErasureSubject
+from fleet_slip.warehouse.gram_rows import BEING_WRITTEN_HOURS
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
@@ -268,7 +269,8 @@ def digests_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) 
         if pc.any(selected := rows_of(names, subject)).as_py():
             rows = read_rows(warehouse.grams, file).filter(selected)
             on_board = pc.is_in(
-                rows["feature_set"], pa.array(list(counted_sets(warehouse.catalog)), pa.string())
+                rows["feature_set"],
+                pa.array(list(onboard_feature_sets(warehouse.catalog)), pa.string()),
             )
             yield from gram_digests(rows.filter(on_board))[0]
     logs = warehouse.logs.snapshot()

@@ -18,8 +18,7 @@ from pydantic import Field
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import ConfigError, PendingError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.gram_files import is_of_received
-from fleet_slip.grams.job import reconcile
+from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
     RETENTION_HOURS,
@@ -50,6 +49,7 @@ from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
+from fleet_slip.warehouse.gram_rows import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 PENDING_SHOWN = 5
@@ -339,7 +339,7 @@ def retain(
     except OverflowError:
         raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
     days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
-    for file in filter(is_of_received, warehouse.grams.snapshot().files):
+    for file in filter(is_onboard_file, warehouse.grams.snapshot().files):
         days.append(pc.max(warehouse.grams.read(file.path, ["day"])["day"]).as_py())
     if days and max(days) < before:
         raise RefusedError(

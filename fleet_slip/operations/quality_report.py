@@ -11,12 +11,11 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, pluralize
+from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
-from fleet_slip.grams.calibration import course_moments
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
-from fleet_slip.grams.reader import GramReader
 from fleet_slip.ingest.recordings import Origin
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
@@ -27,6 +26,7 @@ from fleet_slip.quality.turning import find_implausible
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.database import sql_text
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 

@@ -22,8 +22,8 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_files import is_received, read_rows, rows_of_set, write_rows
-from fleet_slip.grams.job import land_ahead, reconcile
+from fleet_slip.grams.gram_files import read_rows, write_rows
+from fleet_slip.grams.update import commit_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
@@ -41,6 +41,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.erasure_log import ErasureSubject
+from fleet_slip.warehouse.gram_rows import is_onboard, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -96,7 +97,7 @@ def write_again(
                 action = logs.table.write_file(one.name, rows, one.files[0].day)
                 new.append(dataclasses.replace(action, data_change=data_change))
             progress(1, len(rewritings))
-        land_ahead(warehouse, new, replaced)
+        commit_ahead(warehouse, new, replaced)
     except FleetSlipError:
         logs.table.discard(new)
         raise
@@ -189,13 +190,13 @@ def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
     rows = 0
     for file in snapshot.files:
         every = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
-        mine = pc.and_(rows_of(every, subject), is_received(every))
+        mine = pc.and_(rows_of(every, subject), is_onboard(every))
         if pc.any(mine).as_py():
             concerned.append(file)
             rows += pc.sum(every.filter(mine)["n"]).as_py()
     if concerned:
         read = (read_rows(warehouse.grams, file) for file in concerned)
-        kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_received(r)))) for r in read)
+        kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_onboard(r)))) for r in read)
         add = write_rows(warehouse, kept)
         snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
     return rows

@@ -21,14 +21,14 @@ from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
-from fleet_slip.grams.gram_files import find_backlog
-from fleet_slip.grams.job import ensure_grams
-from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.update import ensure_grams
 from fleet_slip.operations.quality_report import SensorFault, examine_drives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
+from fleet_slip.warehouse.gram_reader import GramReader
+from fleet_slip.warehouse.gram_rows import find_backlog
 from fleet_slip.warehouse.predicate import (
     Predicate,
     drive_columns,

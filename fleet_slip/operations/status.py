@@ -21,7 +21,6 @@ from fleet_slip.errors import (
     StorageError,
     printable,
 )
-from fleet_slip.grams.gram_files import find_backlog
 from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
 from fleet_slip.quality.peers import thresholds
@@ -34,6 +33,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import find_erased
+from fleet_slip.warehouse.gram_rows import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600

@@ -37,9 +37,8 @@ from fleet_slip.grams.check import (
     stored_grams,
 )
 from fleet_slip.grams.compute import wide_grams
-from fleet_slip.grams.gram_files import is_of_received, is_received, named_files
-from fleet_slip.grams.job import reconcile
-from fleet_slip.grams.on_board import counted_sets, impossible_rows
+from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
+from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -54,6 +53,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
+from fleet_slip.warehouse.gram_rows import is_onboard, is_onboard_file, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[
@@ -307,10 +307,10 @@ def verify_grams(
 
     `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
     """
-    sets = cache(lambda: counted_sets(warehouse.catalog))
+    sets = cache(lambda: onboard_feature_sets(warehouse.catalog))
     for file in grams:
         rows = warehouse.grams.read(file.path)
-        received = rows.filter(is_received(rows))
+        received = rows.filter(is_onboard(rows))
         for row, why in impossible_rows(received, sets()) if len(received) else ():
             problem = f"the Gram row of drive {row['drive_id']}, sent by a car, {why}"
             report.note("gram", f"grams/{file.path}", problem)
@@ -561,7 +561,7 @@ def _drop_wrong(warehouse: Warehouse, damaged: Collection[str], wrong: set[str])
     bad = [
         file
         for file in snapshot.files
-        if (f"grams/{file.path}" in damaged and not is_of_received(file))
+        if (f"grams/{file.path}" in damaged and not is_onboard_file(file))
         or not wrong.isdisjoint(named.get(file.path, ()))
     ]
     if bad:

@@ -159,7 +159,7 @@ class CohortFolds:
 
         return cls(assignment.names, grams, count_drives)
 
-    def serving(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
+    def complete_cases(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
         """Return the folds of drives that have the label and all the inputs; `sparse` skips others.
 
         Raises `DataError` if a fold, or all but one, has no such row.
@@ -294,7 +294,7 @@ def cross_validate_inputs(
     intercept: bool = True,
 ) -> CrossValidation:
     """Cross-validate least squares over all drives that have the inputs. Raises `DataError`."""
-    folds = cohort.serving(inputs, label)
+    folds = cohort.complete_cases(inputs, label)
     return cross_validate(name, folds, least_squares(inputs, label, intercept=intercept), scales)
 
 

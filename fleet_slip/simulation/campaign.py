@@ -1,6 +1,7 @@
-"""Campaigns: which cars drive where, how fast and how often, read from `configs/campaigns/*.toml`.
+"""Campaigns of simulated drives, read from `configs/campaigns/*.toml`.
 
-A drive depends on the campaign's seed and its own name, never on days, other drives or order.
+A drive depends on the campaign's seed and its own name, not on the number of days, on other drives
+or on their order.
 """
 
 import json
@@ -42,11 +43,11 @@ if TYPE_CHECKING:
     from fleet_slip.simulation.traffic import TrafficDrive
 
 ROAD_SPACING_M = 1.0
-"""Spacing of the points at which curvature and target speed are tabulated, in m."""
+"""Spacing of the tables of curvature and target speed, in m."""
 
 
 class PacePoint(Config):
-    """Speed over that of the planned profile at one station; linear in between."""
+    """Speed over that of the planned profile at a station; linear in between."""
 
     station_m: NotNegative
     factor: Positive
@@ -54,7 +55,7 @@ class PacePoint(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class DriveSpec(CarOnRoad):
-    """Everything that determines one drive's bytes."""
+    """A drive: everything that determines its bytes."""
 
     drive_id: str
     vehicle_id: str
@@ -63,27 +64,27 @@ class DriveSpec(CarOnRoad):
     laps: float
     seed: int
     source: str = "simulated"
-    receiver: Annotated[Receiver | None, Field(exclude_if=lambda one: one is None)] = None
+    receiver: Annotated[Receiver | None, Field(exclude_if=lambda receiver: receiver is None)] = None
     drawn_as: Annotated[str, Field(exclude_if=lambda name: not name)] = ""
-    """The campaign whose car, road and noise this drive has, if it is not its own."""
+    """Campaign that car, road and noise are drawn for; empty: `campaign`."""
     pace: Annotated[tuple[PacePoint, ...], Field(exclude=True)] = ()
-    """Of a scenario: how its speed varies beside what the track asks for."""
+    """Variation of a scenario's speed, in addition to the planned profile."""
 
     @cached_property
     def in_traffic(self) -> "TrafficDrive | None":
-        """What highway-env decides of the drive, computed when it is asked for."""
+        """Path and speed in traffic, as highway-env decides them; None without traffic."""
         if self.traffic is None:
             return None
-        from fleet_slip.simulation.traffic import drive_in_traffic  # noqa: PLC0415 - takes a second
+        from fleet_slip.simulation.traffic import drive_in_traffic  # noqa: PLC0415 - imports highway-env
 
-        generator = self._drawn("traffic", self.drive_id)
+        generator = self._generator("traffic", self.drive_id)
         return drive_in_traffic(
             self.traffic, self.limits, self.speed_factor, ROAD_SPACING_M, generator
         )
 
     @property
     def profile(self) -> SpeedProfile:
-        """The track and the speed along it within the limits, with the pace, before the factor."""
+        """The track and the speed within the limits, with the pace, without the speed factor."""
         if self.in_traffic:
             return self.in_traffic.profile
         planned = speed_profile(self.track, self.limits, ROAD_SPACING_M)
@@ -97,43 +98,43 @@ class DriveSpec(CarOnRoad):
 
     @cached_property
     def expected_rows(self) -> int:
-        """Rows of the drive if the car holds its target speed."""
+        """Rows of the drive at the target speed."""
         if self.traffic:
             return math.ceil(self.traffic.duration_s * SAMPLE_RATE_HZ)
         time_s = self.profile.time_s(self.laps) / self.speed_factor
         return math.ceil(time_s * SAMPLE_RATE_HZ)
 
     def generator(self) -> np.random.Generator:
-        """Return the generator of the drive's sensor noise, at its start."""
-        return self._drawn("sensors", self.drive_id)
+        """Return a new generator of the sensor noise."""
+        return self._generator("sensors", self.drive_id)
 
     def satellite_generator(self) -> np.random.Generator:
-        """Return the generator of the satellite receiver's errors in the drive."""
-        return self._drawn("satellites", self.drive_id)
+        """Return a new generator of the satellite receiver's errors."""
+        return self._generator("satellites", self.drive_id)
 
-    def _drawn(self, what: str, identity: str) -> np.random.Generator:
-        own = identity.removeprefix(self.campaign)
-        known_as = self.drawn_as + own if self.drawn_as else identity
-        return random_generator(self.seed, what, known_as)
+    def _generator(self, purpose: str, identity: str) -> np.random.Generator:
+        if self.drawn_as:
+            identity = self.drawn_as + identity.removeprefix(self.campaign)
+        return random_generator(self.seed, purpose, identity)
 
     def distortion(self) -> Distortion | None:
-        """Return what the sensors make of the truth, at the drive's start; None where nothing."""
+        """Return the imperfect sensors at the start of the drive; None if they are ideal."""
         if self.flaws == NONE:
             return None
-        of_car = self._drawn("pulses", self.vehicle_id)
-        return Distortion(self.flaws, of_car, self._drawn("gps", self.drive_id))
+        car_rng = self._generator("pulses", self.vehicle_id)
+        return Distortion(self.flaws, car_rng, self._generator("gps", self.drive_id))
 
     def surface(self, station_m: FloatArray) -> Surface | None:
-        """Return the road's surface at the stations of the profile."""
-        of_track = random_generator(self.seed, "slopes", self.track.name)
-        of_drive = self._drawn("weather", self.drive_id)
+        """Return the surface of the road at the stations of the profile."""
+        track_rng = random_generator(self.seed, "slopes", self.track.name)
+        drive_rng = self._generator("weather", self.drive_id)
         track = self.in_traffic.profile.track if self.in_traffic else self.track
-        return surface(self.flaws.road, track, station_m, of_track, of_drive)
+        return surface(self.flaws.road, track, station_m, track_rng, drive_rng)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Whole drives of one day that become one Parquet file."""
+    """Whole drives of one day that are written to one Parquet file."""
 
     campaign: str
     day: date
@@ -142,8 +143,9 @@ class Batch:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over all that determines the batch's bytes, as canonical JSON."""
-        digest = sha256_of(canonical_ascii(_BATCH.dump_python(self, mode="json")))
+        """SHA-256 of the canonical JSON of everything that determines the batch's bytes."""
+        content = _BATCH.dump_python(self, mode="json", by_alias=True)
+        digest = sha256_of(canonical_ascii(content))
         scenarios = [drive for drive in self.drives if drive.source == SCENARIO]
         paces = [[point.model_dump() for point in drive.pace] for drive in scenarios]
         return sha256_of(f"{digest} {json.dumps(paces)}") if scenarios else digest
@@ -153,9 +155,9 @@ _BATCH = TypeAdapter(Batch)
 
 
 class Campaign(Config):
-    """A plan of drives over days, or what differs from its `base`; more days change no drive.
+    """A plan of drives over days, or the differences from a `base`. More days change no drive.
 
-    A plan without a `kind` says what differs from that of the base, table by table.
+    A plan without a `kind` contains differences from the base's plan, table by table.
     """
 
     name: Identifier
@@ -168,9 +170,9 @@ class Campaign(Config):
     rows_per_file: int = Field(gt=0, le=2_000_000)
     plan: Annotated[GridPlan | FleetPlan | TrafficPlan | TrialPlan, Field(discriminator="kind")]
     sensors: Sensors
-    base: Annotated[Identifier | None, Field(exclude_if=lambda one: one is None)] = None
-    receivers: Annotated[Receivers | None, Field(exclude_if=lambda one: one is None)] = None
-    """Satellite receivers that log course and speed; None: none does."""
+    base: Annotated[Identifier | None, Field(exclude_if=lambda base: base is None)] = None
+    receivers: Annotated[Receivers | None, Field(exclude_if=lambda cars: cars is None)] = None
+    """Satellite receivers of the cars, which log course and speed; None: no receivers."""
 
     @model_validator(mode="before")
     @classmethod
@@ -179,7 +181,9 @@ class Campaign(Config):
             return content
         base = load_base("campaigns", content["base"], configs_of(info))
         if "base" in base:
-            raise ValueError(f"the base {content['base']!r} has a base itself: take that one")
+            raise ValueError(
+                f"the base {content['base']!r} has a base itself. Name that one instead."
+            )
         plan = content.get("plan", {})
         if isinstance(plan, dict) and "kind" not in plan:
             plan = merged(base.get("plan", {}), plan)
@@ -194,8 +198,9 @@ class Campaign(Config):
 
     @property
     def digest(self) -> str:
-        """SHA-256 over all that determines a day's bytes: all but how many days there are."""
-        content = self.model_dump(mode="json", exclude={"number_of_days", "description"})
+        """SHA-256 of everything that determines a day's bytes: all but number of days and text."""
+        excluded = {"number_of_days", "description"}
+        content = self.model_dump(mode="json", exclude=excluded, by_alias=True)
         return sha256_of(canonical_ascii(content))
 
     def days(self) -> tuple[date, ...]:
@@ -203,7 +208,7 @@ class Campaign(Config):
         return tuple(self.first_day + timedelta(days=day) for day in range(self.number_of_days))
 
     def chosen_days(self, count: int | None, through: date | None) -> tuple[date, ...]:
-        """Return the first days, as many as asked for and up to a day. Raises `UsageError`."""
+        """Return the first `count` days up to `through`. Raises `UsageError` if there are none."""
         days = self.days()
         chosen = tuple(
             day
@@ -212,60 +217,58 @@ class Campaign(Config):
         )
         if not chosen:
             raise UsageError(
-                f"no day is asked for: {self.name} lasts from {days[0]} to {days[-1]}."
+                f"these options select no day. {self.name} lasts from {days[0]} to {days[-1]}."
             )
         return chosen
 
     def drives(self, day: date) -> tuple[DriveSpec, ...]:
-        """Return the drives of a day, by name. Raises `ConfigError` for no such day."""
+        """Return the drives of a day by name. Raises `ConfigError` outside the campaign."""
         days = self.days()
         if day not in days:
             raise ConfigError(
-                f"{day} is not a day of the campaign {self.name!r}, which goes from {days[0]} to"
+                f"{day} is not a day of the campaign {self.name!r}, which lasts from {days[0]} to"
                 f" {days[-1]}. Choose one of these, or raise number_of_days."
             )
         first = (day - self.first_day).days * self.drives_per_day
         return tuple(self._drive(day, first, i) for i in range(self.drives_per_day))
 
     def batches(self, day: date) -> tuple[Batch, ...]:
-        """Return a day's files of about `rows_per_file` rows or fewer. Raises `ConfigError`."""
+        """Return a day's batches of about `rows_per_file` rows or fewer. Raises `ConfigError`."""
         packs = pack(self.drives(day), self.rows_per_file)
         return tuple(Batch(self.name, day, i, drives) for i, drives in enumerate(packs))
 
-    def _drive(self, day: date, first: int, index: int) -> DriveSpec:
-        plan, number = self.plan, first + index
-        of_day, of_plan = f"-{day.isoformat()}-{index:04d}", f"-{plan.car(number):04d}"
-        drive_id, vehicle_id = self.name + of_day, self.name + of_plan
-        drawn_as = self.base or self.name
+    def _drive(self, day: date, first: int, position: int) -> DriveSpec:
+        plan, index, drawn_as = self.plan, first + position, self.base or self.name
+        drive_suffix, car_suffix = f"-{day.isoformat()}-{position:04d}", f"-{plan.car(index):04d}"
+
+        def generator(purpose: str, suffix: str) -> np.random.Generator:
+            return random_generator(self.seed, purpose, drawn_as + suffix)
+
         assignment = plan.assignment(
             DriveDraw(
-                number,
+                index,
                 self.sensors,
-                random_generator(self.seed, "car", drawn_as + of_plan),
-                random_generator(self.seed, "drive", drawn_as + of_day),
+                generator("car", car_suffix),
+                generator("drive", drive_suffix),
                 (day - self.first_day).days,
             )
         )
-        receiver = None
-        if self.receivers:
-            receiver = self.receivers.draw(
-                random_generator(self.seed, "receiver", drawn_as + of_plan)
-            )
+        receivers = self.receivers
         return DriveSpec(
-            drive_id=drive_id,
-            vehicle_id=vehicle_id,
+            drive_id=self.name + drive_suffix,
+            vehicle_id=self.name + car_suffix,
             campaign=self.name,
             day=day,
             laps=self.laps,
             seed=self.seed,
             **vars(assignment),
-            receiver=receiver,
+            receiver=receivers.draw(generator("receiver", car_suffix)) if receivers else None,
             drawn_as=self.base or "",
         )
 
 
 def load_base(kind: str, name: str, configs: Configs) -> dict[str, Any]:
-    """Return the content of a base's file. Raises `ValueError` if there is none."""
+    """Read the file of a base. Raises `ValueError` if it is missing."""
     try:
         return load_toml(configs.find(kind, name))
     except ConfigError as error:
@@ -273,7 +276,7 @@ def load_base(kind: str, name: str, configs: Configs) -> dict[str, Any]:
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the base with changes; tables are merged key by key, all else is replaced."""
+    """Apply changes to a base: tables are merged key by key, all other values are replaced."""
     both = dict(base)
     for key, value in changes.items():
         tables = isinstance(value, dict) and isinstance(both.get(key), dict)
@@ -282,7 +285,7 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 
 def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:
-    """Split drives, in their order, evenly into as few runs as have about so many rows or fewer."""
+    """Split drives in order into the fewest groups with about `rows_per_file` rows or fewer."""
     ends = np.cumsum([drive.expected_rows for drive in drives])
     middles = (ends + np.append(0, ends[:-1])) / 2
     files = math.ceil(ends[-1] / rows_per_file)
@@ -294,5 +297,5 @@ def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpe
 
 
 def load_campaign(name_or_path: str, configs: Configs) -> Campaign:
-    """Read a campaign by name or path. Raises `ConfigError`."""
+    """Read a campaign by name or path. Raises `ConfigError` if it is missing or not valid."""
     return load_config(configs.find("campaigns", name_or_path), Campaign, configs)

@@ -1,7 +1,4 @@
-"""How a campaign chooses car, road and speed for each of its drives: from a grid, or at random.
-
-Drivers who differ: the line that each takes along a road of a class, and how fast.
-"""
+"""Plans of a campaign: how each drive gets a car, a road and a speed, from a grid or at random."""
 
 import math
 from collections.abc import Callable
@@ -49,7 +46,7 @@ GOLDEN_RATIO = (1 + math.sqrt(5)) / 2
 
 
 def load_by_name(load: Callable[[str, Configs], object]) -> BeforeValidator:
-    """Let a config name another one, which is loaded from the `Configs` in the context."""
+    """Load a config that another one names, from the `Configs` of the validation context."""
 
     def resolve(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, str):
@@ -63,9 +60,9 @@ def load_by_name(load: Callable[[str, Configs], object]) -> BeforeValidator:
 
 
 def configs_of(info: ValidationInfo) -> Configs:
-    """Return the configuration files that a config which names others is validated with."""
+    """Return the configuration files of the validation context."""
     if not isinstance(info.context, Configs):
-        raise TypeError("the validation of a config that names others needs `Configs` as context")
+        raise TypeError("validate this config with `Configs` as context: it names other configs")
     return info.context
 
 
@@ -74,8 +71,8 @@ NamedVehicle = Annotated[VehicleParameters, load_by_name(load_vehicle)]
 NotEmpty = Field(min_length=1)
 
 
-def _known_to_highway_env(name: str) -> str:
-    from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - takes a second
+def _require_road(name: str) -> str:
+    from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - imports highway-env
 
     try:
         return require_road(name)
@@ -83,21 +80,21 @@ def _known_to_highway_env(name: str) -> str:
         raise ValueError(str(error)) from None
 
 
-RoadWithTraffic = Annotated[str, AfterValidator(_known_to_highway_env)]
+RoadWithTraffic = Annotated[str, AfterValidator(_require_road)]
 
 
 class Traffic(Config):
-    """A drive among other cars: on which of highway-env's roads, in turns, and how long."""
+    """A drive among other cars on roads of highway-env, which take turns."""
 
     roads: tuple[RoadWithTraffic, ...] = NotEmpty
     duration_s: FiniteFloat = Field(gt=0, le=600)
-    others: int = Field(ge=0, le=50)
-    """About so many other cars."""
+    other_cars: int = Field(alias="others", ge=0, le=50)
+    """Approximate number of other cars."""
     decisions_hz: int = Field(default=10, ge=10, le=15)
 
     @property
     def track(self) -> Track:
-        """What stands for the way of the drive before highway-env has chosen it."""
+        """Placeholder for the track, until highway-env has chosen the path."""
         return Track(
             name="_".join(dict.fromkeys(self.roads)),
             description=f"Traffic on {', '.join(self.roads)} in highway-env",
@@ -106,13 +103,13 @@ class Traffic(Config):
         )
 
 
-def _way_among_cars(name: Any) -> Any:
+def _placeholder_track(name: Any) -> Any:
     return Traffic(roads=(name,), duration_s=1.0, others=0).track if isinstance(name, str) else name
 
 
 @dataclass(frozen=True)
 class CarOnRoad:
-    """One car on one road at one speed."""
+    """A car on a road at a speed. Field names and values are part of a batch's digest."""
 
     vehicle: VehicleParameters
     sensors: Sensors
@@ -121,29 +118,28 @@ class CarOnRoad:
     limits: SpeedLimits
     speed_factor: float
     script: Annotated[tuple[Manoeuvre, ...], Field(exclude_if=lambda script: not script)] = ()
-    """Manoeuvres; a drive without any has the digest that it had before there were some."""
+    """Manoeuvres. Empty ones are not part of the digest, which older campaigns have without."""
     flaws: Annotated[Imperfections, Field(exclude_if=lambda flaws: flaws == NONE)] = NONE
-    """Not part of the digest where there are none: it is what it was before there were any."""
-    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
-    """Where highway-env drives; None: the track is known."""
+    """Imperfections, not part of the digest if there are none."""
+    traffic: Annotated[Traffic | None, Field(exclude_if=lambda traffic: traffic is None)] = None
+    """Traffic that highway-env drives in; None: the drive follows the track."""
 
 
 @dataclass(frozen=True)
 class DriveDraw:
-    """From what a plan makes a drive: its number, its car's sensors, and generators of both.
+    """Inputs of a plan for one drive."""
 
-    Since the campaign's beginning so many `days` have passed.
-    """
-
-    number: int
+    index: int
+    """Number of the drive in the campaign."""
     sensors: Sensors
-    of_car: np.random.Generator
-    of_drive: np.random.Generator
+    car_rng: np.random.Generator
+    drive_rng: np.random.Generator
     days: int = 0
+    """Days since the campaign's first."""
 
 
 class Plan(Config):
-    """What every kind of plan states. The limits of speed are those on a road with μ = 1."""
+    """Base of all plans. Acceleration and braking are limits on a road with μ = 1."""
 
     vehicles: tuple[NamedVehicle, ...] = NotEmpty
     tracks: tuple[NamedTrack, ...] = NotEmpty
@@ -152,7 +148,7 @@ class Plan(Config):
     top_speed_mps: Positive
 
     def limits(self, lateral_mps2: float, adhesion: float = 1.0) -> SpeedLimits:
-        """Return the limits at a planned lateral acceleration, all for the same adhesion."""
+        """Return the speed limits at a planned lateral acceleration, for one adhesion."""
         return SpeedLimits(
             lateral_mps2=lateral_mps2,
             acceleration_mps2=self.acceleration_mps2 * adhesion,
@@ -162,10 +158,10 @@ class Plan(Config):
 
 
 class GridPlan(Plan):
-    """Every combination of the lists once, then again from the beginning.
+    """Every combination of the lists, repeated.
 
-    The stride is 1/φ of their number, φ the golden ratio: any run of drives spreads evenly. Speeds
-    are planned for μ = 1: the driver does not see the road.
+    The stride is 1/φ of the number of combinations, with φ the golden ratio, so that any run of
+    drives is spread evenly. Speeds are planned for μ = 1: the driver does not see the adhesion.
     """
 
     kind: Literal["grid"]
@@ -185,23 +181,21 @@ class GridPlan(Plan):
             self.speed_factor,
         )
 
-    def _combination(self, number: int) -> int:
-        """Return which combination the drive of this number takes, as an index in C order."""
+    def _combination(self, index: int) -> int:
+        """Return the combination of a drive, as an index in C order."""
         count = math.prod(map(len, self._axes))
         stride = round(count / GOLDEN_RATIO)
         while math.gcd(stride, count) > 1:
             stride += 1
-        return number * stride % count
+        return index * stride % count
 
-    def car(self, number: int) -> int:
-        """Return the car that drives the drive of this number: one for each vehicle and mass."""
-        return self._combination(number) // math.prod(map(len, self._axes[2:]))
+    def car(self, index: int) -> int:
+        """Return the number of a drive's car: one for each vehicle and mass."""
+        return self._combination(index) // math.prod(map(len, self._axes[2:]))
 
     def assignment(self, drawn: DriveDraw) -> CarOnRoad:
-        """Return what the drive of this number is to be."""
-        index = np.unravel_index(
-            self._combination(drawn.number), [len(axis) for axis in self._axes]
-        )
+        """Return the car and the road of a drive."""
+        index = np.unravel_index(self._combination(drawn.index), [len(axis) for axis in self._axes])
         vehicle, mass_kg, track, adhesion, lateral_mps2, speed_factor = (
             axis[i] for axis, i in zip(self._axes, index, strict=True)
         )
@@ -216,13 +210,13 @@ class GridPlan(Plan):
 
 
 class SensorBiases(Config):
-    """Standard deviations of the biases from car to car."""
+    """Standard deviations of sensor biases between cars."""
 
     acceleration_mps2: NotNegative
     yaw_rate_rad_s: NotNegative
 
     def draw(self, sensors: Sensors, generator: np.random.Generator) -> Sensors:
-        """Return the sensors of one car, its biases drawn around the given ones."""
+        """Draw the sensors of a car, with biases around those of the given sensors."""
         ax, ay, yaw_rate = generator.standard_normal(3).tolist()
         return sensors.model_copy(
             update={
@@ -234,19 +228,19 @@ class SensorBiases(Config):
 
 
 class DrawnPlan(Plan):
-    """A plan whose cars and drives are drawn, with what is imperfect about both."""
+    """A plan whose cars and drives are drawn at random."""
 
     sensor_bias_std: SensorBiases
-    """Of cars; in trials of the other ones."""
+    """Biases of all cars; in trials, of the other cars."""
     imperfections: ImperfectionRanges | None = added(None)
-    """None: cars, sensors and roads are those of the textbook."""
+    """None: cars, sensors and roads are ideal."""
 
 
 class FleetPlan(DrawnPlan):
-    """Many different cars that take turns, each on roads and at speeds drawn for every drive.
+    """Different cars take turns, on roads and at speeds that are drawn for every drive.
 
-    Model, load, tyres and biases are a car's own. The driver plans lateral acceleration over μ g by
-    `friction_use`.
+    Model, load, tyres and biases are drawn once for each car. `friction_use` is the planned lateral
+    acceleration over μ g.
     """
 
     kind: Literal["fleet"]
@@ -261,25 +255,25 @@ class FleetPlan(DrawnPlan):
     friction_use: Uniform
     speed_factor: Uniform
 
-    def car(self, number: int) -> int:
-        """Return the car that drives the drive of this number."""
-        return number % self.cars
+    def car(self, index: int) -> int:
+        """Return the number of a drive's car."""
+        return index % self.cars
 
     def assignment(self, drawn: DriveDraw) -> CarOnRoad:
-        """Draw a car with worn tyres from one generator, and its drive from another."""
-        of_car, of_drive = drawn.of_car, drawn.of_drive
-        vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
-        mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_car)
-        stiffness, radius = self.tyre_stiffness.draw(of_car), self.tyre_radius.draw(of_car)
-        sensors = self.sensor_bias_std.draw(drawn.sensors, of_car)
-        track = self.tracks[of_drive.integers(len(self.tracks))]
-        adhesion = self.adhesion.draw(of_drive)
-        lateral_mps2 = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
-        speed_factor = self.speed_factor.draw(of_drive)
+        """Draw a car with worn tyres, and its drive."""
+        car_rng, drive_rng = drawn.car_rng, drawn.drive_rng
+        vehicle = self.vehicles[car_rng.integers(len(self.vehicles))]
+        mass_kg = vehicle.body.sprung_mass_kg * self.load.draw(car_rng)
+        stiffness, radius = self.tyre_stiffness.draw(car_rng), self.tyre_radius.draw(car_rng)
+        sensors = self.sensor_bias_std.draw(drawn.sensors, car_rng)
+        track = self.tracks[drive_rng.integers(len(self.tracks))]
+        adhesion = self.adhesion.draw(drive_rng)
+        lateral_mps2 = self.friction_use.draw(drive_rng) * adhesion * GRAVITY_MPS2
+        speed_factor = self.speed_factor.draw(drive_rng)
         ranges = self.imperfections or ImperfectionRanges()
-        vehicle = ranges.loaded(vehicle, mass_kg, of_car)
-        flaws = ranges.draw(of_car, of_drive)
-        stiffer, smaller = ranges.wear(of_car, drawn.days)
+        vehicle = ranges.loaded(vehicle, mass_kg, car_rng)
+        flaws = ranges.draw(car_rng, drive_rng)
+        stiffer, smaller = ranges.wear(car_rng, drawn.days)
         return CarOnRoad(
             vehicle=vehicle.with_tyres(
                 stiffness_factor=stiffness * stiffer, rolling_radius_factor=radius * smaller
@@ -294,98 +288,100 @@ class FleetPlan(DrawnPlan):
 
 
 class TrafficPlan(FleetPlan):
-    """A fleet in traffic: each drive on one of highway-env's roads among other cars.
+    """A fleet in traffic: each drive is on a road of highway-env among other cars.
 
-    `tracks` are the roads, and `speed_factor` is the wanted speed over what road or plan allow.
+    `tracks` names the roads. `speed_factor` is the desired speed over the limit of road and plan.
     """
 
     kind: Literal["traffic"]  # type: ignore[assignment]
-    tracks: tuple[Annotated[Track, BeforeValidator(_way_among_cars)], ...] = NotEmpty
+    tracks: tuple[Annotated[Track, BeforeValidator(_placeholder_track)], ...] = NotEmpty
     duration_s: Uniform
-    others: Uniform
+    other_cars: Uniform = Field(alias="others")
     """Number of other cars."""
     decisions_hz: int = Field(default=10, ge=10, le=15)
-    """How often highway-env decides."""
+    """Rate of highway-env's decisions."""
 
     def assignment(self, drawn: DriveDraw) -> CarOnRoad:
-        """Draw a car and its drive, then how long it takes and among how many cars."""
-        one = super().assignment(drawn)
+        """Draw a car and its drive, then its duration and the number of other cars."""
+        alone = super().assignment(drawn)
         traffic = Traffic(
-            roads=(one.track.name,),
-            duration_s=self.duration_s.draw(drawn.of_drive),
-            others=round(self.others.draw(drawn.of_drive)),
+            roads=(alone.track.name,),
+            duration_s=self.duration_s.draw(drawn.drive_rng),
+            others=round(self.other_cars.draw(drawn.drive_rng)),
             decisions_hz=self.decisions_hz,
         )
-        return replace(one, traffic=traffic)
+        return replace(alone, traffic=traffic)
 
 
 class Drivers(Config):
-    """How drivers differ: the line, how they wander about it, and their temper."""
+    """Differences between drivers: line, wandering about the line, and speed."""
 
     cut: Range
-    """How far ahead and behind a bend is rounded off, over the smallest radius of the class."""
+    """Distance by which bends are cut, over the smallest radius of the road's class."""
     wander_m: Range
+    """Standard deviation of the offset from the line."""
     acceleration_mps2: Uniform
-    """On a road with μ = 1; less on others."""
+    """Acceleration on a road with μ = 1; proportional to μ."""
     braking_mps2: Uniform
     top_speed: Uniform
-    """Over that of the road's class."""
+    """Top speed over that of the road's class."""
 
-    def line(self, road: Track, kind: str, of_drive: np.random.Generator) -> Track:
-        """Draw the line that a driver takes along a road of a class."""
-        cut_m = self.cut.draw(of_drive) * CLASSES[kind].radius_m[0]
-        every_m = WANDER_S * CLASSES[kind].top_speed_mps
-        return driven_line(road, cut_m, self.wander_m.draw(of_drive), every_m, of_drive)
+    def line(self, road: Track, kind: str, generator: np.random.Generator) -> Track:
+        """Draw the line of a driver along a road of a class."""
+        cut_m = self.cut.draw(generator) * CLASSES[kind].radius_m[0]
+        spacing_m = WANDER_S * CLASSES[kind].top_speed_mps
+        return driven_line(road, cut_m, self.wander_m.draw(generator), spacing_m, generator)
 
     def limits(
-        self, kind: str, adhesion: float, friction_use: float, of_drive: np.random.Generator
+        self, kind: str, adhesion: float, friction_use: float, generator: np.random.Generator
     ) -> SpeedLimits:
-        """Draw how fast a driver goes who sees the adhesion."""
+        """Draw the speed limits of a driver who sees the adhesion."""
         return SpeedLimits(
             lateral_mps2=friction_use * adhesion * GRAVITY_MPS2,
-            acceleration_mps2=self.acceleration_mps2.draw(of_drive) * adhesion,
-            braking_mps2=self.braking_mps2.draw(of_drive) * adhesion,
-            top_speed_mps=self.top_speed.draw(of_drive) * CLASSES[kind].top_speed_mps,
+            acceleration_mps2=self.acceleration_mps2.draw(generator) * adhesion,
+            braking_mps2=self.braking_mps2.draw(generator) * adhesion,
+            top_speed_mps=self.top_speed.draw(generator) * CLASSES[kind].top_speed_mps,
         )
 
 
-# Trials: one car tested under all that it may meet, and other cars beside it.
-
-TESTED = 0
+TEST_CAR = 0
 """Number of the car under test."""
 
 
-class Mostly(Uniform):
-    """The usual value, or range, with a probability, and otherwise anything of a wider range."""
+class Mixture(Uniform):
+    """With a probability the usual value or range, otherwise a uniform distribution."""
 
     usual: NotNegative | Uniform
     share: float = Field(ge=0, le=1)
+    """Probability of `usual`."""
 
     def draw(self, generator: np.random.Generator) -> float:
-        """Draw one number; as many are drawn from the generator whichever is taken."""
+        """Draw one number. The generator advances by the same amount in both cases."""
         chosen, other = generator.random(), super().draw(generator)
         usual = self.usual.draw(generator) if isinstance(self.usual, Uniform) else self.usual
         return usual if chosen < self.share else other
 
 
 class Manoeuvres(Config):
-    """How many manoeuvres a drive has and how hard they are."""
+    """Number and severity of a drive's manoeuvres."""
 
-    per_km: Mostly
+    per_km: Mixture
     friction_use: Uniform
     """Planned lateral acceleration, or braking, over μ g."""
     duration_s: Uniform
     period_s: Uniform
-    """Of a slalom."""
+    """Period of a slalom."""
 
     def draw(
         self, track: Track, adhesion: float, generator: np.random.Generator
     ) -> tuple[Manoeuvre, ...]:
-        """Draw the script of a drive: kinds, places and sides at random."""
+        """Draw the manoeuvres of a drive: kinds, stations and sides at random."""
         count = generator.poisson(self.per_km.draw(generator) * track.length_m / 1000)
-        return tuple(self._one(track, adhesion, generator) for _ in range(count))
+        return tuple(self._manoeuvre(track, adhesion, generator) for _ in range(count))
 
-    def _one(self, track: Track, adhesion: float, generator: np.random.Generator) -> Manoeuvre:
+    def _manoeuvre(
+        self, track: Track, adhesion: float, generator: np.random.Generator
+    ) -> Manoeuvre:
         side = 1.0 if generator.random() < 0.5 else -1.0
         return Manoeuvre(
             kind=KINDS[generator.integers(len(KINDS))],
@@ -397,99 +393,100 @@ class Manoeuvres(Config):
 
 
 class TrialPlan(DrawnPlan):
-    """One car on every road, at every speed and load, and now and then one of other cars.
+    """Trials of one car on all roads, at all speeds and loads, with some drives of other cars.
 
-    The first vehicle is the tested one, mostly as usual. Lateral acceleration is planned up to a
-    share of the road's friction; above one the driver expects more than there is. Load and wear are
-    drawn for every drive, what else is imperfect about a car once for each.
+    The first vehicle is under test. The planned lateral acceleration is limited to a share of the
+    road's friction; above 1 the driver overestimates it. Load and wear are drawn for every drive,
+    all other imperfections of a car once for each car.
     """
 
     kind: Literal["trials"]
     other_every: int = Field(ge=2)
-    """Every so many drives one is of another car."""
-    others: int = Field(gt=0)
+    """One drive of this many is of another car."""
+    other_cars: int = Field(alias="others", gt=0)
     """Number of other cars, which take turns."""
-    load: Mostly
-    tyre_stiffness: Mostly
-    tyre_radius: Mostly
-    noise: Mostly
-    """Bias and noise of the inertial sensors and the gyroscope over those of `sensors`."""
-    adhesion: Mostly
-    lateral_mps2: Mostly
+    load: Mixture
+    tyre_stiffness: Mixture
+    tyre_radius: Mixture
+    noise: Mixture
+    """Bias and noise of accelerometer and gyroscope over those of `sensors`."""
+    adhesion: Mixture
+    lateral_mps2: Mixture
     friction_use: Uniform
     acceleration: Uniform
-    """Over `acceleration_mps2`."""
+    """Acceleration over `acceleration_mps2`."""
     braking: Uniform
-    """Over `braking_mps2`."""
+    """Braking over `braking_mps2`."""
     manoeuvres: Manoeuvres
-    load_kg: Annotated[Mostly | None, Field(exclude_if=lambda kg: kg is None)] = None
-    """Further load, at the place that the imperfections have for load."""
+    load_kg: Annotated[Mixture | None, Field(exclude_if=lambda kg: kg is None)] = None
+    """Additional load at `imperfections.load_position_m`."""
     tyre_wear_days: Annotated[NotNegative, Field(exclude_if=lambda days: days == 0)] = 0.0
-    """Tyres have been driven for up to so many days."""
-    drivers: Annotated[Drivers | None, Field(exclude_if=lambda one: one is None)] = None
-    """Who take lines and speeds of their own along roads of a class."""
+    """Maximum age of the tyres."""
+    drivers: Annotated[Drivers | None, Field(exclude_if=lambda drivers: drivers is None)] = None
+    """Drivers with individual lines and speeds, on roads of a class."""
 
     @model_validator(mode="after")
-    def _is_of_use(self) -> Self:
-        flaws = self.imperfections or ImperfectionRanges()
-        if (self.load_kg is None) != (flaws.load_position_m is None):
-            raise ValueError("load_kg and imperfections.load_position_m need each other")
-        if self.tyre_wear_days and flaws.tread_wear_per_100_days is None:
+    def _is_consistent(self) -> Self:
+        ranges = self.imperfections or ImperfectionRanges()
+        if (self.load_kg is None) != (ranges.load_position_m is None):
+            raise ValueError("give both load_kg and imperfections.load_position_m, or neither")
+        if self.tyre_wear_days and ranges.tread_wear_per_100_days is None:
             raise ValueError("tyre_wear_days needs imperfections.tread_wear_per_100_days")
         if self.drivers and (other := [t.name for t in self.tracks if road_class(t) is None]):
-            raise ValueError(f"drivers take roads of a class, such as country_17, not {other[0]}")
+            raise ValueError(f"drivers need roads of a class, such as country_17, not {other[0]}")
         return self
 
-    def car(self, number: int) -> int:
-        """Return the car that drives the drive of this number; `TESTED` is the one under test."""
-        turn, within = divmod(number, self.other_every)
-        return TESTED if within < self.other_every - 1 else 1 + turn % self.others
+    def car(self, index: int) -> int:
+        """Return the number of a drive's car; `TEST_CAR` is the one under test."""
+        turn, position = divmod(index, self.other_every)
+        is_test = position < self.other_every - 1
+        return TEST_CAR if is_test else 1 + turn % self.other_cars
 
     def assignment(self, drawn: DriveDraw) -> CarOnRoad:
-        """Draw a car from one generator and its drive from another, in a fixed order."""
-        sensors, of_car, of_drive = drawn.sensors, drawn.of_car, drawn.of_drive
+        """Draw a car and its drive, in a fixed order."""
+        sensors, car_rng, drive_rng = drawn.sensors, drawn.car_rng, drawn.drive_rng
         vehicle = self.vehicles[0]
-        if self.car(drawn.number) != TESTED:
-            vehicle = self.vehicles[of_car.integers(len(self.vehicles))]
-            sensors = self.sensor_bias_std.draw(sensors, of_car)
-        track = self.tracks[of_drive.integers(len(self.tracks))]
-        adhesion = self.adhesion.draw(of_drive)
-        friction = self.friction_use.draw(of_drive) * adhesion * GRAVITY_MPS2
-        lateral_mps2 = min(self.lateral_mps2.draw(of_drive), friction)
+        if self.car(drawn.index) != TEST_CAR:
+            vehicle = self.vehicles[car_rng.integers(len(self.vehicles))]
+            sensors = self.sensor_bias_std.draw(sensors, car_rng)
+        track = self.tracks[drive_rng.integers(len(self.tracks))]
+        adhesion = self.adhesion.draw(drive_rng)
+        friction = self.friction_use.draw(drive_rng) * adhesion * GRAVITY_MPS2
+        lateral_mps2 = min(self.lateral_mps2.draw(drive_rng), friction)
         limits = SpeedLimits(
             lateral_mps2=lateral_mps2,
-            acceleration_mps2=self.acceleration_mps2 * self.acceleration.draw(of_drive),
-            braking_mps2=self.braking_mps2 * self.braking.draw(of_drive),
+            acceleration_mps2=self.acceleration_mps2 * self.acceleration.draw(drive_rng),
+            braking_mps2=self.braking_mps2 * self.braking.draw(drive_rng),
             top_speed_mps=self.top_speed_mps,
         )
-        loaded_kg = vehicle.body.sprung_mass_kg * self.load.draw(of_drive)
+        loaded_kg = vehicle.body.sprung_mass_kg * self.load.draw(drive_rng)
         vehicle = vehicle.with_sprung_mass(loaded_kg).with_tyres(
-            stiffness_factor=self.tyre_stiffness.draw(of_drive),
-            rolling_radius_factor=self.tyre_radius.draw(of_drive),
+            stiffness_factor=self.tyre_stiffness.draw(drive_rng),
+            rolling_radius_factor=self.tyre_radius.draw(drive_rng),
         )
-        sensors = _noisier(sensors, self.noise.draw(of_drive))
-        script = self.manoeuvres.draw(track, adhesion, of_drive)
+        sensors = _with_noise(sensors, self.noise.draw(drive_rng))
+        script = self.manoeuvres.draw(track, adhesion, drive_rng)
         kind = road_class(track)
         if self.drivers and kind:
             use = lateral_mps2 / (adhesion * GRAVITY_MPS2)
-            limits = self.drivers.limits(kind, adhesion, use, of_drive)
-            track = self.drivers.line(track, kind, of_drive)
+            limits = self.drivers.limits(kind, adhesion, use, drive_rng)
+            track = self.drivers.line(track, kind, drive_rng)
         ranges = self.imperfections or ImperfectionRanges()
         return CarOnRoad(
-            vehicle=self._as_today(vehicle, ranges, of_drive),
+            vehicle=self._worn(vehicle, ranges, drive_rng),
             sensors=sensors,
             track=track,
             adhesion=adhesion,
             limits=limits,
             speed_factor=1.0,
             script=script,
-            flaws=ranges.draw(of_car, of_drive),
+            flaws=ranges.draw(car_rng, drive_rng),
         )
 
-    def _as_today(
+    def _worn(
         self, vehicle: VehicleParameters, ranges: ImperfectionRanges, generator: np.random.Generator
     ) -> VehicleParameters:
-        """Return the car with the further load and the worn tyres of a drive."""
+        """Return the car with the additional load and the worn tyres of a drive."""
         if self.load_kg:
             mass_kg = vehicle.body.sprung_mass_kg + self.load_kg.draw(generator)
             vehicle = ranges.loaded(vehicle, mass_kg, generator)
@@ -500,8 +497,8 @@ class TrialPlan(DrawnPlan):
         return vehicle.with_tyres(stiffness_factor=stiffer, rolling_radius_factor=smaller)
 
 
-def _noisier(sensors: Sensors, factor: float) -> Sensors:
-    """Return sensors whose accelerometer and gyroscope have so many times the bias and noise."""
+def _with_noise(sensors: Sensors, factor: float) -> Sensors:
+    """Scale bias and noise of accelerometer and gyroscope."""
     names = (
         "ax_bias_mps2",
         "ay_bias_mps2",

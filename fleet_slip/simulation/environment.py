@@ -1,8 +1,8 @@
-"""`gymnasium.make("fleet_slip/SideSlip-v0")`: what a stability controller sees, and may do.
+"""A gymnasium environment for stability controllers: `gymnasium.make("fleet_slip/SideSlip-v0")`.
 
-A car is steered through a sine with dwell (FMVSS 126: 0.7 Hz, 0.5 s at the second peak); a
-controller brakes single wheels by the signals that a fleet logs: noisy, biased, in counts.
-Importing this module registers the environment.
+A car is steered through a sine with dwell (FMVSS 126: 0.7 Hz, 0.5 s at the second peak). A
+controller brakes single wheels and observes the signals that a fleet logs, with noise, biases and
+rounding to counts. Importing this module registers the environment.
 """
 
 import math
@@ -25,7 +25,7 @@ from fleet_slip.vehicle.parameters import Constants, Controls, State, constants,
 
 
 class Moved(NamedTuple):
-    """A car after a step: its state, what the next step needs, and what its sensors felt."""
+    """A car after a step: state, slopes for the next step, and specific force."""
 
     state: State
     slopes: Slopes
@@ -44,7 +44,7 @@ def move(
     count: int,
     order: float,
 ) -> Any:
-    """Return the car after so many steps; `order` is that of the first."""
+    """Advance a car by `count` steps; `order` is that of the first."""
     ax = ay = 0.0
     for k in range(count):
         d = derivative(x, u, brakes, c)
@@ -59,14 +59,14 @@ Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")
 
 TICK_S = float(SAMPLE_TIME_S)
-STRONGEST_BRAKE_N = 5000.0
-"""Brake force at the rim of a wheel for an action of 1."""
+MAX_BRAKE_N = 5000.0
+"""Brake force at the rim of a wheel for an action of 1, in N."""
 BRAKE_LAG_S = 0.03
-"""How the hydraulic follows, a first-order lag."""
+"""First-order lag of the hydraulic, in s."""
 SINE_HZ = 0.7
 DWELL_S = 0.5
-BEGIN_S = 0.5
-LAST_S = 5.0
+START_S = 0.5
+END_S = 5.0
 LOST_SLIP_RAD = math.radians(60)
 LOST_SPEED_MPS = 0.5
 COMFORTABLE_SLIP_RAD = math.radians(5)
@@ -75,15 +75,15 @@ BRAKING_COSTS = 0.05
 
 @dataclass(frozen=True)
 class Trial:
-    """One manoeuvre: how fast, how far the steering wheel turns, on what road."""
+    """A manoeuvre: speed, amplitude of the steering wheel, adhesion of the road."""
 
     speed_mps: float
     steering_rad: float
     adhesion: float
 
     def steering_at(self, time_s: float) -> float:
-        """Return the angle of the steering wheel at a time in s: a sine with dwell, left first."""
-        phase = (time_s - BEGIN_S) * SINE_HZ
+        """Return the angle of the steering wheel in rad at a time in s; the first half is left."""
+        phase = (time_s - START_S) * SINE_HZ
         if phase >= 0.75:
             phase = max(0.75, phase - DWELL_S * SINE_HZ)
         return self.steering_rad * math.sin(2 * math.pi * phase) if 0 <= phase <= 1 else 0.0
@@ -92,11 +92,29 @@ class Trial:
 class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     """A sine with dwell; actions brake wheels.
 
-    Observation: `signals` in SI units, float32 (10,). Action: brakes fl, fr, rl, rr from 0 to 1,
-    float32 (4,), for 10 ms. Reward: minus the squared side-slip angle in units of 5 degrees, and a
-    little for braking. An episode ends when the car has spun or stopped. `info` has what no series
-    sensor measures: `sideslip_rad`, `vx_mps`, `vy_mps`, `adhesion`, `time_s` and the true
-    `yaw_rate_rad_s`.
+    The observation contains `signals` in SI units, float32 of shape (10,). An action contains the
+    brakes fl, fr, rl, rr from 0 to 1 for 10 ms, float32 of shape (4,). The reward is minus the
+    squared side-slip angle in units of 5 degrees, with a small penalty for braking. An episode ends
+    when the car has spun or stopped, or after 5 s. `info` contains what no series sensor measures:
+    `sideslip_rad`, `vx_mps`, `vy_mps`, `adhesion`, `time_s` and the true `yaw_rate_rad_s`.
+
+    Parameters
+    ----------
+    vehicle
+        Name of the car, or path of its file.
+    speed_mps, steering_rad, adhesion
+        Ranges of the trials: speed, amplitude of the steering wheel, adhesion.
+    sensors
+        False: the signals are the true ones.
+    catalog
+        Signals and configs; by default the shipped ones.
+
+    Raises
+    ------
+    ConfigError
+        If the car is unknown.
+    UsageError
+        If a range is not valid.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
@@ -110,27 +128,18 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         sensors: bool = True,
         catalog: Catalog | None = None,
     ) -> None:
-        """Choose the car and the ranges that trials are drawn from: m/s, rad at the steering wheel.
-
-        Without `sensors` the signals are true. `catalog` has the signals and the configs, by
-        default the shipped ones. Raises `ConfigError` for an unknown car and
-        `UsageError` for an invalid range.
-        """
-        for name, (least, most) in {
-            "speed_mps": speed_mps,
-            "steering_rad": steering_rad,
-            "adhesion": adhesion,
-        }.items():
-            if not 0 < least <= most < math.inf:
+        ranges = {"speed_mps": speed_mps, "steering_rad": steering_rad, "adhesion": adhesion}
+        for name, (low, high) in ranges.items():
+            if not 0 < low <= high < math.inf:
                 raise UsageError(
-                    f"{name} = ({least}, {most}): give the least and the most, above 0."
+                    f"{name} = ({low}, {high}): give a minimum and a maximum, both above 0."
                 )
         catalog = catalog or load_catalog()
         signals = [catalog.signals[name] for name in catalog.signals.inputs]
         self.signals = tuple(catalog.signals.inputs)
         self._scales = np.array([float(signal.scale) for signal in signals])
         self._limits = np.array([float(signal.max) for signal in signals])
-        # The paper's initial noise, section III.A; from car to car biases are as large as there.
+        # Noise as in section III.A of the paper. Its biases are standard deviations between cars.
         errors = load_scenario("nominal", catalog.configs).sensors.bias_and_std
         self._bias_std, self._noise = np.array([errors[name] for name in self.signals]).T
         limits = self._limits.astype(np.float32)
@@ -142,9 +151,9 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Draw a trial; `options` may fix `speed_mps`, `steering_rad` and `adhesion`."""
+        """Draw a trial; `options` may set `speed_mps`, `steering_rad` and `adhesion`."""
         super().reset(seed=seed)
-        speed, steering, adhesion = (self.np_random.uniform(*one) for one in self._ranges)
+        speed, steering, adhesion = (self.np_random.uniform(*bounds) for bounds in self._ranges)
         side = 1.0 if self.np_random.random() < 0.5 else -1.0
         drawn = {"speed_mps": speed, "steering_rad": side * steering, "adhesion": adhesion}
         self.trial = Trial(**{**drawn, **(options or {})})
@@ -155,33 +164,33 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         self._slopes = Slopes(*(0.0 for _ in Slopes._fields))
         self._brakes = np.zeros(len(WHEELS))
         self._bias = self._bias_std * self.np_random.standard_normal(len(self.signals))
-        self._ticks, self._felt = 0, (0.0, 0.0)
+        self._ticks, self._force = 0, (0.0, 0.0)
         return self._observe(), self._info()
 
     def step(
         self, action: Observation
     ) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Drive on for 10 ms."""
+        """Advance by 10 ms."""
         demanded = np.clip(np.asarray(action, dtype=float), 0.0, 1.0)
         self._brakes += (demanded - self._brakes) * (1 - math.exp(-TICK_S / BRAKE_LAG_S))
         moved = move(
             self._state,
             self._slopes,
             Controls(self.trial.steering_at(self._time_s), 0.0),
-            Wheels(*(float(STRONGEST_BRAKE_N * share) for share in self._brakes)),
+            Wheels(*(float(MAX_BRAKE_N * share) for share in self._brakes)),
             self._constants,
             STEP_S,
             round(TICK_S / STEP_S),
             SECOND_ORDER if self._ticks else FIRST_ORDER,
         )
         self._state, self._slopes = moved.state, moved.slopes
-        self._felt = (moved.ax, moved.ay)
+        self._force = (moved.ax, moved.ay)
         self._ticks += 1
         slip = self._sideslip
         lost = abs(slip) > LOST_SLIP_RAD or self._state.vx < LOST_SPEED_MPS
         reward = -((slip / COMFORTABLE_SLIP_RAD) ** 2) - BRAKING_COSTS * float(np.mean(demanded))
-        over = self._time_s >= LAST_S
-        return self._observe(), reward, bool(lost), bool(over), self._info()
+        truncated = self._time_s >= END_S
+        return self._observe(), reward, bool(lost), bool(truncated), self._info()
 
     @property
     def _time_s(self) -> float:
@@ -192,12 +201,12 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         return math.atan2(self._state.vy, self._state.vx)
 
     def _observe(self) -> Observation:
-        """Return the signals as sensors report them: biased, noisy, in counts, within range."""
+        """Return the signals with bias, noise and rounding to counts, within their ranges."""
         x, c = self._state, self._constants
         tangent = c.steer_per_wheel * x.steering_wheel
         true = {
-            "ax": self._felt[0],
-            "ay": self._felt[1],
+            "ax": self._force[0],
+            "ay": self._force[1],
             "yaw_rate": x.yaw_rate,
             "steering_wheel": x.steering_wheel,
             "steer_fl": math.atan2(tangent, 1 - c.ackermann * tangent),

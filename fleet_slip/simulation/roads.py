@@ -1,7 +1,8 @@
-"""Roads drawn by class, and the lines that drivers take along them.
+"""Tracks from files, roads drawn by class, speed profiles, surfaces, manoeuvres, driven lines.
 
-Straights and bends, arcs between clothoids, as laid out in Germany (RAL 2012, RAA 2008, RASt 06:
-parameters from a third of the radius to it); from sums and products, for the same bits.
+Drawn roads consist of straights and bends, which are arcs between clothoids with parameters from a
+third of the radius to the radius, as in German guidelines (RAL 2012, RAA 2008, RASt 06). Only sums
+and products are used, for the same bits on every machine.
 """
 
 import hashlib
@@ -25,11 +26,6 @@ from fleet_slip.simulation.imperfections import RoadImperfections
 from fleet_slip.vehicle.batch import Road, Surface
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
-# Tracks as sequences of curvature segments (`configs/tracks/*.toml`), and how fast a car follows.
-#
-# Speeds come of a forward-backward pass (Kapania, Subosits and Gerdes, 2016) within the friction
-# circle; implicit steps hold the limits exactly, and a higher limit slows no point.
-
 CLOSURE_TOLERANCE_M = 0.05
 """Largest gap between the ends of a closed track, in m."""
 
@@ -39,29 +35,29 @@ CLOSURE_TOLERANCE_RAD = 1e-3
 CONTINUITY_TOLERANCE_1PM = 1e-6
 """Largest jump of curvature between two segments, in 1/m: a car cannot follow a jump."""
 
-LONGEST_M = 1e6
-"""Longest track, in m. Its points are tabulated, which takes memory."""
+MAX_LENGTH_M = 1e6
+"""Maximum length of a track, in m: its tables take memory in proportion."""
 
-SHARPEST_1PM = 1.0
-"""Largest curvature of a track, in 1/m. No car turns so sharply; sums of much more overflow."""
+MAX_CURVATURE_1PM = 1.0
+"""Maximum curvature of a track, in 1/m. No car turns so sharply."""
 
 INTEGRATION_STEP_M = 5.0
 QUADRATURE_POINTS = 6
 
 
-Curvature = Annotated[FiniteFloat, Field(ge=-SHARPEST_1PM, le=SHARPEST_1PM)]
+Curvature = Annotated[FiniteFloat, Field(ge=-MAX_CURVATURE_1PM, le=MAX_CURVATURE_1PM)]
 
 
 class Segment(Config):
-    """A straight, an arc or a clothoid: curvature is linear in arc length between two values."""
+    """A straight, an arc or a clothoid: curvature is linear in the arc length."""
 
-    length_m: FiniteFloat = Field(gt=0, le=LONGEST_M)
+    length_m: FiniteFloat = Field(gt=0, le=MAX_LENGTH_M)
     curvature_1pm: tuple[Curvature, Curvature]
 
 
 @dataclass(frozen=True)
 class CentreLine:
-    """Points from a start at the origin along x; `heading_rad` is continuous, not wrapped."""
+    """Points of a centre line that starts at the origin along x; `heading_rad` is not wrapped."""
 
     station_m: FloatArray
     x_m: FloatArray
@@ -69,14 +65,14 @@ class CentreLine:
     heading_rad: FloatArray
 
     def at(self, station_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return x and y in m and the heading in rad at stations in m."""
+        """Return x and y in m, and the heading in rad, at stations in m."""
         along = (self.x_m, self.y_m, self.heading_rad)
         x, y, heading = (np.interp(station_m, self.station_m, values) for values in along)
         return x, y, heading
 
 
 class Track(Config):
-    """A centre line given by its curvature, positive when bending left."""
+    """A circuit or an open road, given by the curvature of its line, positive to the left."""
 
     name: Identifier
     description: str = Field(min_length=1)
@@ -85,8 +81,8 @@ class Track(Config):
 
     @model_validator(mode="after")
     def _is_not_too_long(self) -> Self:
-        if self.length_m > LONGEST_M:
-            raise ValueError(f"is {self.length_m:g} m long, at most {LONGEST_M:g} m are possible")
+        if self.length_m > MAX_LENGTH_M:
+            raise ValueError(f"is {self.length_m:g} m long: give at most {MAX_LENGTH_M:g} m")
         return self
 
     @model_validator(mode="after")
@@ -127,33 +123,33 @@ class Track(Config):
         return float(self._knots_m[-1])
 
     def curvature(self, station_m: ArrayLike) -> FloatArray:
-        """Return the curvature in 1/m at stations in m; a closed track wraps, an open one ends."""
+        """Return the curvature in 1/m at stations in m; the stations of a closed track wrap."""
         station = np.asarray(station_m, dtype=np.float64)
         if self.closed:
             station = np.mod(station, self.length_m)
         return np.interp(station, self._knots_m, self._curvature_at_knots_1pm)
 
     def grid(self, spacing_m: float) -> tuple[FloatArray, float]:
-        """Return even stations in m from 0 and their spacing, as near `spacing_m` as fits.
+        """Return even stations in m from 0, and their spacing, the nearest to `spacing_m`.
 
-        On an open track they reach its end; on a closed one the next would be the start.
+        The stations of an open track include its end, those of a closed track do not.
         """
         intervals = max(1, round(self.length_m / spacing_m))
         stations = np.linspace(0.0, self.length_m, intervals + 1)
         return (stations[:-1] if self.closed else stations), self.length_m / intervals
 
     def centre_line(self, spacing_m: float) -> CentreLine:
-        """Integrate the curvature to points about `spacing_m` apart, ends included, to rounding."""
+        """Integrate the curvature to points about `spacing_m` apart, including both ends."""
         intervals = max(1, round(self.length_m / spacing_m))
         station = np.linspace(0.0, self.length_m, intervals + 1)
         steps = np.arange(0.0, self.length_m, INTEGRATION_STEP_M)
         nodes = np.union1d(station, np.concatenate([self._knots_m, steps]))
         x, y, heading = self._integrate(nodes)
-        at = np.searchsorted(nodes, station)
-        return CentreLine(station, x[at], y[at], heading[at])
+        i = np.searchsorted(nodes, station)
+        return CentreLine(station, x[i], y[i], heading[i])
 
     def through(self, curvature_1pm: FloatArray, step_m: float) -> Self:
-        """Return a track in the place of this one, through curvatures so far apart."""
+        """Return a track of this name with other curvatures, `step_m` apart."""
         pairs = zip(curvature_1pm[:-1].tolist(), curvature_1pm[1:].tolist(), strict=True)
         segments = tuple(Segment(length_m=step_m, curvature_1pm=pair) for pair in pairs)
         return type(self)(
@@ -161,7 +157,7 @@ class Track(Config):
         )
 
     def closure(self) -> tuple[float, float]:
-        """Return how far apart the ends are: in m, and in rad beside whole turns."""
+        """Return the gap between both ends in m, and the difference of their headings in rad."""
         line = self.centre_line(self.length_m)
         turns = line.heading_rad[-1] / (2 * np.pi)
         gap_rad = 2 * np.pi * abs(turns - round(turns))
@@ -187,7 +183,7 @@ def _cumulative(increments: FloatArray) -> FloatArray:
 
 
 class SpeedLimits(Config):
-    """What the profile allows itself: the half axes of the friction ellipse, and a top speed."""
+    """Limits of a speed profile: the half axes of the friction ellipse, and a top speed."""
 
     lateral_mps2: FiniteFloat = Field(gt=0)
     acceleration_mps2: FiniteFloat = Field(gt=0)
@@ -197,7 +193,7 @@ class SpeedLimits(Config):
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Speed at the stations of `Track.grid`; periodic on a closed track."""
+    """Speed at the stations of `Track.grid`, periodic on a closed track."""
 
     track: Track
     spacing_m: float
@@ -205,22 +201,28 @@ class SpeedProfile:
     speed_mps: FloatArray
 
     def time_s(self, laps: float) -> float:
-        """Return the time from the start over laps or parts, by constant accelerations."""
+        """Return the time of a number of laps in s, at constant acceleration between stations."""
         station, speed = self.station_m, self.speed_mps
         if self.track.closed:
             station, speed = np.append(station, self.track.length_m), np.append(speed, speed[0])
         steps = 2 * np.diff(station) / (speed[:-1] + speed[1:])
         passed = np.append(0.0, np.cumsum(steps))
-        whole, part = divmod(laps, 1)
-        rest = np.interp(part * self.track.length_m, station, passed)
-        return float(whole * passed[-1] + rest)
+        full_laps, fraction = divmod(laps, 1)
+        last_lap_s = np.interp(fraction * self.track.length_m, station, passed)
+        return float(full_laps * passed[-1] + last_lap_s)
 
 
 def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedProfile:
-    """Return the fastest speed over station within the limits.
+    """Compute the fastest speed profile within the limits, by a forward and a backward pass.
 
-    With v the speed, a the acceleration along the track and κ the curvature, v <= top speed and (κ
-    v² / lateral)² + (a / a_max)² <= 1, a_max by the sign of a. Open ends take any speed.
+    With speed v, longitudinal acceleration a and curvature κ, v <= top speed and
+    (κ v² / lateral)² + (a / a_max)² <= 1, with a_max for acceleration or braking. Implicit steps
+    hold the limits exactly, and a higher limit never lowers a speed. Open ends have no limit.
+
+    References
+    ----------
+    N. R. Kapania, J. Subosits, J. C. Gerdes, "A sequential two-step algorithm for fast generation
+    of vehicle racing trajectories" (2016).
     """
     station_m, step_m = track.grid(spacing_m)
     load = np.abs(track.curvature(station_m)) / limits.lateral_mps2
@@ -233,57 +235,55 @@ def speed_profile(track: Track, limits: SpeedLimits, spacing_m: float) -> SpeedP
 
 @kernel
 def _pass(cap: FloatArray, load: FloatArray, gain: float, periodic: bool) -> FloatArray:
-    """Limit how fast the squared speed w rises from point to point.
+    """Limit the increase of the squared speed w from point to point.
 
-    The next w is the larger root of ((w - w_before) / gain)² + (load w)² = 1, gain = 2 Δs a_max, at
-    most its cap. A closed track begins at its slowest point.
+    The next w is the larger root of ((w - w_previous) / gain)² + (load w)² = 1, at most its cap,
+    with gain = 2 Δs a_max. A closed track starts at its slowest point.
     """
     count = len(cap)
-    first = np.argmin(cap) if periodic else 0
     squared = cap.copy()
-    at = first
+    i = np.argmin(cap) if periodic else 0
     for _ in range(1, count):
-        before = squared[at]
-        at = at + 1 if at + 1 < count else 0
-        if before < cap[at]:
-            k2 = load[at] ** 2
-            root = gain * np.sqrt(1 + k2 * (gain**2 - before**2))
-            squared[at] = min(cap[at], (before + root) / (1 + k2 * gain**2))
+        previous = squared[i]
+        i = i + 1 if i + 1 < count else 0
+        if previous < cap[i]:
+            k2 = load[i] ** 2
+            root = gain * np.sqrt(1 + k2 * (gain**2 - previous**2))
+            squared[i] = min(cap[i], (previous + root) / (1 + k2 * gain**2))
     return squared
 
 
-# The surface of a drive's road: slopes of the track, adhesion and wind of the drive.
-#
-# Drawn at knots and linear in between, periodic on a closed track.
+# The surface of a road: slopes belong to the track, adhesion and wind to the drive. They are drawn
+# at knots, linear in between, and periodic on a closed track.
 
 KNOTS_M = 60.0
-"""Distance of the knots: the length of a bend, a patch or a gust."""
+"""Distance of the knots in m: the length of a bend, a patch or a gust."""
 
-SHARP_1PM = 0.01
-"""Curvature from which on a bend has all of its superelevation."""
+FULL_SUPERELEVATION_1PM = 0.01
+"""Curvature in 1/m above which a bend has its full superelevation."""
 
-LEAST_GRIP = 0.1
+MIN_GRIP = 0.1
 
 
 def surface(
     road: RoadImperfections,
     track: Track,
     station_m: FloatArray,
-    of_track: np.random.Generator,
-    of_drive: np.random.Generator,
+    track_rng: np.random.Generator,
+    drive_rng: np.random.Generator,
 ) -> Surface | None:
-    """Return the surface at the stations of a track's grid; None for a perfect road."""
+    """Draw the surface at the stations of a track's grid; None for an ideal road."""
     if road == RoadImperfections():
         return None
     curvature = track.curvature(station_m)
-    bank = _along(track, station_m, of_track)
-    grade = _along(track, station_m, of_track)
-    change, split, gust = (_along(track, station_m, of_drive) for _ in range(3))
-    wind_x, wind_y = of_drive.standard_normal(2).tolist()
+    bank = _along(track, station_m, track_rng)
+    grade = _along(track, station_m, track_rng)
+    change, split, gust = (_along(track, station_m, drive_rng) for _ in range(3))
+    wind_x, wind_y = drive_rng.standard_normal(2).tolist()
     share = road.wind_mps / math.sqrt(wind_x * wind_x + wind_y * wind_y)
     fall = (
         road.cross_slope_percent
-        - road.superelevation_percent * np.clip(curvature / SHARP_1PM, -1.0, 1.0)
+        - road.superelevation_percent * np.clip(curvature / FULL_SUPERELEVATION_1PM, -1.0, 1.0)
         + road.bank_std_percent * bank
     ) / 100
     climb = road.grade_std_percent * grade / 100
@@ -293,27 +293,27 @@ def surface(
     return Surface(
         gravity_x_mps2=-GRAVITY_MPS2 * climb / np.sqrt(1 + climb * climb),
         gravity_y_mps2=-GRAVITY_MPS2 * fall / np.sqrt(1 + fall * fall),
-        grip_left=np.maximum(grip + half, LEAST_GRIP),
-        grip_right=np.maximum(grip - half, LEAST_GRIP),
+        grip_left=np.maximum(grip + half, MIN_GRIP),
+        grip_right=np.maximum(grip - half, MIN_GRIP),
         cross_wind_mps=_across(curvature, spacing_m, share * wind_x, share * wind_y)
         + road.gust_std_mps * gust,
     )
 
 
 def _along(track: Track, station_m: FloatArray, generator: np.random.Generator) -> FloatArray:
-    """Return standard normal numbers at knots, of mean zero over the track, between them linear."""
+    """Draw standard normal numbers at knots, with mean zero over the track, linear in between."""
     knots = max(2, round(track.length_m / KNOTS_M))
     values = generator.standard_normal(knots)
     values = values - np.sum(values) / knots
-    at_m = np.arange(knots) * (track.length_m / knots)
+    knots_m = np.arange(knots) * (track.length_m / knots)
     if track.closed:
-        at_m, values = np.append(at_m, track.length_m), np.append(values, values[0])
-    return np.interp(station_m, at_m, values)
+        knots_m, values = np.append(knots_m, track.length_m), np.append(values, values[0])
+    return np.interp(station_m, knots_m, values)
 
 
 @kernel
 def _across(curvature: FloatArray, spacing_m: float, wind_x: float, wind_y: float) -> FloatArray:
-    """Return a wind's part across the track; its heading is a unit vector turned by points."""
+    """Return the component of a wind across the track, whose heading is a rotated unit vector."""
     across = np.empty(len(curvature))
     cosine, sine = 1.0, 0.0
     for i in range(len(curvature)):
@@ -325,88 +325,81 @@ def _across(curvature: FloatArray, spacing_m: float, wind_x: float, wind_y: floa
     return across
 
 
-# Manoeuvres: what a driver does besides following the track, as changes of the road before him.
-#
-# Steps and slaloms are added curvature, braking a dip of the speed: no law or kernel knows them.
+# Manoeuvres are changes of the road that the driver follows: steps and slaloms add curvature,
+# braking reduces the target speed. Driver and kernel need no code for them.
 
 Kind = Literal["step", "slalom", "braking"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 SLOWEST_MPS = 4.0
-"""A car does not brake below this speed, nor is a manoeuvre planned for less."""
+"""Lower bound of the speed in manoeuvres, in m/s."""
 
-DEEPEST_DIP = 0.45
-"""Largest part of the speed that braking takes."""
+MAX_DIP = 0.45
+"""Largest relative reduction of the speed by braking."""
 
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """One manoeuvre on each lap.
-
-    Attributes:
-        kind: a step to one side and back, a slalom in sines, or braking and speeding up again.
-        station_m: where it begins.
-        duration_s: how long it takes at the planned speed.
-        strength_mps2: planned lateral acceleration, first to the left, or deceleration.
-        period_s: of a slalom, how long one swing to each side takes together.
-    """
+    """A manoeuvre on each lap."""
 
     kind: Kind
+    """A step to one side and back, a slalom in sines, or braking and accelerating again."""
     station_m: float
+    """Start of the manoeuvre."""
     duration_s: float
+    """Duration at the planned speed."""
     strength_mps2: float
+    """Planned lateral acceleration, first to the left, or deceleration."""
     period_s: float
+    """Period of a slalom."""
 
 
 def road_with(road: Road, script: Sequence[Manoeuvre]) -> Road:
-    """Return a road with manoeuvres, one after the other; without any it is the same road."""
+    """Return a road with manoeuvres, applied in order; without any, the same road."""
     if not script:
         return road
     curvature, speed = road.curvature_1pm.copy(), road.speed_mps.copy()
     station: FloatArray = np.arange(len(speed), dtype=np.float64) * road.spacing_m
-    for one in script:
-        planned = max(float(np.interp(one.station_m, station, speed)), SLOWEST_MPS)
-        ahead: FloatArray = station - one.station_m
+    for manoeuvre in script:
+        planned = max(float(np.interp(manoeuvre.station_m, station, speed)), SLOWEST_MPS)
+        ahead: FloatArray = station - manoeuvre.station_m
         if road.closed:
             ahead %= road.length_m
-        passed: FloatArray = ahead / (one.duration_s * planned)
-        inside = (passed >= 0) & (passed < 1)
-        curvature[inside] += _bend_of(one, passed[inside]) / planned**2
-        if one.kind == "braking":
-            dip = min(DEEPEST_DIP, abs(one.strength_mps2) * one.duration_s / 2 / planned)
-            speed[inside] *= 1.0 - dip * (1.0 - np.abs(2 * passed[inside] - 1))
+        progress: FloatArray = ahead / (manoeuvre.duration_s * planned)
+        inside = (progress >= 0) & (progress < 1)
+        curvature[inside] += _lateral_mps2(manoeuvre, progress[inside]) / planned**2
+        if manoeuvre.kind == "braking":
+            dip = abs(manoeuvre.strength_mps2) * manoeuvre.duration_s / 2 / planned
+            speed[inside] *= 1.0 - min(MAX_DIP, dip) * (1.0 - np.abs(2 * progress[inside] - 1))
     return road._replace(curvature_1pm=curvature, speed_mps=np.maximum(speed, SLOWEST_MPS))
 
 
-def _bend_of(one: Manoeuvre, passed: FloatArray) -> FloatArray:
-    """Return the further lateral acceleration at the shares of the manoeuvre that have passed."""
-    if one.kind == "step":
-        return one.strength_mps2 * np.where(passed < 0.5, 1.0, -1.0)
-    if one.kind == "slalom":
-        swings = max(1, round(one.duration_s / one.period_s))
-        return one.strength_mps2 * np.sin(2 * math.pi * swings * passed)
-    return np.zeros(len(passed))
+def _lateral_mps2(manoeuvre: Manoeuvre, progress: FloatArray) -> FloatArray:
+    """Return the additional lateral acceleration, given the progress from 0 to 1."""
+    if manoeuvre.kind == "step":
+        return manoeuvre.strength_mps2 * np.where(progress < 0.5, 1.0, -1.0)
+    if manoeuvre.kind == "slalom":
+        swings = max(1, round(manoeuvre.duration_s / manoeuvre.period_s))
+        return manoeuvre.strength_mps2 * np.sin(2 * math.pi * swings * progress)
+    return np.zeros(len(progress))
 
 
-# Random numbers that depend on what they are for, and on nothing else.
-
-
-def random_generator(seed: int, *identity: str) -> np.random.Generator:
-    """Return a generator that depends on the seed and on what it is for, and on nothing else."""
-    digest = hashlib.sha256("\n".join(identity).encode()).digest()
+def random_generator(seed: int, *purpose: str) -> np.random.Generator:
+    """Return a generator that depends on the seed and its purpose only."""
+    digest = hashlib.sha256("\n".join(purpose).encode()).digest()
     words = np.frombuffer(digest, dtype="<u4").tolist()
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, *words])))
 
 
 LINE_STEP_M = 2.0
-"""Distance of the points of a driver's line."""
+"""Distance of the points of a driver's line, in m."""
 
 WANDER_S = 2.0
-"""A driver wanders about his line, with a new offset every so many seconds at top speed."""
+"""Time between two offsets of a wandering driver at top speed, in s."""
 
 
 class RoadClass(NamedTuple):
-    """What roads of a class are like. Bends are mostly near the smaller radius."""
+    """Dimensions of the roads of a class. Most bends are near the smaller radius."""
 
     radius_m: tuple[float, float]
     turn_deg: tuple[float, float]
@@ -422,13 +415,13 @@ CLASSES = {
     "motorway": RoadClass((400.0, 3000.0), (5.0, 40.0), (200.0, 900.0), 6000.0, 45.0),
     "switchback": RoadClass((8.0, 25.0), (100.0, 190.0), (40.0, 200.0), 1500.0, 18.0),
 }
-"""From RAL 2012, RAA 2008 and RASt 06; hill roads and switchbacks are older than any rule."""
+"""Dimensions from RAL 2012, RAA 2008 and RASt 06. No guideline has hill roads and switchbacks."""
 
 _NAME = re.compile(rf"({'|'.join(CLASSES)})_(\d{{1,9}})")
 
 
 def load_track(name_or_path: str, configs: Configs) -> Track:
-    """Read a track by name or path, or draw `country_17`: class, seed. Raises `ConfigError`."""
+    """Read a track by name or path, or draw a road such as `country_17` (class, seed)."""
     drawn = _NAME.fullmatch(name_or_path)
     if drawn:
         return draw_road(drawn[1], int(drawn[2]))
@@ -436,13 +429,13 @@ def load_track(name_or_path: str, configs: Configs) -> Track:
 
 
 def road_class(track: Track) -> str | None:
-    """Return the class of a road that was drawn; None for any other track."""
+    """Return the class of a drawn road, None for a track from a file."""
     drawn = _NAME.fullmatch(track.name)
     return drawn[1] if drawn else None
 
 
 def draw_road(kind: str, seed: int) -> Track:
-    """Draw a road of a class of `CLASSES`. It is open, and its ends are straight."""
+    """Draw an open road of a class of `CLASSES`, with straight ends."""
     road, generator = CLASSES[kind], random_generator(seed, "road", kind)
     segments = [_straight(road, generator)]
     while sum(segment.length_m for segment in segments) < road.length_m:
@@ -460,10 +453,10 @@ def _straight(road: RoadClass, generator: np.random.Generator) -> Segment:
 
 
 def _bend(road: RoadClass, generator: np.random.Generator) -> list[Segment]:
-    least, most = road.radius_m
-    radius_m = least + (most - least) * generator.random() ** 2
+    min_m, max_m = road.radius_m
+    radius_m = min_m + (max_m - min_m) * generator.random() ** 2
     turn_rad = generator.uniform(*road.turn_deg) * (math.pi / 180)
-    spiral_rad = min(generator.uniform(1 / 3, 1.0) ** 2, turn_rad)  # what both clothoids turn
+    spiral_rad = min(generator.uniform(1 / 3, 1.0) ** 2, turn_rad)  # angle of each clothoid
     side = 1.0 if generator.random() < 0.5 else -1.0
     bend = side / radius_m
     shapes = [
@@ -482,30 +475,31 @@ def driven_line(
     road: Track,
     cut_m: float,
     wander_m: float,
-    wander_every_m: float,
-    of_driver: np.random.Generator,
+    wander_spacing_m: float,
+    generator: np.random.Generator,
 ) -> Track:
-    """Return the line that a driver takes along a road.
+    """Draw the line of a driver along a road.
 
-    He cuts bends: curvature is the road's mean from `cut_m` behind to `cut_m` ahead. He wanders:
-    cubic splines through offsets of deviation `wander_m`, `wander_every_m` apart.
+    The driver cuts bends: the line's curvature is the mean of the road's from `cut_m` behind to
+    `cut_m` ahead. The driver wanders: a cubic spline through random offsets is added, with the
+    standard deviation `wander_m` and the distance `wander_spacing_m`.
     """
     points = max(2, round(road.length_m / LINE_STEP_M)) + 1
     station_m = np.linspace(0.0, road.length_m, points)
-    curvature = _mean_around(road, station_m, cut_m)
-    knots = max(4, round(road.length_m / wander_every_m))
-    offsets_m = wander_m * of_driver.standard_normal(knots)
+    curvature = _mean_curvature(road, station_m, cut_m)
+    knots = max(4, round(road.length_m / wander_spacing_m))
+    offsets_m = wander_m * generator.standard_normal(knots)
     bends = np.zeros(knots)
-    bends[1:-1] = (offsets_m[:-2] - 2 * offsets_m[1:-1] + offsets_m[2:]) / wander_every_m**2
+    bends[1:-1] = (offsets_m[:-2] - 2 * offsets_m[1:-1] + offsets_m[2:]) / wander_spacing_m**2
     curvature = curvature + np.interp(station_m, np.linspace(0.0, road.length_m, knots), bends)
     return road.through(curvature, road.length_m / (points - 1))
 
 
-def _mean_around(road: Track, station_m: FloatArray, reach_m: float) -> FloatArray:
-    """Return the mean of a road's curvature from so far behind to so far ahead."""
+def _mean_curvature(road: Track, station_m: FloatArray, reach_m: float) -> FloatArray:
+    """Return the mean curvature of a road within `reach_m` of stations."""
     if reach_m <= 0:
         return road.curvature(station_m)
     shares = np.linspace(-1.0, 1.0, 21)
-    near = [road.curvature(station_m + share * reach_m) for share in shares]
-    mean: FloatArray = np.sum(near, axis=0) / len(near)
+    curvatures = [road.curvature(station_m + share * reach_m) for share in shares]
+    mean: FloatArray = np.sum(curvatures, axis=0) / len(curvatures)
     return mean

@@ -1,6 +1,7 @@
-"""Scenarios: test drives that models are evaluated on, read from `configs/scenarios/*.toml`.
+"""Scenarios: test drives for the evaluation of models, read from `configs/scenarios/*.toml`.
 
-Each says in what it differs from its base; its drive has a source of its own, and trains none.
+A scenario contains its differences from a base. Its drive has the source `scenario`, which training
+excludes.
 """
 
 import re
@@ -22,20 +23,20 @@ from fleet_slip.simulation.sensors import GPS_SIGNALS, Sensors
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 DAY = date(2024, 4, 1)
-"""The date that all scenario drives carry."""
+"""Date of all scenario drives."""
 
 NOT_INHERITED = frozenset({"name", "description", "paper", "base", "drive", "failures"})
-"""What a scenario says of itself alone."""
+"""Keys that a scenario does not inherit from its base."""
 
 
 class Failure(Config):
-    """Sensors that fail for a while: `stuck` at the count of `from_s`, or `missing`, when read."""
+    """A failure of sensors: `stuck` at the count of `from_s`, or `missing`."""
 
     kind: Literal["stuck", "missing"]
     signals: tuple[Identifier, ...] = Field(min_length=1)
     from_s: NotNegative
     until_s: Positive | None = None
-    """None: to the end of the drive."""
+    """End of the failure; None: the end of the drive."""
 
     @model_validator(mode="after")
     def _signals_are_measured(self, info: ValidationInfo) -> Self:
@@ -50,20 +51,20 @@ class Failure(Config):
 
 
 class Scenario(Config):
-    """One test drive, and what fails in it."""
+    """A test drive, and the failures of its sensors."""
 
     name: Identifier
     description: str = Field(min_length=1)
     paper: str | None = None
-    """The figures and tables of the paper that show this situation; None goes beyond the paper."""
+    """Figures and tables of the paper with this situation; None: not in the paper."""
     base: Identifier | None = None
     drive: Identifier
-    """Whose drive this is: its own, or that of the base if nothing but failures is added."""
+    """Scenario whose drive this is: itself, or the base if only failures differ."""
     vehicle: NamedVehicle
     sprung_mass_kg: Positive | None = None
-    """None: that of the vehicle's file."""
+    """Sprung mass including the load; None: that of the vehicle's file."""
     load_position_m: FiniteFloat | None = None
-    """Where the load beyond that sits, before the centre of gravity; None: at that place."""
+    """Position of the load before the empty car's centre of gravity; None: at it."""
     tyre_stiffness: Positive = 1.0
     """Cornering stiffness over that of the vehicle's file."""
     tyre_radius: Positive = 1.0
@@ -71,16 +72,16 @@ class Scenario(Config):
     track: NamedTrack
     adhesion: Positive
     limits: SpeedLimits
-    """Planned for a dry road whatever the road is: the driver does not see it."""
+    """Speed limits on a dry road: the driver does not see the adhesion."""
     pace: tuple[PacePoint, ...] = ()
     laps: Positive
     seed: int = Field(ge=0)
     sensors: Sensors
     imperfections: Imperfections = NONE
-    """What car, sensors and road have beyond the textbook's."""
+    """Imperfections of car, sensors and road."""
     failures: tuple[Failure, ...] = ()
-    traffic: Annotated[Traffic | None, Field(exclude_if=lambda one: one is None)] = None
-    """Where highway-env drives, in the place of the track."""
+    traffic: Annotated[Traffic | None, Field(exclude_if=lambda traffic: traffic is None)] = None
+    """Traffic that highway-env drives in, instead of the track."""
 
     @model_validator(mode="before")
     @classmethod
@@ -106,12 +107,12 @@ class Scenario(Config):
 
     @property
     def drive_id(self) -> str:
-        """Name of the drive in the logs. No campaign's drive can have it."""
+        """Name of the drive in the logs, which no drive of a campaign can have."""
         return f"{SCENARIO}-{self.drive}"
 
     @property
     def way(self) -> Track:
-        """The track, or what stands for it where highway-env drives."""
+        """The track, or its placeholder in traffic."""
         return self.traffic.track if self.traffic else self.track
 
     @property
@@ -125,7 +126,7 @@ class Scenario(Config):
         return tyred.with_sprung_mass(self.sprung_mass_kg, self.load_position_m)
 
     def batch(self) -> Batch:
-        """Return the drive as the simulation job takes it."""
+        """Return the drive as a batch to simulate."""
         drive = DriveSpec(
             drive_id=self.drive_id,
             vehicle_id=self.drive_id,
@@ -150,7 +151,7 @@ class Scenario(Config):
 def _complete(
     content: Mapping[str, Any], derived: tuple[str, ...], info: ValidationInfo
 ) -> dict[str, Any]:
-    """Fill in what a scenario takes from its base. Raises `ValueError`."""
+    """Complete a scenario by the values of its base. Raises `ValueError` if it is not valid."""
     name, base = content.get("name"), content.get("base")
     if "drive" in content:
         raise ValueError("drive follows from the base and cannot be given")
@@ -163,21 +164,21 @@ def _complete(
     changes = sorted(set(content) - NOT_INHERITED)
     if "failures" in content and changes:
         raise ValueError(
-            f"a scenario with failures takes the drive of its base as it is, without "
+            f"a scenario with failures uses the drive of its base unchanged: remove "
             f"{', '.join(changes)}"
         )
     drive = inherited["drive"] if "failures" in content else name
-    kept = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
-    return {**merged(kept, content), "drive": drive}
+    inherited = {key: value for key, value in inherited.items() if key not in NOT_INHERITED}
+    return {**merged(inherited, content), "drive": drive}
 
 
 def load_scenario(name_or_path: str, configs: Configs) -> Scenario:
-    """Read a scenario by name or path. Raises `ConfigError`."""
+    """Read a scenario by name or path. Raises `ConfigError` if it is missing or not valid."""
     return load_config(configs.find("scenarios", name_or_path), Scenario, configs)
 
 
 def load_scenarios(configs: Configs) -> tuple[Scenario, ...]:
-    """Return all scenarios: the paper's first, in the order of its figures."""
+    """Read all scenarios: first those of the paper, in the order of its figures."""
 
     def place_in_paper(scenario: Scenario) -> tuple[bool, list[int], str]:
         numbers = [int(number) for number in re.findall(r"\d+", scenario.paper or "")]

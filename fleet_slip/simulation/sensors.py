@@ -1,4 +1,4 @@
-"""What a car's sensors report: bias, white noise and lost GPS fixes, then integer counts."""
+"""Sensors of a car: imperfections, bias, white noise, GPS outages, and integer counts."""
 
 import math
 from collections.abc import Mapping
@@ -17,31 +17,29 @@ from fleet_slip.simulation.imperfections import Imperfections
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
-# Signals that come late, by a delay or a low-pass, and errors that last (Gauss-Markov).
-
 
 class Delay:
-    """A signal that comes late; between samples it is linear, before the first one constant."""
+    """A delay. The signal is linear between samples and constant before the first."""
 
     def __init__(self, latency_s: float) -> None:
         self._ticks = latency_s / SAMPLE_S
-        self._before: FloatArray | None = None
+        self._previous: FloatArray | None = None
 
     def apply(self, values: FloatArray) -> FloatArray:
         """Return the next block, delayed."""
         if self._ticks == 0.0:
             return values
-        whole = math.floor(self._ticks)
-        if self._before is None:
-            self._before = np.full(whole + 1, values[0])
-        return _delayed(values, self._before, self._ticks - whole)
+        full_ticks = math.floor(self._ticks)
+        if self._previous is None:
+            self._previous = np.full(full_ticks + 1, values[0])
+        return _delayed(values, self._previous, self._ticks - full_ticks)
 
 
 class LowPass:
-    """A low-pass of first order, by the trapezoidal rule."""
+    """A low-pass filter of first order, by the trapezoidal rule."""
 
     def __init__(self, bandwidth_hz: float) -> None:
-        """Take the frequency at which the gain is −3 dB; 0 for no low-pass."""
+        """Design the filter with a gain of −3 dB at `bandwidth_hz`; 0: no filter."""
         half = math.pi * bandwidth_hz * SAMPLE_S
         self._gain = half / (1 + half)
         self._last: tuple[float, float] | None = None
@@ -50,46 +48,46 @@ class LowPass:
         """Return the next block, filtered."""
         if self._gain == 0.0:
             return values
-        before, output = self._last or (values[0], values[0])
-        filtered = _low_pass(values, float(before), float(output), self._gain)
+        previous, output = self._last or (values[0], values[0])
+        filtered = _low_pass(values, float(previous), float(output), self._gain)
         self._last = (values[-1], filtered[-1])
         return filtered
 
 
 @kernel
-def _delayed(values: FloatArray, before: FloatArray, part: float) -> FloatArray:
-    """Return values `len(before) - 1 + part` samples late; `before` is the last block's end."""
-    first, ticks = len(before), len(values)
-    late = np.empty(ticks)
+def _delayed(values: FloatArray, previous: FloatArray, fraction: float) -> FloatArray:
+    """Delay values by `len(previous) - 1 + fraction` samples; update `previous`, the last ones."""
+    first, ticks = len(previous), len(values)
+    delayed = np.empty(ticks)
     for i in range(min(first, ticks)):
-        newer = before[i + 1] if i + 1 < first else values[i + 1 - first]
-        late[i] = (1.0 - part) * newer + part * before[i]
+        newer = previous[i + 1] if i + 1 < first else values[i + 1 - first]
+        delayed[i] = (1.0 - fraction) * newer + fraction * previous[i]
     for i in range(first, ticks):
-        late[i] = (1.0 - part) * values[i + 1 - first] + part * values[i - first]
+        delayed[i] = (1.0 - fraction) * values[i + 1 - first] + fraction * values[i - first]
     if ticks < first:
-        before[: first - ticks] = before[ticks:].copy()
-        before[first - ticks :] = values
+        previous[: first - ticks] = previous[ticks:].copy()
+        previous[first - ticks :] = values
     else:
-        before[:] = values[ticks - first :]
-    return late
+        previous[:] = values[ticks - first :]
+    return delayed
 
 
 @kernel
-def _low_pass(values: FloatArray, before: float, output: float, gain: float) -> FloatArray:
+def _low_pass(values: FloatArray, previous: float, output: float, gain: float) -> FloatArray:
     filtered = np.empty(len(values))
     for i in range(len(values)):
-        output += gain * (values[i] + before - 2.0 * output)
-        before = values[i]
+        output += gain * (values[i] + previous - 2.0 * output)
+        previous = values[i]
         filtered[i] = output
     return filtered
 
 
 KNOT_TICKS = 10
-"""Samples between the times for which an error is drawn; in between it is linear."""
+"""Samples between two drawn errors; in between, errors are linear."""
 
 
-class Wander:
-    """Processes of mean 0 and deviation 1 that forget within a correlation time, block or not."""
+class GaussMarkov:
+    """Correlated noise: first-order Gauss-Markov processes of mean 0 and standard deviation 1."""
 
     def __init__(self, count: int, correlation_s: float, generator: np.random.Generator) -> None:
         decay = 1.0 - KNOT_TICKS * SAMPLE_S / correlation_s
@@ -111,7 +109,7 @@ class Wander:
 def _wander(
     drawn: FloatArray, ends: FloatArray, phase: int, step: tuple[float, float], values: FloatArray
 ) -> int:
-    """Fill in values between the knots `ends`, shape (2, processes); return how far they reach."""
+    """Interpolate between the knots `ends`, shape (2, processes); return the new phase."""
     decay, kick = step
     knot = 0
     for i in range(values.shape[1]):
@@ -127,58 +125,57 @@ def _wander(
     return phase
 
 
-# What sensors make of the truth, block by block, before bias and noise: place, tilt, delay ...
-
-
 class Pulses:
-    """A wheel speed sensor that times the pulses of an encoder's teeth.
+    """A wheel speed sensor that measures the time between the pulses of an encoder.
 
-    It reports pulses over the time since the last report; without one, at most one just now.
+    It reports the number of pulses over the time since the previous report. Without a pulse, the
+    report is at most one pulse over the time since the last one.
     """
 
-    def __init__(self, places: FloatArray) -> None:
-        self._places = places
+    def __init__(self, offsets: FloatArray) -> None:
+        """Take the offsets of the teeth from their nominal positions, in pulses."""
+        self._offsets = offsets
         self._state = np.zeros(5)
-        self._begun = False
+        self._started = False
 
     def apply(self, speed_rad_s: FloatArray) -> FloatArray:
-        """Return the next block as the sensor reports it."""
-        if not self._begun:
+        """Return the reports of the next block."""
+        if not self._started:
             self._state[:] = 0.0, 0.0, 0.0, speed_rad_s[0], speed_rad_s[0]
-            self._begun = True
-        return _timed_pulses(speed_rad_s, self._places, self._state)
+            self._started = True
+        return _timed_pulses(speed_rad_s, self._offsets, self._state)
 
 
 @kernel
-def _timed_pulses(speed: FloatArray, places: FloatArray, state: FloatArray) -> FloatArray:
-    """Fill in reports; `state`: turned pulses, last pulse, its age, speed before, report."""
-    turned, last, since, before, report = state
-    count = len(places)
+def _timed_pulses(speed: FloatArray, offsets: FloatArray, state: FloatArray) -> FloatArray:
+    """Compute reports. `state`: rotation in pulses, last pulse, its age, previous speed, report."""
+    rotation, last, since, previous, report = state
+    count = len(offsets)
     per_sample = count * SAMPLE_S / (2.0 * math.pi)
     reports = np.empty(len(speed))
-    start = last - int(last) % count  # of the turn; a division for every pulse would take longest
+    start = last - int(last) % count  # of the revolution; avoids a division for every pulse
     for i in range(len(speed)):
-        step = 0.5 * (before + speed[i]) * per_sample
-        turned += step
+        step = 0.5 * (previous + speed[i]) * per_sample
+        rotation += step
         since += 1.0
-        pulse = math.floor(turned)
+        pulse = math.floor(rotation)
         while pulse >= start + count:
             start += count
         while pulse < start:
             start -= count
         tooth = int(pulse - start)
-        while pulse > last and turned < pulse + places[tooth]:
+        while pulse > last and rotation < pulse + offsets[tooth]:
             pulse -= 1.0
             tooth = tooth - 1 if tooth > 0 else count - 1
         if pulse > last and step > 0.0:
-            ago = (turned - pulse - places[tooth]) / step
+            ago = (rotation - pulse - offsets[tooth]) / step
             report = (pulse - last) / (max(since - ago, 1e-3) * per_sample)
             last, since = pulse, ago
         elif since > 0.0:
             report = min(report, 1.0 / (since * per_sample))
         reports[i] = report
-        before = speed[i]
-    state[0], state[1], state[2], state[3], state[4] = turned, last, since, before, report
+        previous = speed[i]
+    state[0], state[1], state[2], state[3], state[4] = rotation, last, since, previous, report
     return reports
 
 
@@ -190,15 +187,15 @@ LABEL = "sideslip_rad"
 
 
 class Distortion:
-    """The sensors of one car in one drive."""
+    """Imperfect sensors of a car in one drive, block by block, before bias and noise."""
 
     def __init__(
-        self, flaws: Imperfections, of_car: np.random.Generator, of_drive: np.random.Generator
+        self, flaws: Imperfections, car_rng: np.random.Generator, drive_rng: np.random.Generator
     ) -> None:
-        """Draw the pulses' places from the car's generator, all else from the drive's."""
+        """Draw the encoders from the car's generator; other errors come from the drive's."""
         sensors = flaws.sensors
         self._flaws = flaws
-        self._generator = of_drive
+        self._generator = drive_rng
         self._delays = {name: Delay(sensors.inertial_latency_s) for name in INERTIAL}
         self._delays |= {name: Delay(sensors.steering_latency_s) for name in STEERING}
         self._delays |= {name: Delay(sensors.wheel_latency_s) for name in WHEELS}
@@ -208,73 +205,74 @@ class Distortion:
         self._filters[LABEL] = LowPass(sensors.label_bandwidth_hz)
         pulses = sensors.wheel_pulses_per_turn
         self._pulses = {
-            name: Pulses(sensors.wheel_pitch_error * of_car.standard_normal(pulses))
+            name: Pulses(sensors.wheel_pitch_error * car_rng.standard_normal(pulses))
             for name in WHEELS
             if pulses
         }
-        self._gps: Wander | None = None
+        self._gps: GaussMarkov | None = None
 
     def apply(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return the next block as the sensors see it, with satellite velocity besides."""
-        seen = {**truth, **self._accelerations(truth), **self._angles(truth)}
+        """Return the next block as the sensors measure it, with satellite velocity."""
+        measured = {**truth, **self._accelerations(truth), **self._angles(truth)}
         for name, pulses in self._pulses.items():
-            seen[name] = pulses.apply(truth[name])
-        seen |= self._satellite(truth)
-        for name, low_pass in self._filters.items():
-            seen[name] = low_pass.apply(seen[name])
-        for name, delay in self._delays.items():
-            seen[name] = delay.apply(seen[name])
-        return seen
+            measured[name] = pulses.apply(truth[name])
+        measured |= self._satellite(truth)
+        for steps in (self._filters, self._delays):
+            for name, step in steps.items():
+                measured[name] = step.apply(measured[name])
+        return measured
 
     def _accelerations(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return what the inertial unit feels at its place on a leaning body.
+        """Return the measurements of the inertial unit at its position on a rolling body.
 
-        At (x, y): ax − r² x − ṙ y, ay + ṙ x − r² y, and for roll φ and pitch θ a part of the
-        weight's reaction, g sin φ, g sin θ (Kidambi et al. 2014).
+        At (x, y) the specific force is ax − r² x − ṙ y, ay + ṙ x − r² y. Roll φ and pitch θ add the
+        components g sin φ and g sin θ of gravity (Kidambi et al. 2014).
         """
         sensors, car = self._flaws.sensors, self._flaws.car
         r, turning = truth["yaw_rate_rad_s"], truth["yaw_acceleration_rad_s2"]
-        place = sensors.inertial_x_m, sensors.inertial_y_m
-        turned = (
+        position = sensors.inertial_x_m, sensors.inertial_y_m
+        mounting = (
             math.radians(sensors.inertial_roll_deg),
             math.radians(sensors.inertial_pitch_deg),
             math.radians(sensors.inertial_yaw_deg),
         )
-        lean = (
+        gradients = (
             math.radians(car.roll_gradient_deg_per_g) / GRAVITY_MPS2,
             math.radians(car.pitch_gradient_deg_per_g) / GRAVITY_MPS2,
         )
-        moving = truth["ax_mps2"], truth["ay_mps2"], r, turning
-        leaning = truth["leaning_ax_mps2"], truth["leaning_ay_mps2"]
-        return dict(zip(INERTIAL, _feel(moving, leaning, place, turned, lean), strict=True))
+        motion = truth["ax_mps2"], truth["ay_mps2"], r, turning
+        lagged = truth["leaning_ax_mps2"], truth["leaning_ay_mps2"]
+        measured = _inertial_unit(motion, lagged, position, mounting, gradients)
+        return dict(zip(INERTIAL, measured, strict=True))
 
     def _angles(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         sensors = self._flaws.sensors
         scale = 1 + sensors.wheel_angle_scale_error
-        left, right = sensors.wheel_angle_offset_fl_deg, sensors.wheel_angle_offset_fr_deg
+        offset_fl = math.radians(sensors.wheel_angle_offset_fl_deg)
+        offset_fr = math.radians(sensors.wheel_angle_offset_fr_deg)
         return {
             "steering_wheel_rad": truth["steering_wheel_rad"]
             + math.radians(sensors.steering_offset_deg),
-            "steer_fl_rad": scale * truth["steer_fl_rad"] + math.radians(left),
-            "steer_fr_rad": scale * truth["steer_fr_rad"] + math.radians(right),
+            "steer_fl_rad": scale * truth["steer_fl_rad"] + offset_fl,
+            "steer_fr_rad": scale * truth["steer_fr_rad"] + offset_fr,
             LABEL: truth[LABEL] + math.radians(sensors.label_offset_deg),
         }
 
     def _satellite(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return satellite velocity in the car's frame, turned by the error of the heading."""
+        """Return satellite velocity in the car's frame, rotated by the error of the heading."""
         sensors = self._flaws.sensors
         vx, vy = truth["vx_mps"], truth["vy_mps"]
         if not (sensors.gps_heading_std_deg or sensors.gps_velocity_std_mps):
             return {"gps_vx_mps": vx, "gps_vy_mps": vy}
-        self._gps = self._gps or Wander(3, sensors.gps_correlation_s, self._generator)
+        self._gps = self._gps or GaussMarkov(3, sensors.gps_correlation_s, self._generator)
         errors = self._gps.next(len(vx))
         std = math.radians(sensors.gps_heading_std_deg), sensors.gps_velocity_std_mps
-        return dict(zip(GPS, _turned_velocity(vx, vy, errors, std), strict=True))
+        return dict(zip(GPS, _satellite_velocity(vx, vy, errors, std), strict=True))
 
 
 @equation
 def _sine(angle: float) -> float:
-    """Return the sine of an angle below 0.3 rad to 2e-5, the same bits everywhere."""
+    """Return the sine of an angle below 0.3 rad with an error of 2e-5, portable to the bit."""
     return angle * (1.0 - angle * angle / 6.0)
 
 
@@ -284,37 +282,37 @@ def _cosine(angle: float) -> float:
 
 
 @kernel
-def _feel(
-    moving: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    leaning: tuple[FloatArray, FloatArray],
-    place: tuple[float, float],
-    turned: tuple[float, float, float],
-    lean: tuple[float, float],
+def _inertial_unit(
+    motion: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    lagged: tuple[FloatArray, FloatArray],
+    position: tuple[float, float],
+    mounting: tuple[float, float, float],
+    gradients: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the accelerations and the yaw rate that the unit feels, see `_accelerations`."""
-    ax, ay, rate, turning = moving
-    leaning_ax, leaning_ay = leaning
-    (x, y), (roll, pitch, yaw), (per_ay, per_ax) = place, turned, lean
+    """Return accelerations and yaw rate at the inertial unit; see `Distortion._accelerations`."""
+    ax, ay, rate, turning = motion
+    lagged_ax, lagged_ay = lagged
+    (x, y), (roll, pitch, yaw), (per_ay, per_ax) = position, mounting, gradients
     ticks = len(ax)
-    felt_ax, felt_ay, felt_rate = np.empty(ticks), np.empty(ticks), np.empty(ticks)
+    unit_ax, unit_ay, unit_rate = np.empty(ticks), np.empty(ticks), np.empty(ticks)
     for i in range(ticks):
         r = rate[i]
-        here_x = ax[i] - r * r * x - turning[i] * y
-        here_y = ay[i] + turning[i] * x - r * r * y
-        phi, theta = per_ay * leaning_ay[i] + roll, per_ax * leaning_ax[i] + pitch
-        level_x = _cosine(theta) * here_x + GRAVITY_MPS2 * _sine(theta)
-        level_y = _cosine(phi) * here_y + GRAVITY_MPS2 * _sine(phi)
-        felt_ax[i] = level_x + yaw * level_y
-        felt_ay[i] = level_y - yaw * level_x
-        felt_rate[i] = _cosine(phi) * r
-    return felt_ax, felt_ay, felt_rate
+        local_x = ax[i] - r * r * x - turning[i] * y
+        local_y = ay[i] + turning[i] * x - r * r * y
+        phi, theta = per_ay * lagged_ay[i] + roll, per_ax * lagged_ax[i] + pitch
+        level_x = _cosine(theta) * local_x + GRAVITY_MPS2 * _sine(theta)
+        level_y = _cosine(phi) * local_y + GRAVITY_MPS2 * _sine(phi)
+        unit_ax[i] = level_x + yaw * level_y
+        unit_ay[i] = level_y - yaw * level_x
+        unit_rate[i] = _cosine(phi) * r
+    return unit_ax, unit_ay, unit_rate
 
 
 @kernel
-def _turned_velocity(
+def _satellite_velocity(
     vx: FloatArray, vy: FloatArray, errors: FloatArray, std: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocity with errors of heading and of both components, given their deviations."""
+    """Add errors of heading and of both components, with these standard deviations."""
     heading, error_x, error_y = errors
     heading_std, velocity_std = std
     seen_x, seen_y = np.empty(len(vx)), np.empty(len(vx))
@@ -327,18 +325,18 @@ def _turned_velocity(
 
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
 GPS_SIGNALS = {"gps_vx": "vx_mps", "gps_vy": "vy_mps"}
-"""The signals that are null between fixes, each with the true column that it measures."""
+"""Signals that are null between fixes, with the column of the truth that each measures."""
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 EXACT = (0.0, 0.0)
-"""Bias and standard deviation of a signal that is not measured but known."""
+"""Bias and standard deviation of a signal without errors."""
 
 
 class Gps(Config):
-    """Satellite navigation: velocity at its own rate, and stretches without a fix.
+    """Satellite navigation: velocity at a rate of its own, with outages.
 
-    Outages, and the times between them, are exponentially distributed.
+    Durations of outages, and times between them, are exponentially distributed.
     """
 
     rate_hz: int = Field(gt=0)
@@ -350,12 +348,12 @@ class Gps(Config):
     @classmethod
     def _rate_divides_sample_rate(cls, rate_hz: int) -> int:
         if SAMPLE_RATE_HZ % rate_hz:
-            raise ValueError(f"{rate_hz} Hz does not divide {SAMPLE_RATE_HZ} Hz")
+            raise ValueError(f"give a divisor of {SAMPLE_RATE_HZ} Hz, not {rate_hz} Hz")
         return rate_hz
 
 
 class Sensors(Config):
-    """Bias and standard deviation of white noise of one car's sensors."""
+    """Bias and white noise of a car's sensors."""
 
     ax_bias_mps2: FiniteFloat
     ay_bias_mps2: FiniteFloat
@@ -370,7 +368,7 @@ class Sensors(Config):
 
     @property
     def bias_and_std(self) -> dict[str, tuple[float, float]]:
-        """Bias and standard deviation of the signals at the full rate, in their SI units."""
+        """Bias and standard deviation of the signals at the full rate, in SI units."""
         wheel, steer = (0.0, self.wheel_speed_std_rad_s), (0.0, self.steer_std_rad)
         return {
             "ax": (self.ax_bias_mps2, self.acceleration_std_mps2),
@@ -389,21 +387,22 @@ class Sensors(Config):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One drive in counts: an int16 array per signal in catalog order, one value a tick.
-
-    `gps_fix`: where GPS is valid; `saturated`: values clipped to the signal's valid range.
-    """
+    """A drive in counts."""
 
     counts: dict[str, NDArray[np.int16]]
+    """One array for each signal, in the order of the catalog, with one value for each tick."""
     gps_fix: BoolArray
+    """Ticks with a valid GPS fix."""
     saturated: int
+    """Number of values that were clipped to the signal's valid range."""
 
 
 class Recorder:
-    """What the sensors of one car report of one drive, recorded block by block.
+    """Records the reports of a car's sensors in one drive, block by block.
 
-    For every block white noise is drawn by signal, then GPS outages, then GPS noise: counts depend
-    on the cut. Signals without an entry in `Sensors.bias_and_std` are exact.
+    For each block, white noise is drawn signal by signal, then GPS outages, then GPS noise, so that
+    counts depend on the size of the blocks. Signals without an entry in `Sensors.bias_and_std` have
+    no errors.
     """
 
     def __init__(
@@ -424,7 +423,7 @@ class Recorder:
         self._saturated = 0
 
     def record(self, truth: Mapping[str, FloatArray]) -> None:
-        """Measure the next block, float64 by SI column but GPS; a missing one is not measured."""
+        """Measure the next block of true values by SI column; skip signals without a column."""
         ticks = len(next(iter(truth.values())))
         if self._distortion is not None:
             truth = self._distortion.apply(truth)
@@ -436,7 +435,7 @@ class Recorder:
             if name in errors:
                 self._generator.standard_normal(out=noise, dtype=np.float32)
             error = errors.get(name, EXACT)
-            self._keep(name, *noisy_counts(truth[signal.column], noise, error, signal))
+            self._append(name, *noisy_counts(truth[signal.column], noise, error, signal))
         self._record_gps(truth, ticks)
         self._ticks += ticks
 
@@ -446,20 +445,20 @@ class Recorder:
         for name, column in GPS_SIGNALS.items():
             if name not in self._signals.signals:
                 continue
-            seen = truth.get(self._signals[name].column)
-            fixed = (truth[column] if seen is None else seen)[fix]
+            distorted = truth.get(self._signals[name].column)
+            fixed = (truth[column] if distorted is None else distorted)[fix]
             noise = self._generator.standard_normal(len(fixed), dtype=np.float32)
             std = self._sensors.gps.velocity_std_mps
             counts = np.zeros(ticks, dtype=np.int16)
             counts[fix], clipped = noisy_counts(fixed, noise, (0.0, std), self._signals[name])
-            self._keep(name, counts, clipped)
+            self._append(name, counts, clipped)
 
-    def _keep(self, name: str, counts: NDArray[np.int16], clipped: int) -> None:
+    def _append(self, name: str, counts: NDArray[np.int16], clipped: int) -> None:
         self._counts.setdefault(name, []).append(counts)
         self._saturated += clipped
 
     def measurement(self) -> Measurement:
-        """Return all blocks as one measurement, once, at the end: their memory is given back."""
+        """Join all blocks to one measurement and release them. Call it once, at the end."""
         return Measurement(
             {
                 name: _joined(self._counts.pop(name))
@@ -471,8 +470,8 @@ class Recorder:
         )
 
 
-def _joined(parts: list[NDArray[Scalar]]) -> NDArray[Scalar]:
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+def _joined(blocks: list[NDArray[Scalar]]) -> NDArray[Scalar]:
+    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
 
 def noisy_counts(
@@ -481,7 +480,7 @@ def noisy_counts(
     bias_and_std: tuple[float, float],
     signal: Signal,
 ) -> tuple[NDArray[np.int16], int]:
-    """Return `(physical + bias + std * noise) / scale`, halves to even; count clipped and NaN."""
+    """Quantise `(physical + bias + std * noise) / scale`, halves to even; count clipped values."""
     counts = np.empty(len(physical), dtype=np.int16)
     valid = (float(signal.min_count), float(signal.max_count))
     clipped = _quantise(physical, noise, bias_and_std, float(signal.scale), valid, counts)
@@ -497,14 +496,14 @@ def _quantise(
     valid: tuple[float, float],
     counts: NDArray[np.int16],
 ) -> int:
-    """Fill `counts` in one pass over memory and return how many were clipped."""
+    """Write `counts` in one pass over memory; return the number of clipped values and NaN."""
     bias, std = bias_and_std
     lowest, highest = valid
     clipped = 0
     for i in range(len(physical)):
         count = np.rint((physical[i] + (bias + std * noise[i])) / scale)
         within = lowest <= count <= highest
-        # A comparison with NaN is false: NaN takes the lower end and never reaches the cast.
+        # A comparison with NaN is false: NaN becomes the lower bound and never reaches the cast.
         inside = min(count, highest) if count >= lowest else lowest
         counts[i] = np.int16(inside)
         clipped += 0 if within else 1
@@ -512,28 +511,28 @@ def _quantise(
 
 
 class Outages:
-    """When a drive has a GPS fix: once a period, and never in an outage."""
+    """GPS fixes of a drive: one each period, none in an outage."""
 
     def __init__(self, gps: Gps, generator: np.random.Generator) -> None:
         self._gps = gps
         self._generator = generator
-        self._begin_s = 0.0
+        self._start_s = 0.0
         self._end_s = 0.0
 
     def fixes(self, first: int, ticks: int) -> BoolArray:
-        """Return for so many ticks from a first one, the next ones, whether there is a fix."""
+        """Return which of the next ticks have a fix; `first` is the number of the first."""
         period = SAMPLE_RATE_HZ // self._gps.rate_hz
         fix = np.zeros(ticks, dtype=np.bool_)
         fix[-first % period :: period] = True
         self._clear(fix, first)
         while self._end_s * SAMPLE_RATE_HZ < first + ticks:
-            self._begin_s = self._end_s + self._generator.exponential(
+            self._start_s = self._end_s + self._generator.exponential(
                 self._gps.time_between_outages_s
             )
-            self._end_s = self._begin_s + self._generator.exponential(self._gps.outage_duration_s)
+            self._end_s = self._start_s + self._generator.exponential(self._gps.outage_duration_s)
             self._clear(fix, first)
         return fix
 
     def _clear(self, fix: BoolArray, first: int) -> None:
-        begin, end = (int(s * SAMPLE_RATE_HZ) - first for s in (self._begin_s, self._end_s))
-        fix[max(begin, 0) : max(end, 0)] = False
+        start, end = (int(s * SAMPLE_RATE_HZ) - first for s in (self._start_s, self._end_s))
+        fix[max(start, 0) : max(end, 0)] = False

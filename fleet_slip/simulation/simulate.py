@@ -1,8 +1,7 @@
-"""Writes what is missing of a campaign: each batch of drives is a file that lands exactly once.
+"""Simulates the drives of a campaign and commits them to the logs.
 
-What a campaign lands in the logs, and whether it did: batches of drives, and complete days.
-
-Units of work, their version made of what defines them: a changed campaign is noticed.
+Each batch of drives becomes one file, committed once by an application transaction. Its version is
+derived from the content of the batch, so that a changed campaign is detected.
 """
 
 import time
@@ -32,33 +31,31 @@ from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# From drives to the rows of a log: choose the speed, drive the car, measure, tabulate counts.
-
 DRIVES_AT_ONCE = 128
-"""Drives of a batch that are simulated together, which bounds the memory for their roads."""
+"""Drives that are simulated together. It limits the memory for their roads."""
 
 TOLERANCE = 1e-9
-"""By how much of its largest value a quantity may depart from highway-env's."""
+"""Largest difference from highway-env, relative to the largest value of a quantity."""
 
 CHUNK_ROWS = 2**16
-"""Rows of a chunk of a column that is the same in all rows of a drive."""
+"""Rows of a chunk of a column that is constant in a drive."""
 
 
 @dataclass(frozen=True)
 class DriveLog:
-    """One drive as its car logged it."""
+    """The log of a drive."""
 
     spec: DriveSpec
     measurement: Measurement
     lost_control_s: float | None
     fixes: Measurement | None = None
-    """What its satellite receiver logged, if the campaign has receivers."""
+    """Log of the satellite receiver, if the campaign has receivers."""
     motion: Mapping[str, FloatArray] = field(default_factory=dict)
-    """The channels of `MOTION` at 100 Hz, not rounded to counts, if they were asked for."""
+    """Requested channels of the truth at 100 Hz, not rounded to counts."""
 
     @property
     def signals(self) -> set[str]:
-        """Names of the signals that it has."""
+        """Names of the logged signals."""
         return {*self.measurement.counts, *(self.fixes.counts if self.fixes else ())}
 
     @property
@@ -68,7 +65,7 @@ class DriveLog:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """The columns of `SignalCatalog.drive_schema`."""
+        """Values of the columns of `SignalCatalog.drive_schema`."""
         spec = self.spec
         return {
             "drive_id": spec.drive_id,
@@ -89,7 +86,7 @@ class DriveLog:
 
 
 def lane_drive(spec: DriveSpec) -> LaneDrive:
-    """Return the drive as the simulator takes it."""
+    """Return a drive as the input of the simulator."""
     profile = spec.profile
     road = Road(
         spacing_m=profile.spacing_m,
@@ -104,13 +101,13 @@ def lane_drive(spec: DriveSpec) -> LaneDrive:
 
 
 def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
-    """Drive the first seconds of the first drive by highway-env too, in a slalom.
+    """Compare the first seconds of the first drive with highway-env, in a slalom.
 
-    Raises `RefusedError` if the kernel, or highway-env or its traffic, is not what it was.
+    Raises `RefusedError` if the kernel, highway-env or its traffic differs from the tested version.
     """
-    from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - takes a second
+    from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - imports highway-env
 
-    for name in sorted({name for one in drives if one.traffic for name in one.traffic.roads}):
+    for name in sorted({name for spec in drives if spec.traffic for name in spec.traffic.roads}):
         from fleet_slip.simulation.traffic import require_known_traffic  # noqa: PLC0415 - as above
 
         require_known_traffic(name)
@@ -124,10 +121,10 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
 
 
 def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
-    """Simulate and measure the drives of a batch, a function of the batch alone.
+    """Simulate and measure the drives of a batch. The result depends on the batch alone.
 
-    Columns are in the order of `SignalCatalog.log_schema`, without unlogged extras, strings as
-    dictionaries; rows by drive, then tick.
+    Columns are in the order of `SignalCatalog.log_schema`, without extra signals that no drive has.
+    Strings are dictionaries. Rows are in the order of drives and ticks.
     """
     logs: list[DriveLog] = []
     for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
@@ -136,15 +133,15 @@ def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
 
 
 MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
-"""What of the truth an evaluation needs, as no sensor measures it."""
+"""Channels of the truth that an evaluation needs and no sensor measures."""
 
 
 def simulate_logs(
     signals: SignalCatalog, specs: Sequence[DriveSpec], channels: Sequence[str] = ()
 ) -> list[DriveLog]:
-    """Simulate drives together, each measured block by block by its own sensors and generator.
+    """Simulate drives together and measure each block by block with its own sensors.
 
-    The logs' motion has the named channels of the truth.
+    `motion` of the logs contains the named channels of the truth.
     """
     recorders = [Recorder(signals, s.sensors, s.generator(), s.distortion()) for s in specs]
     receivers = [
@@ -156,8 +153,8 @@ def simulate_logs(
     for block in simulate_blocks([lane_drive(spec) for spec in specs]):
         recorder, receiver = recorders[block.drive], receivers[block.drive]
         truth = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
-        for name, parts in motions[block.drive].items():
-            parts.append(truth[name].copy())
+        for name, values in motions[block.drive].items():
+            values.append(truth[name].copy())
         recorder.record(truth)
         if receiver:
             receiver.record(truth)
@@ -168,13 +165,13 @@ def simulate_logs(
                 recorder.measurement(),
                 None if lost is None else lost / SAMPLE_RATE_HZ,
                 receiver.measurement() if receiver else None,
-                {name: np.concatenate(parts) for name, parts in motions[block.drive].items()},
+                {name: np.concatenate(values) for name, values in motions[block.drive].items()},
             )
     return [logs[drive] for drive in range(len(specs))]
 
 
 def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[str, FloatArray]:
-    """Return channels with the velocity so far before the centre of gravity, and its angle."""
+    """Move velocity and side-slip angle to a point `reference_m` before the centre of gravity."""
     if not reference_m:
         return channels
     vy_mps = channels["vy_mps"] + reference_m * channels["yaw_rate_rad_s"]
@@ -183,7 +180,7 @@ def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[st
 
 
 def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
-    """Return the rows of the logs as one table."""
+    """Return the rows of logs as a table."""
     rows = [log.rows for log in logs]
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
     for column in signals.drive_schema:
@@ -200,15 +197,15 @@ def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> 
 
 
 def _counts(log: DriveLog, name: str) -> pa.Array:
-    one = log.fixes if log.fixes and name in log.fixes.counts else log.measurement
-    if name not in one.counts:
+    source = log.fixes if log.fixes and name in log.fixes.counts else log.measurement
+    if name not in source.counts:
         return pa.nulls(log.rows, pa.int16())
-    by_fixes = one is log.fixes or name in GPS_SIGNALS
-    return pa.array(one.counts[name], mask=~one.gps_fix if by_fixes else None)
+    at_fixes = source is log.fixes or name in GPS_SIGNALS
+    return pa.array(source.counts[name], mask=~source.gps_fix if at_fixes else None)
 
 
 def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
-    """Return each value so many times, strings as a dictionary; chunks of a drive share memory."""
+    """Repeat each value, strings as a dictionary; the chunks of a drive share their memory."""
     encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
     chunks = []
     for drive, count in enumerate(times):
@@ -234,31 +231,31 @@ def day_name(campaign: str, day: date) -> str:
 
 
 def has_landed(snapshot: Snapshot, transaction: AppTransaction) -> bool:
-    """Whether a transaction is in the logs. Raises `RefusedError` if another version of it is."""
+    """Return True if a transaction is in the logs. Raises `RefusedError` for another version."""
     landed = snapshot.landed(transaction.name)
     if landed not in (None, transaction.version):
         _, campaign, day, *_ = transaction.name.split("/")
         raise RefusedError(
-            f"{day}: the campaign {campaign!r} was changed since this day was simulated, and logs "
-            "are never replaced. Give the changed campaign another name, or use another data root."
+            f"{day}: the campaign {campaign!r} has changed since this day was simulated. Logs are "
+            "not replaced. Give the changed campaign another name, or use another data root."
         )
     return landed is not None
 
 
 @dataclass
 class SimulationReport(Answer):
-    """What a run of the job did."""
+    """Result of a simulation."""
 
     batches_written: int = 0
     batches_present: int = 0
-    """Batches of the days that were planned that had landed before."""
+    """Batches of incomplete days that were in the logs before."""
     days_present: int = 0
-    """Days that were complete, and so not planned."""
+    """Days that were complete before."""
     drives: int = 0
     drives_checked: int = 0
-    """Drives, one a file, whose first seconds are as highway-env drives them."""
+    """Drives that were compared with highway-env, one for each file."""
     drives_forgotten: int = 0
-    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    """Drives that were skipped, because they or their cars are erased."""
     rows: int = 0
     size_bytes: int = 0
     logs_version: int | None = None
@@ -267,13 +264,13 @@ class SimulationReport(Answer):
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """True if logs were written."""
         return bool(self.batches_written)
 
     def parts(self) -> Iterator[Part]:
-        """Return what was written, and what was compared with highway-env."""
+        """Return the counts of drives, rows and files, and of drives compared with highway-env."""
         if not self.changed:
-            yield Remark(f"{self.campaign}: nothing to do, all is simulated")
+            yield Remark(f"{self.campaign}: nothing to do, all days are simulated")
             return
         drives, rows = pluralize(self.drives, "drive"), pluralize(self.rows, "row")
         yield Remark(
@@ -291,9 +288,9 @@ class SimulationReport(Answer):
 class _Written:
     batch: Batch
     drives: tuple[DriveSpec, ...]
-    """Those of the batch that were not forgotten."""
+    """Drives of the batch that are not erased."""
     action: AddAction | None
-    """What adds their file; None without drives."""
+    """The file of the drives; None without drives."""
     rows: int
 
 
@@ -304,28 +301,28 @@ def simulate_campaign(
     executor: Executor,
     progress: Progress = no_progress,
 ) -> SimulationReport:
-    """Simulate what has not landed of the given days of a campaign, and land each batch.
+    """Simulate and commit the batches of days that are not in the logs.
 
-    A day is planned in its turn; a complete one is recorded and never planned again, so that nights
-    stay short for years. Raises like `simulate_batches`.
+    Days are planned one by one. A complete day is recorded and never planned again, so that nightly
+    runs stay short. Raises as `simulate_batches`.
     """
     snapshot = warehouse.logs.snapshot()
-    every = tuple(days)
-    open_days = _open_days(snapshot, campaign, every)
+    days = tuple(days)
+    open_days = _open_days(snapshot, campaign, days)
     for day in open_days:  # before anything is written, so that a changed campaign is refused
         if snapshot.landed(f"{day_name(campaign.name, day)}/0") is not None:
             for batch in campaign.batches(day):
                 has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress)
-    report.campaign, report.days_present = campaign.name, len(every) - len(open_days)
+    report.campaign, report.days_present = campaign.name, len(days) - len(open_days)
     _complete(warehouse, campaign, open_days)
     report.logs_version = warehouse.logs.snapshot().version
     return report
 
 
 def _open_days(snapshot: Snapshot, campaign: Campaign, days: Iterable[date]) -> list[date]:
-    """Return the days not recorded as complete. Raises `RefusedError` for a changed campaign."""
+    """Return the incomplete days. Raises `RefusedError` for a changed campaign."""
     return [day for day in days if not has_landed(snapshot, day_transaction(campaign, day))]
 
 
@@ -345,11 +342,10 @@ def simulate_batches(
     executor: Executor,
     progress: Progress = no_progress,
 ) -> SimulationReport:
-    """Simulate the batches that have not landed, and land each.
+    """Simulate and commit the batches that are not in the logs.
 
-    Raises `RefusedError` if a different version of a batch is there or the cars do not drive as
-    highway-env's, `StorageError`, and at the end
-    `ClusterError` for batches that workers died of.
+    Raises `RefusedError` if the logs contain another version of a batch or a car departs from
+    highway-env, `StorageError`, and at the end `ClusterError` for batches whose workers died.
     """
     snapshot = warehouse.logs.snapshot()
     for batch in batches:
@@ -369,7 +365,7 @@ def _simulate(
     days_planned = rows = 0
 
     def backlog() -> Iterator[Batch]:
-        """Yield batches that have not landed, planned day by day as they are asked for."""
+        """Yield the missing batches, planned day by day on demand."""
         nonlocal days_planned, rows
         for batches in plan:
             missing = [
@@ -380,27 +376,27 @@ def _simulate(
             rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
             yield from missing
 
-    for _, result in run_tasks(executor, partial(_write, warehouse), backlog(), _name):
-        if landed := _land(warehouse, result):
+    for _, result in run_tasks(executor, partial(_write, warehouse), backlog(), _task_name):
+        if landed := _commit(warehouse, result):
             report.batches_written += 1
             report.drives += len(landed.drives)
             report.drives_checked += bool(landed.drives)
             report.drives_forgotten += len(landed.batch.drives) - len(landed.drives)
             report.rows += landed.rows
             report.size_bytes += landed.action.size if landed.action else 0
-        # The rows of days that are not planned yet are taken to be like the others'.
+        # Days that are not planned yet are assumed to have the mean number of rows.
         progress(result.rows, rows * days // days_planned)
     report.logs_version = warehouse.logs.snapshot().version
     report.seconds = time.perf_counter() - start
     return report
 
 
-def _name(batch: Batch) -> str:
+def _task_name(batch: Batch) -> str:
     return f"{batch.campaign}, {batch.day}, file {batch.index}"
 
 
 def _write(warehouse: Warehouse, batch: Batch) -> _Written:
-    drives = _not_forgotten(warehouse, batch.drives)
+    drives = _not_erased(warehouse, batch.drives)
     if not drives:
         return _Written(batch, (), None, 0)
     check_against_highway_env(drives)
@@ -410,7 +406,7 @@ def _write(warehouse: Warehouse, batch: Batch) -> _Written:
     return _Written(batch, drives, action, rows.num_rows)
 
 
-def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
+def _not_erased(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
     erased = ErasureLog(warehouse.root).erased(
         {drive.vehicle_id for drive in drives}, {drive.drive_id for drive in drives}
     )
@@ -421,15 +417,15 @@ def _not_forgotten(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple
     )
 
 
-def _land(warehouse: Warehouse, written: _Written) -> _Written | None:
-    """Commit a batch, and return what has landed; None if another process landed it first."""
+def _commit(warehouse: Warehouse, written: _Written) -> _Written | None:
+    """Commit a batch and return it; None if another process committed it first."""
 
     def attempt() -> _Written | None:
         nonlocal written
         snapshot = warehouse.logs.snapshot()
         landed = has_landed(snapshot, batch_transaction(written.batch))
-        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
-        while landed or written.drives != _not_forgotten(warehouse, written.drives):
+        # Read after the snapshot: a later erasure makes this commit a conflict.
+        while landed or written.drives != _not_erased(warehouse, written.drives):
             warehouse.logs.discard(_files(written))
             if landed:
                 return None

@@ -20,7 +20,7 @@ def bent_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         done_on(root, "gram", "--features", "motion")
-        done_on(root, "publish", "bent", "--features", "motion", "--nested", FEATURES)
+        done_on(root, "publish", "bent", "--features", "motion", "--order", FEATURES)
 
     return made_once(tmp_path_factory, "bent", make)
 

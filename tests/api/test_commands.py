@@ -110,7 +110,7 @@ def test_running_again_selects_again_where_anything_is_new(tmp_path: Path) -> No
 
     assert [selects(), selects()] == [True, False]
     assert {*steps} >= {"simulate smoke", "gram signals"}
-    assert selects(worth="50%")
+    assert selects(tolerance="50%")
     assert selects(name="other")
     assert not selects()
     assert selects(name="other", models=str(short))
@@ -123,7 +123,7 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
     diagnosis = cohort.diagnose("bent")
     assert diagnosis.fitted.model.signals == fleet.model("bent").manifest.signals
     assert cohort.diagnose(fleet.model("bent")).drives == diagnosis.drives
-    subset = cohort.select(nested="ay,yaw_rate", all_subsets=True, criterion="bic")
+    subset = cohort.select(order="ay,yaw_rate", all_subsets=True, criterion="bic")
     assert subset.choice and subset.choice.subsets
     with pytest.raises(UsageError, match="not both"):
         cohort.diagnose("bent", signals="ay")

@@ -68,7 +68,7 @@ def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Rules that let small differences pass: of few drives they are large. One file is verified."""
     own = tmp_path_factory.mktemp("forgiving") / "configs"
     with (
-        champions_by(own, "worth_deg = 0.025", "worth_deg = 1.0  "),
+        champions_by(own, "tolerance_deg = 0.025", "tolerance_deg = 1.0  "),
         pytest.MonkeyPatch.context() as patch,
     ):
         patch.setattr(nightly, "SAMPLE_FILES", 1)
@@ -154,7 +154,7 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
             matrix = np.column_stack([told[name].astype(np.int64) for name in names])
             gram = Gram.from_counts(names, matrix)
             rows.append(row_of(gram, f"VIN{car}", START_S + 86_400 * night))
-        fleet.ingest_counted(write_counted(tmp_path / f"{night}", rows))
+        fleet.import_onboard_grams(write_counted(tmp_path / f"{night}", rows))
         report = give(place, night)
         assert (report.exit_code, report.drives, report.champion) == (
             0,
@@ -307,7 +307,7 @@ def test_what_means_nothing_is_refused_before_anything_is_written(
     with pytest.raises(UsageError, match="no/name"):
         fleet.nightly(tmp_path, "m", "no/name")
     with pytest.raises(UsageError, match="much"):
-        fleet.nightly(tmp_path, "m", "name", worth="much")
+        fleet.nightly(tmp_path, "m", "name", tolerance="much")
     assert not (tmp_path / "data").exists()
 
 

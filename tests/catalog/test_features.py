@@ -34,7 +34,7 @@ from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import load_model_list
 from fleet_slip.quality.course_relation import CourseRelation, relate
 from fleet_slip.regression.gram import Gram, GramTable
@@ -220,7 +220,9 @@ def test_a_feature_that_is_not_integer_arithmetic_on_inputs_is_refused(
 
 
 def cohort_gram(warehouse: Warehouse, feature_set: str, signals: list[str]) -> Gram:
-    table: GramTable = load_cohort(warehouse, "true", feature_set).serving(signals[:-1]).table
+    table: GramTable = (
+        load_cohort(warehouse, "true", feature_set).complete_cases(signals[:-1]).table
+    )
     assert table.signals == tuple(signals)
     return table.total()
 
@@ -244,7 +246,7 @@ def test_a_set_costs_one_pass_and_stands_beside_the_others(warehouse: Warehouse)
     assert not update_grams(warehouse, feature_set="motion").changed
     signals = [*INPUTS, LABEL]
     assert cohort_gram(warehouse, "motion", signals) == cohort_gram(warehouse, "signals", signals)
-    with_curvature = load_cohort(warehouse, "true", "motion").serving(["ay", "curvature"])
+    with_curvature = load_cohort(warehouse, "true", "motion").complete_cases(["ay", "curvature"])
     assert 0 < with_curvature.table.total().n < 500
     assert with_curvature.drives.num_rows == 2
     land(warehouse, "two", drive("c", 100, 3))
@@ -297,10 +299,10 @@ def test_a_drive_with_several_gram_rows_is_one_drive(warehouse: Warehouse) -> No
     cohort = load_cohort(warehouse, "true", "motion")
     assert len(cohort.drives) > 2
     assert cohort.drive_count == 2
-    served = cohort.serving(["ay", "yaw_rate"])
+    served = cohort.complete_cases(["ay", "yaw_rate"])
     assert served.drives["drive_id"].to_pylist() == ["a", "b"]
     assert served.table.n.tolist() == [300, 300]
-    moving = cohort.serving(["ay", "curvature"])
+    moving = cohort.complete_cases(["ay", "curvature"])
     assert int(moving.table.n[moving.drives["drive_id"].to_pylist().index("a")]) == 200
 
 

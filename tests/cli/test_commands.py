@@ -96,12 +96,12 @@ def test_select_reports_the_models_in_the_list_s_order(
     assert min(report["models"], key=lambda model: model["rmse_deg"])["name"] == "5"
     for worth, winner in (
         ((), "2"),
-        (("--worth", "0.000001deg"), "5"),
-        (("--worth", "1deg"), "1"),
+        (("--tolerance", "0.000001deg"), "5"),
+        (("--tolerance", "1deg"), "1"),
     ):
         asked = run_command(*listed, *worth, root=smoke_root).json
         assert asked["winner"] == winner
-    table = run_command("select", "--nested", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
+    table = run_command("select", "--order", "ay,yaw_rate,steering_wheel", root=smoke_root).stdout
     assert "first 3" in table
     assert "winner: " in table
 
@@ -143,14 +143,14 @@ def test_publish_show_score_promote_and_roll_back(
     same = ("publish", "slip", "--models", "table1", "--cohort", "campaign = 'smoke'", "--json")
     made = [run_command(*same).json for _ in range(2)]
     assert [(one["version"], one["new"]) for one in made] == [(1, True), (1, False)]
-    alone = ("--nested", "ax")
+    alone = ("--order", "ax")
     worse = run_command("publish", "slip", *alone)
     assert worse.exit_code == 7
     assert "worse than the champion" in worse.stderr
-    other = run_command("publish", "smoke", "--nested", "ax")  # its columns are windows
+    other = run_command("publish", "smoke", "--order", "ax")  # its columns are windows
     assert other.exit_code == 7
     assert "cannot be compared: these drives lack" in other.stderr
-    assert "to compare on it: --features windows" in other.stderr
+    assert "its feature set is windows" in other.stderr
     forced = run_command("publish", "slip", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "slip", "--json").json["version"] == 2
@@ -195,7 +195,7 @@ FORGED = (
         (["monitor", "smoke", "--cohort", "true UNION SELECT 1"], 5, "not valid SQL"),
         (["score", "smoke", "--cohort", "true) OR (true"], 5, "not valid SQL"),
         (["select", "--models", "table9"], 3, "Known: course, estimator, gated"),
-        (["select", "--by", "vehicle"], 5, "at least two folds"),
+        (["select", "--group-by", "vehicle"], 5, "at least two folds"),
         (["show", "nothing"], 5, "no model is called"),
         (["show", "smoke", "--root", "mine"], 2, "--root stands before the command"),
         (["ingest", __file__], 4, "fleet-slip mapping suggest LOG"),
@@ -207,11 +207,11 @@ FORGED = (
         (["sql", "COPY (SELECT 1) TO 'stolen.csv'"], 5, "only queries are allowed"),
         (["publish", "Bad Name!"], 2, "cannot be the name of a model"),
         (["gram", "--features", "mood"], 5, "Feature sets: signals, motion"),
-        (["select", "--nested", "curvature"], 5, "not an input"),
-        (["select", "--rank", "luck"], 5, "Known rankings: declared"),
+        (["select", "--order", "curvature"], 5, "not an input"),
+        (["select", "--ranking", "luck"], 5, "Known rankings: declared"),
         (["select", "--criterion", "luck"], 5, "Known criteria: cv, cp"),
-        (["select", "--models", "table1", "--rank", "t"], 2, "leave out models"),
-        (["select", "--all-subsets", "--rank", "t"], 2, "needs no order"),
+        (["select", "--models", "table1", "--ranking", "t"], 2, "leave out models"),
+        (["select", "--all-subsets", "--ranking", "t"], 2, "needs no ranking"),
         (["select", "--model", "ax, vx"], 5, "vx is not an input"),
         (["select", "--model", "ax", "--search", "exchange"], 2, "search"),
         (["diagnose", "nothing"], 5, "no model is called"),
@@ -270,7 +270,7 @@ def test_a_changed_campaign_is_refused_and_changes_nothing(
     before = run_command(*asked, root=root_to_fail_in).json
     changed = run_command("simulate", "./mine.toml", root=root_to_fail_in)
     assert changed.exit_code == 7
-    assert "was changed since this day was simulated" in changed.stderr
+    assert "has changed since this day was simulated" in changed.stderr
     assert run_command(*asked, root=root_to_fail_in).json == before
 
 
@@ -280,7 +280,7 @@ def test_the_version_is_told(run_command: RunCommand) -> None:
     assert run_command().exit_code == 2
 
 
-WORSE = ("publish", "smoke", "--features", "windows", "--nested", "ax", "--json")
+WORSE = ("publish", "smoke", "--features", "windows", "--order", "ax", "--json")
 
 
 def test_candidates_wait_are_compared_and_promoted(
@@ -313,11 +313,11 @@ def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
     for hold in (["pin", "smoke"], ["promote", "smoke", "--previous"]):
         assert run_command(*hold).exit_code == 0
         before = run_command("show", "smoke", "--json").json["version"]
-        night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
+        night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
         assert night.json["candidate"]
         assert run_command("show", "smoke", "--json").json["version"] == before
     assert run_command("pin", "smoke", "--off").exit_code == 0
-    night = run_command("publish", "smoke", "--nested", "ay,yaw_rate", "--force", "--json")
+    night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
     assert not night.json["candidate"]
 
 

@@ -131,7 +131,7 @@ COMMANDS = [
     "show smoke",
     "select",
     "select --all-subsets",
-    "select --nested ay,yaw_rate,ax",
+    "select --order ay,yaw_rate,ax",
     "quality",
     "status",
     "features",
@@ -143,7 +143,7 @@ COMMANDS = [
 @pytest.fixture(scope="module", autouse=True)
 def chosen_once() -> Iterator[None]:
     """Let what is asked for again be shown again: to choose takes longer than to show."""
-    answer, answers = select.answer_request, dict[str, select.Selection]()
+    answer, answers = select.run_selection, dict[str, select.Selection]()
 
     def once(warehouse: Warehouse, request: SelectionRequest, predicate: str) -> select.Selection:
         asked = f"{request} {predicate}"
@@ -152,7 +152,7 @@ def chosen_once() -> Iterator[None]:
         return answers[asked]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(select, "answer_request", once)
+        patch.setattr(select, "run_selection", once)
         yield
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import TICKS, counts, drive
 from tests.support.catalog import CATALOG
@@ -54,8 +54,8 @@ def test_all_sets_are_made_and_up_to_date(run_command: RunCommand, own_set: Path
 def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     run_command: RunCommand, more_sets: Path
 ) -> None:
-    nested = ("--nested", "ax,ay,yaw_rate,steering_wheel,steer_fl")
-    arguments = ("select", *nested, "--rank", "backward", "--criterion", "bic")
+    nested = ("--order", "ax,ay,yaw_rate,steering_wheel,steer_fl")
+    arguments = ("select", *nested, "--ranking", "backward", "--criterion", "bic")
     report = run_command(*arguments, "--json", root=more_sets).json
     choice = report["choice"]
     assert sorted(choice["order"]) == ["ax", "ay", "steer_fl", "steering_wheel", "yaw_rate"]
@@ -74,7 +74,7 @@ def test_all_subsets_report_the_best_of_every_size(
     run_command: RunCommand, more_sets: Path
 ) -> None:
     report = run_command(
-        "select", "--all-subsets", "--nested", "ax,ay,yaw_rate,steer_fl", "--json", root=more_sets
+        "select", "--all-subsets", "--order", "ax,ay,yaw_rate,steer_fl", "--json", root=more_sets
     ).json
     subsets = report["choice"]["subsets"]
     assert [one["size"] for one in subsets] == [0, 1, 2, 3, 4]
@@ -98,8 +98,8 @@ def test_a_model_names_the_rows_that_it_was_made_of(
 def test_a_published_model_with_features_explains_and_evaluates_them(
     run_command: RunCommand, own_set: Path
 ) -> None:
-    nested = ("--nested", "ay,steer_fl,curvature,speed_squared")
-    arguments = ("--features", "motion", *nested, "--rank", "declared", "--criterion", "cp")
+    nested = ("--order", "ay,steer_fl,curvature,speed_squared")
+    arguments = ("--features", "motion", *nested, "--ranking", "declared", "--criterion", "cp")
     done = run_command("publish", "curved", *arguments, "--json", root=own_set)
     assert done.exit_code == 0, done.stderr
     shown = run_command("show", "curved", "--json", root=own_set).json
@@ -160,7 +160,7 @@ def test_a_number_of_folds_that_cannot_be_is_named(
 
 
 @pytest.mark.parametrize(
-    "extra", [("--models", "table1"), pytest.param(("--rank", "t"), marks=pytest.mark.long)]
+    "extra", [("--models", "table1"), pytest.param(("--ranking", "t"), marks=pytest.mark.long)]
 )
 def test_as_many_folds_as_drives_leave_out_each(
     run_command: RunCommand, more_sets: Path, extra: tuple[str, ...]
@@ -188,9 +188,9 @@ def test_one_model_is_taken_without_a_list(run_command: RunCommand, more_sets: P
 def test_nested_models_have_their_distances_from_the_null_one_on(
     run_command: RunCommand, more_sets: Path
 ) -> None:
-    arguments = ("select", "--nested", "ax,ay,yaw_rate,steer_fl")
+    arguments = ("select", "--order", "ax,ay,yaw_rate,steer_fl")
     plain = run_command(*arguments, "--json", root=more_sets).json
-    ranked = run_command(*arguments, "--rank", "declared", "--json", root=more_sets).json
+    ranked = run_command(*arguments, "--ranking", "declared", "--json", root=more_sets).json
     found = plain["nested"]
     for name in ("contributions", "distances_to_full", "expected_distances", "effective_rows"):
         assert found[name] == ranked["choice"][name]
@@ -205,7 +205,7 @@ def test_nested_models_have_their_distances_from_the_null_one_on(
     by_cars = run_command(*arguments, "--cluster", "vehicle", root=more_sets)
     assert "cluster-robust errors need at least two vehicles" in by_cars.stderr
     parts = run_command(
-        *arguments, "--features", "blocks", "--by", "part", "--json", root=more_sets
+        *arguments, "--features", "blocks", "--group-by", "part", "--json", root=more_sets
     )
     assert "Fold by drive" in parts.json["nested"]["left_out"]
 
@@ -254,7 +254,7 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
     ignored = shutil.ignore_patterns("grams")
     root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
     assert run_command("gram", "--features", "motion", root=root).exit_code == 0
-    asked = ("select", "--features", "windows", "--nested", "ax,ay", "--cohort")
+    asked = ("select", "--features", "windows", "--order", "ax,ay", "--cohort")
     refused = run_command(*asked, "campaign = 'smoke'", root=root)
     assert refused.exit_code == 5
     assert "log files have no Gram rows yet. Run: fleet-slip gram &&" in refused.stderr
@@ -294,7 +294,7 @@ def test_rows_that_tell_nothing_are_told(run_command: RunCommand, warehouse: War
         del one["sideslip"]
     land(warehouse, "all", *(log_rows(f"d{i}", one) for i, one in enumerate(known)))
     update_grams(warehouse)
-    asked = ("--nested", "ay,yaw_rate")
+    asked = ("--order", "ay,yaw_rate")
     told = f"{6 * TICKS:,} of {30 * TICKS:,} rows skipped"
     chosen = run_command("select", *asked)
     assert told in chosen.stderr, chosen.stderr

@@ -15,14 +15,14 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
+from fleet_slip.calibration.intercept import PLANE
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.c_gram import sets_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.grams.compute import aggregate
-from fleet_slip.grams.on_board import counted_sets
+from fleet_slip.grams.on_board import onboard_feature_sets
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.straight_on import PLANE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 from fleet_slip.storage.folder import Folder
@@ -124,7 +124,7 @@ def test_the_layout_is_what_the_page_says(counter: Path) -> None:
     assert content[:8] == b"FSGR\x01\x00" + len(content).to_bytes(2, "little")
     assert (
         int.from_bytes(content[8:16], "little")
-        == next(iter(counted_sets(CATALOG).values())).definition
+        == next(iter(onboard_feature_sets(CATALOG).values())).definition
     )
     assert content[16:32] == b"VIN-17".ljust(16, b"\0")
     assert content[32:36] == b"\0\0\x01\0"
@@ -214,7 +214,7 @@ def received_rows(
     """The Gram rows that the messages of a drive become."""
     root.mkdir()
     fleet = fleet_slip.open(root / "data", configs.folder)
-    fleet.ingest_counted(
+    fleet.import_onboard_grams(
         write_counted(root / "rows", rows_of_messages(content, fleet.warehouse.catalog))
     )
     found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()

@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.grams.job import ensure_grams
+from fleet_slip.grams.update import ensure_grams
 
 
 def runs_of(fleet: Fleet, command: str) -> list[tuple[str, ...]]:

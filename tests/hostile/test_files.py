@@ -14,11 +14,11 @@ import pytest
 from fleet_slip.base import no_progress
 from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
 from fleet_slip.errors import ConfigError, FleetSlipError, InputError, StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.formats.can import CanBus, parse_database, read_can_database
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.log_files import StrayLink, find_logs
-from fleet_slip.models.acceptance import Floor
+from fleet_slip.models.acceptance import PublishThresholds
 from fleet_slip.models.registry import Registry
 from fleet_slip.resources import Configs
 from fleet_slip.storage.data_root import data_root
@@ -176,7 +176,7 @@ def test_a_config_that_cannot_be_read_is_not_replaced_by_the_shipped_one(
 ) -> None:
     (tmp_path / "publish.toml").symlink_to(target)
     with pytest.raises(ConfigError, match=r"publish\.toml"):
-        load_config(Configs(tmp_path).file("publish.toml"), Floor)
+        load_config(Configs(tmp_path).file("publish.toml"), PublishThresholds)
 
 
 def test_a_named_config_that_leads_nowhere_is_told(tmp_path: Path) -> None:

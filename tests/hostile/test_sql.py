@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from fleet_slip.base import no_progress
 from fleet_slip.errors import QuestionError, StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.storage.checksums import check_local_files
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect

@@ -7,7 +7,7 @@ import pytest
 
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.grams.compute import by_sql
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
 from fleet_slip.resources import folder

@@ -9,7 +9,7 @@ import pytest
 from fleet_slip.columns.column_sql import column_query
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.regression.inference import infer_classically
 from fleet_slip.regression.least_squares import fit
@@ -116,14 +116,14 @@ def trailing_mean(values: np.ndarray, ticks: int = 16) -> np.ndarray:
 def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_to(
     tmp_path: Path,
 ) -> None:
-    """From the file to `--by part`: blocks of time left out of the training."""
+    """From the file to `--group-by part`: blocks of time left out of the training."""
     file = tmp_path / "lap.csv"
     file.write_text(csv_text(remembering_log()))
     root, models = tmp_path / "data", tmp_path / "models.toml"
     models.write_text(MODELS)
     call(root, "ingest", str(file), "--mapping", "race_car_250lm_speed")
     call(root, "gram", "--features", "blocks")
-    asked = ("select", "--by", "part", "--models", str(models), "--json")
+    asked = ("select", "--group-by", "part", "--models", str(models), "--json")
     found = json.loads(call(root, *asked))
     names = ["block 0001", "block 0002"]
     assert [one["fold"] for one in found["models"][0]["folds"]] == names
@@ -136,7 +136,7 @@ def test_what_a_log_remembers_is_found_and_carries_to_blocks_it_was_not_fitted_t
     assert f"{last['rmse_deg']:.4f}" in next(row for row in shown.splitlines() if names[1] in row)
     call(root, "gram")
     with pytest.raises(QuestionError, match=r"does not divide the rows of a drive.*time: blocks"):
-        call(root, "select", "--by", "part")
+        call(root, "select", "--group-by", "part")
 
 
 def first_to_last_minute_deg(root: Path) -> float:

@@ -129,7 +129,7 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
         )
         sent.append(counter.messages(rows.to_arrow_table(), late, START_S + 86_400 * number))
     edge = fleet_slip.open(tmp_path / "edge")
-    edge.ingest_counted(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
+    edge.import_onboard_grams(write_counted(tmp_path / "rows", rows_of_messages(b"".join(sent))))
     found = without_label(edge)
     assert found.trained_on.drives_without_log == found.trained_on.drives == len(logged)
     assert (found.intercept, found.terms) == (taught.intercept, taught.terms)
@@ -168,7 +168,7 @@ def test_columns_are_searched_for(fleet: Fleet) -> None:
     # The noise of two fixes of 0.03 m/s each, at 15 to 45 m/s.
     assert 0.05 < told.noise_deg < 0.2 < told.error_deg and told.noise_uncertainty_deg is not None
     assert 0.02 < told.angle_at_most_deg < told.error_deg / math.sqrt(2)
-    assert told.one_way is None and -0.4 < told.to_the_left < -0.1
+    assert told.one_way is None and -0.4 < told.turn_balance < -0.1
 
 
 def test_cars_that_turn_to_one_side_alone_are_told(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_cars_that_turn_to_one_side_alone_are_told(tmp_path: Path) -> None:
     for name in ("signals", "course"):
         made.gram(name)
     told = made.cohort("true").select(label="course", model=COLUMNS).without_label
-    assert told is not None and told.one_way == "left" and told.to_the_left > 0.95
+    assert told is not None and told.one_way == "left" and told.turn_balance > 0.95
 
 
 def test_a_set_without_changes_has_no_course(fleet: Fleet) -> None:
@@ -195,4 +195,4 @@ def test_a_fleet_without_receivers_is_told_so(smoke_copy: Path) -> None:
     with pytest.raises(DataError, match="no course to learn from"):
         cohort.select(label="course", model=COLUMNS)
     with pytest.raises(DataError, match="no course to learn from"):
-        cohort.select(label="course", nested="ay", rank="declared")
+        cohort.select(label="course", order="ay", ranking="declared")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.least_squares import fit
@@ -47,7 +47,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, models: Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         update_grams(Warehouse(LocalFolder(root)), feature_set="gated")
-        answer(root, "publish", "roads", "--models", str(models), "--worth", "0.0001deg")
+        answer(root, "publish", "roads", "--models", str(models), "--tolerance", "0.0001deg")
 
     return made_once(tmp_path_factory, "gated_model", make)
 
@@ -72,7 +72,7 @@ def test_score_finds_the_error_that_the_gram_rows_say(root: Path) -> None:
     warehouse = Warehouse(LocalFolder(root))
     manifest = Registry(LocalFolder(root), CATALOG).resolve("roads").manifest
     cohort = load_cohort(warehouse, "true", "gated")
-    total = cohort.serving(manifest.signals).table.total()
+    total = cohort.complete_cases(manifest.signals).table.total()
     fitted = fit(total, manifest.signals, manifest.label.signal)
     figures = error_sums(fitted.model, total).figures(SIGNALS[manifest.label.signal].exact_scale)
     scored = answer(root, "score", "roads", "--cohort", "true")

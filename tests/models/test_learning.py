@@ -17,7 +17,7 @@ from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
 from fleet_slip.grams.compute import read_drives
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.support.catalog import CATALOG, SIGNALS

@@ -54,7 +54,7 @@ def honest(grams: Sequence[Gram], start_s: int) -> Rows:
 
 
 def receive(fleet: fleet_slip.Fleet, path: Path, rows: Rows) -> None:
-    assert fleet.ingest_counted(write_counted(path, rows)).gram_rows == len(rows)
+    assert fleet.import_onboard_grams(write_counted(path, rows)).gram_rows == len(rows)
 
 
 def select(fleet: fleet_slip.Fleet) -> Selection:

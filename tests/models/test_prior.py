@@ -14,8 +14,8 @@ from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.measured_evaluation import identified_prior
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.weights import age_weights
+from fleet_slip.grams.drive_weights import age_weights
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import SelectionPlan
@@ -75,7 +75,12 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
     weight = found.cohort.weight
     signals = (*INPUTS.split(","), SIGNALS.label)
     (simulated,) = prior.tables
-    real = load_cohort(fleet.warehouse).serving(INPUTS.split(",")).table.total().restrict(signals)
+    real = (
+        load_cohort(fleet.warehouse)
+        .complete_cases(INPUTS.split(","))
+        .table.total()
+        .restrict(signals)
+    )
     both = with_mark(real, 1).scaled(weight.denominator)
     both += with_mark(simulated.total().restrict(signals), 0).scaled(weight.numerator)
     assert 0 < weight < 1
@@ -111,8 +116,8 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
 @pytest.mark.parametrize(
     "words",
     [
-        ("--nested", "ay,yaw_rate"),
-        ("--rank", "tstat"),
+        ("--order", "ay,yaw_rate"),
+        ("--ranking", "tstat"),
         ("--label", "course"),
     ],
 )
@@ -255,12 +260,12 @@ def fleet(tmp_path: Path) -> Fleet:
 
 
 def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: Fleet) -> None:
-    robust = fleet.cohort().select(nested=TWO, robust=True)
-    assert list(robust.weighed) == ["d06"]
-    assert robust.weighed["d06"].times > 10 and robust.weighed["d06"].weight == 0
-    others = fleet.cohort("vehicle_id <> 'it''s me'").select(nested=TWO)
+    robust = fleet.cohort().select(order=TWO, robust=True)
+    assert list(robust.weighted) == ["d06"]
+    assert robust.weighted["d06"].times > 10 and robust.weighted["d06"].weight == 0
+    others = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO)
     assert robust.winner.model.model == others.winner.model.model
-    plain = fleet.cohort().select(nested=TWO)
+    plain = fleet.cohort().select(order=TWO)
     assert plain.winner.model.pooled.rmse_deg > 2 * robust.winner.model.pooled.rmse_deg
     assert plain.as_dict()["drives"] == 1 + robust.as_dict()["drives"]
 
@@ -268,16 +273,16 @@ def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: 
 def test_the_command_names_it_and_the_version_keeps_how(
     fleet: Fleet, run_command: RunCommand
 ) -> None:
-    told = run_command("select", "--nested", TWO, "--robust")
+    told = run_command("select", "--order", TWO, "--robust")
     assert told.exit_code == 0
     assert "d06: its error is " in told.stderr and "the weight 0.00" in told.stderr
     before = run_command("diagnose", "--signals", TWO)
     assert "d06: its error is " in before.stderr
     before_json = run_command("diagnose", "--signals", TWO, "--json").json
     assert list(before_json["drives_weighed"]) == ["d06"]
-    document = run_command("select", "--nested", TWO, "--robust", "--json").json
+    document = run_command("select", "--order", TWO, "--robust", "--json").json
     assert document["drives_weighed"]["d06"]["weight"] == 0
-    made = run_command("publish", "safe", "--nested", TWO, "--robust", "--force")
+    made = run_command("publish", "safe", "--order", TWO, "--robust", "--force")
     assert made.exit_code == 0, made.stderr
     manifest = fleet.model("safe").manifest
     assert manifest.selected_by.asked is not None and manifest.selected_by.asked["robust"]
@@ -287,10 +292,10 @@ def test_the_command_names_it_and_the_version_keeps_how(
 
 
 def test_honest_drives_keep_their_weight(fleet: Fleet) -> None:
-    honest = fleet.cohort("vehicle_id <> 'it''s me'").select(nested=TWO, robust=True)
-    assert honest.weighed == {}
-    few = fleet.cohort("drive_id < 'd05'").select(nested=TWO, robust=True)
-    assert few.weighed == {}
+    honest = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO, robust=True)
+    assert honest.weighted == {}
+    few = fleet.cohort("drive_id < 'd05'").select(order=TWO, robust=True)
+    assert few.weighted == {}
 
 
 def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> None:
@@ -308,8 +313,8 @@ def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> Non
     land(warehouse, "all", *drives)
     update_grams(warehouse)
     found = fleet_slip.open(tmp_path / "data").cohort().select(model=TWO, robust=True)
-    assert list(found.weighed) == ["d05"] and 0 < found.weighed["d05"].weight < 1
-    part = round(16 * found.weighed["d05"].weight)
+    assert list(found.weighted) == ["d05"] and 0 < found.weighted["d05"].weight < 1
+    part = round(16 * found.weighted["d05"].weight)
     assert found.trained_rows == (1100 * 16 + 100 * part) // 16
     repeated = np.concatenate(
         [np.repeat(one, part if i == 5 else 16, axis=0) for i, one in enumerate(rows)]

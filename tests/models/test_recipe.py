@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import QuestionError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import SelectedBy
 from fleet_slip.models.publish import asked_of, recipe_for
 from fleet_slip.models.registry import Registry
-from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.select import run_selection
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
@@ -30,7 +30,15 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     folder = tmp_path_factory.mktemp("recipes") / "data"
     shutil.copytree(smoke_root, folder)
     answer(folder, "publish", "plain", "--cohort", FASTER)
-    options = ("--nested", "ax,ay,yaw_rate", "--rank", "forward", "--folds", "4", "--no-intercept")
+    options = (
+        "--order",
+        "ax,ay,yaw_rate",
+        "--ranking",
+        "forward",
+        "--folds",
+        "4",
+        "--no-intercept",
+    )
     answer(folder, "publish", "ranked", "--cohort", FASTER, *options)
     return folder
 
@@ -44,14 +52,14 @@ def test_publishing_again_without_options_is_the_same_model(root: Path, name: st
 def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
     registry = Registry(LocalFolder(root), CATALOG)
     kept = recipe_for(registry, "ranked", SelectionRequest())
-    assert (kept.request.rank, kept.request.folds, kept.request.intercept) == (
+    assert (kept.request.ranking, kept.request.folds, kept.request.intercept) == (
         "forward",
         "4",
         False,
     )
     assert kept.cohort == FASTER
     wider = recipe_for(registry, "ranked", SelectionRequest(folds=3), "true")
-    assert (wider.request.rank, wider.request.folds, wider.cohort) == ("forward", 3, "true")
+    assert (wider.request.ranking, wider.request.folds, wider.cohort) == ("forward", 3, "true")
     assert FASTER in wider.told
     assert "ranked@1" in wider.told
     other = recipe_for(registry, "ranked", SelectionRequest(models="table1"))
@@ -59,6 +67,38 @@ def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
     assert other.cohort == FASTER
     new = recipe_for(registry, "new", SelectionRequest())
     assert (new.request, new.told) == (SelectionRequest(), "")
+
+
+def test_options_of_earlier_versions_are_read_under_their_old_names(tmp_path: Path) -> None:
+    registry = Registry(LocalFolder(tmp_path), CATALOG)
+    stored = {"nested": "ay,ax", "rank": "forward", "worth": "1deg", "most": 3, "by": "day"}
+    chosen = SelectedBy(
+        model_list="nested", model="5", reason="best", config_sha256="0", asked=stored
+    )
+    registry.add(manifest(name="old").model_copy(update={"selected_by": chosen}), b"")
+    assert recipe_for(registry, "old", SelectionRequest()).request == SelectionRequest(
+        order="ay,ax", ranking="forward", tolerance="1deg", max_features=3, group_by="day"
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("most = 3", "max_features"),
+        ("fewest_drives = 3", "min_drives"),
+        ("columns_per_drive = 3", "max_features_per_drive"),
+        ('rule = "worth"', "tolerance"),
+    ],
+)
+def test_a_renamed_key_of_a_model_list_is_refused_with_its_new_name(
+    tmp_path: Path, old: str, new: str
+) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text(
+        f'description = "own"\n[[model]]\nname = "1"\nsignals = ["ay"]\n[[search]]\n{old}\n'
+    )
+    with pytest.raises(ConfigError, match=f"own.toml: search.0: .* is now called .*{new}"):
+        load_model_list(CATALOG, str(file))
 
 
 def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Path) -> None:
@@ -89,11 +129,11 @@ def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_p
     rng = np.random.default_rng(3)
     land(warehouse, "a.parquet", *(log_rows(f"d{n}", random_counts(rng, 300)) for n in range(6)))
     update_grams(warehouse)
-    answer = answer_request(warehouse, SelectionRequest(), "true")
+    answer = run_selection(warehouse, SelectionRequest(), "true")
     assert answer.model_list == "table1"
     assert "fleet-slip gram --features windows" in answer.remark
     assert asked_of(answer) == {}  # so that the usual list is asked for again
-    assert asked_of(answer_request(warehouse, SelectionRequest(models="table1"), "true")) is None
+    assert asked_of(run_selection(warehouse, SelectionRequest(models="table1"), "true")) is None
 
 
 def test_publishing_computes_the_columns_of_the_usual_list(smoke_copy: Path) -> None:

@@ -1,4 +1,4 @@
-"""Which signals of a set: rankings, all subsets, and what the choice is worth."""
+"""Which signals of a set: rankings, all subsets, and how good the choice is."""
 
 from itertools import combinations
 from typing import Literal
@@ -12,7 +12,7 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import folding
 from fleet_slip.grams.cohort import drive_folds
 from fleet_slip.grams.folding import EACH, FoldCount, Folding, assign_folds
-from fleet_slip.models.request import CandidateModel, Search, SelectionRequest, parse_worth
+from fleet_slip.models.request import CandidateModel, Search, SelectionRequest, parse_tolerance
 from fleet_slip.models.search import (
     ALL_SUBSETS,
     choose_by,
@@ -69,7 +69,7 @@ def test_each_nested_model_has_the_figures_of_its_own_cross_validation(
 ) -> None:
     cohort = cohort_of(drives)
     found = select_inputs(cohort, INPUTS, FIVE, Rule("forward", "bic"), USUAL)
-    folds = cohort.folds("drive", 5).serving(INPUTS, LABEL)
+    folds = cohort.folds("drive", 5).complete_cases(INPUTS, LABEL)
     for model in found.models:
         procedure = least_squares(model.signals, LABEL)
         alone = cross_validate("alone", folds, procedure, CATALOG.input_scales)
@@ -151,17 +151,17 @@ def test_subsets_can_be_chosen_by_cross_validation(drives: list[Driven]) -> None
     assert shortfall.negligible
 
 
-@pytest.mark.parametrize("rule", ["best", "worth"])
+@pytest.mark.parametrize("rule", ["best", "tolerance"])
 @pytest.mark.parametrize("around", ["0.00499deg", "0.005deg", "0.0051deg"])
-def test_a_worth_that_is_asked_for_decides_whatever_the_rule_of_the_list(
-    rule: Literal["best", "worth"], around: str
+def test_a_tolerance_precedes_the_rule_of_the_list(
+    rule: Literal["best", "tolerance"], around: str
 ) -> None:
-    """The usual worth asked for is asked for, too; the weak signals are 0.0029 deg each."""
+    """The default tolerance counts if it is given; the weak signals are 0.0029 deg each."""
     cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
-    search = Search(method="exchange", most=4, rule=rule)
+    search = Search(method="exchange", max_features=4, rule=rule)
     models = search_models(cohort, INPUTS, FIVE, search).models
     asked = {
-        text: len(choose_by(search, models, parse_worth(text)).model.signals)
+        text: len(choose_by(search, models, parse_tolerance(text)).model.signals)
         for text in (around, "0.025deg", "0.0001deg")
     }
     assert asked == {around: 2, "0.025deg": 2, "0.0001deg": 4}
@@ -171,7 +171,7 @@ def test_a_worth_that_is_asked_for_decides_whatever_the_rule_of_the_list(
 def test_the_rule_of_one_standard_error_keeps_what_is_real_however_small() -> None:
     """The weak signals gain 0.0029 deg each, far more than their noise over folds."""
     cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
-    search = Search(method="exchange", most=4, rule="standard error")
+    search = Search(method="exchange", max_features=4, rule="standard error")
     models = search_models(cohort, INPUTS, FIVE, search).models
     assert len(choose_by(search, models).model.signals) == 4
     idle = search_models(cohort_of(driven(1, STRONG_FIRST, drives=30)), INPUTS, FIVE, search)
@@ -182,8 +182,14 @@ def test_the_rule_of_one_standard_error_keeps_what_is_real_however_small() -> No
 
 def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough() -> None:
     searches = (
-        Search(name="few", method="exchange", most=4, rule="standard error", inputs=("ay", "ax")),
-        Search(name="all", method="exchange", most=4, fewest_drives=9),
+        Search(
+            name="few",
+            method="exchange",
+            max_features=4,
+            rule="standard error",
+            inputs=("ay", "ax"),
+        ),
+        Search(name="all", method="exchange", max_features=4, min_drives=9),
     )
     for drives, found in ((8, ["few 1", "few 2"]), (9, ["few 1", "few 2", *ALL_SIZES])):
         cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
@@ -195,7 +201,7 @@ def test_a_list_searches_among_some_inputs_and_then_all_where_drives_are_enough(
 
 
 def test_few_drives_allow_few_columns() -> None:
-    search = Search(name="few", method="forward", most=4, columns_per_drive=1)
+    search = Search(name="few", method="forward", max_features=4, max_features_per_drive=1)
     for drives, most in ((3, 3), (5, 4)):
         cohort = cohort_of(driven(1, STRONG_FIRST, drives=drives))
         chosen = select(cohort, (), FIVE, searches=[search], inputs=INPUTS)

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 import fleet_slip
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import MOST_DIGITS, ExactFraction, ImportedFrom, TrainedDrives
-from fleet_slip.models.publish import is_up_to_date
+from fleet_slip.models.publish import is_current
 from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
 from fleet_slip.operations.monitor import monitor
 from fleet_slip.operations.verify import Verification, verify_models
@@ -265,8 +265,8 @@ def test_the_tables_here_are_not_those_that_made_it(smoke_root: Path, tmp_path: 
     manifest = made.manifest.model_copy(update={"imported_from": origin})
     brought = away.registry().add(manifest, drives.content)
     arguments = (home.warehouse, made.manifest.trained_on.cohort, "estimator", None)
-    assert is_up_to_date(made.manifest, *arguments)
-    assert not is_up_to_date(brought.manifest, *arguments)
+    assert is_current(made.manifest, *arguments)
+    assert not is_current(brought.manifest, *arguments)
     with pytest.raises(DataError, match="monitor smoke --since DAY"):
         monitor(home.warehouse, brought)
     report = Verification()

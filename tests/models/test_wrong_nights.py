@@ -16,7 +16,7 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.gram import Gram

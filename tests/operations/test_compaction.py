@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import fleet_slip
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.find_drives import find_expired, find_unreferenced, vacuum
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify

@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
-from fleet_slip.grams import job
+from fleet_slip.grams import update
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.find_drives import (
     Located,
     drives_by_file,
@@ -212,7 +212,7 @@ def test_a_gram_job_under_way_does_not_bring_a_forgotten_drive_back(
         forget(warehouse, ErasureSubject("vehicle", "beta"))
         return rows
 
-    monkeypatch.setattr(job, "compute_grams", overtaken)
+    monkeypatch.setattr(update, "compute_grams", overtaken)
     update_grams(warehouse)
     assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM grams") == [("alfa",)]
 

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import load
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.load import ingest_files

@@ -15,7 +15,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.check import check_grams
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.rewriting import migrate
 from fleet_slip.resources import folder
 from fleet_slip.views import open_views
@@ -188,7 +188,7 @@ def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> N
 def test_it_takes_gram_rows_of_cars_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
     fleet.migrate()
     fleet.gram()
-    report = fleet.ingest_counted(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
+    report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
     assert report.gram_rows == 1
     fleet.forget(vehicle="VIN1")
     assert not fleet.verify(full=True).damage

@@ -13,11 +13,11 @@ from scipy import stats
 
 import fleet_slip
 from fleet_slip.errors import DataError, UsageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.operations.monitor import Chart, Limits, monitor
 from fleet_slip.regression.figures import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
@@ -50,7 +50,7 @@ def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("trained") / "data"
     warehouse = Warehouse(LocalFolder(root))
     add_days(warehouse, 0, TRAINING_DAYS)
-    planned = answer_request(warehouse, SelectionRequest(models="table1"))
+    planned = run_selection(warehouse, SelectionRequest(models="table1"))
     publish_challenger(Registry(warehouse.root, CATALOG), manifest_of(planned, "m"), planned)
     return root
 
@@ -85,8 +85,8 @@ def test_a_training_day_is_judged_by_a_model_that_it_did_not_make(
     warehouse, version = trained
     first = monitor(warehouse, version).days[0]
     signals = ",".join(version.manifest.signals)
-    plan = SelectionRequest(nested=signals)
-    without = answer_request(warehouse, plan, f"day > '{DAY}'")
+    plan = SelectionRequest(order=signals)
+    without = run_selection(warehouse, plan, f"day > '{DAY}'")
     model = next(m for m in without.models if m.signals == version.manifest.signals)
     estimate = " + ".join(
         f"{float(b)!r} * {term.column}"

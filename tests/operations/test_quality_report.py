@@ -13,7 +13,7 @@ import pytest
 
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations import quality_report
 from fleet_slip.operations.quality_report import (
     QualityReport,

@@ -14,14 +14,14 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.grams import job
+from fleet_slip.grams import update
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.operations import rewriting
 from fleet_slip.operations.find_drives import find_expired
 from fleet_slip.operations.forget import forget
@@ -213,7 +213,7 @@ def test_no_gram_row_of_a_forgotten_car_lands_after_the_erasure(
     warehouse = fill(tmp_path, "alfa")
     land(warehouse, "new", drive("beta", 1))
     just_before_its_commit(monkeypatch, lambda: forget(warehouse, BETA, now=True), "grams")
-    monkeypatch.setattr(job, "require_active", lambda *_: None)  # killed before its last look
+    monkeypatch.setattr(update, "require_active", lambda *_: None)  # killed before its last look
     update_grams(warehouse)
     assert not mentions(tmp_path, "beta")
 
@@ -269,8 +269,8 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
     registry, answers = Registry(warehouse.root, CATALOG), {}
     cohorts = {"of_all": "true", "of_others": "vehicle_id <> 'beta'"}
     for name, cohort in cohorts.items():
-        request = SelectionRequest(nested="ay,yaw_rate")
-        answers[name] = answer_request(warehouse, request, cohort)
+        request = SelectionRequest(order="ay,yaw_rate")
+        answers[name] = run_selection(warehouse, request, cohort)
     manifests = {name: manifest_of(answer, name) for name, answer in answers.items()}
     forget(warehouse, BETA, now=True)
     for name, answer in answers.items():
@@ -286,7 +286,7 @@ def test_while_an_erasure_is_under_way_what_is_published_counts_as_trained_on_it
 ) -> None:
     warehouse = fill(tmp_path, *CARS)
     ErasureLog(warehouse.root).begin(BETA, 3, [], {"beta": 0})
-    answer = answer_request(warehouse, SelectionRequest(nested="ay,yaw_rate"))
+    answer = run_selection(warehouse, SelectionRequest(order="ay,yaw_rate"))
     publish_challenger(
         Registry(warehouse.root, CATALOG), manifest_of(answer, "beta"), answer, force=True
     )

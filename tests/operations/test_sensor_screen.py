@@ -11,7 +11,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotScreenedError, RefusedError
 from fleet_slip.models import training_checks
-from fleet_slip.models.acceptance import load_floor
+from fleet_slip.models.acceptance import load_thresholds
 from fleet_slip.operations import quality_report, sensor_screen
 from fleet_slip.operations.quality_report import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -148,15 +148,16 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    choice = ("--nested", "ay,yaw_rate", "--worth", "0.0001deg")
+    choice = ("--order", "ay,yaw_rate", "--tolerance", "0.0001deg")
     command = ("publish", "m", *choice, "--dry-run")
-    asked = fleet.cohort("day = DATE '2026-10-05'").select(nested="ay,yaw_rate", worth="0.0001deg")
+    cohort = fleet.cohort("day = DATE '2026-10-05'")
+    asked = cohort.select(order="ay,yaw_rate", tolerance="0.0001deg")
     for name, bound, told in (
         ("max_columns_per_drive", 0.1, r"columns? on 4 drives, more than 0\.1 a drive"),
         ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
     ):
-        strict = load_floor(SHIPPED_CONFIGS).model_copy(update={name: bound})
-        monkeypatch.setattr(training_checks, "load_floor", lambda _, strict=strict: strict)
+        strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={name: bound})
+        monkeypatch.setattr(training_checks, "load_thresholds", lambda _, strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
             fleet.publish("m", asked)
         dry = fleet.would_publish("m", asked)
@@ -164,7 +165,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         assert fleet.would_publish("m", asked, candidate=True).candidate
         said = run_command(*command)
         assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
-        monkeypatch.setattr(training_checks, "load_floor", load_floor)
+        monkeypatch.setattr(training_checks, "load_thresholds", load_thresholds)
     assert not fleet.models().num_rows
     assert "m would be published. " in run_command(*command).stderr
     assert fleet.publish("m", asked).new
@@ -175,8 +176,8 @@ def test_a_champion_of_more_columns_needs_drives_for_them_too(
 ) -> None:
     cohort = fleet.cohort("day = DATE '2026-10-05'")
     assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
-    strict = load_floor(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
-    monkeypatch.setattr(training_checks, "load_floor", lambda _: strict)
+    strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
+    monkeypatch.setattr(training_checks, "load_thresholds", lambda _: strict)
     with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
         fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
     assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused
@@ -231,7 +232,7 @@ def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
     for day in range(3):
         path = tmp_path / f"day-{day}"
         write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
         fleet.cohort().examine()
         assert len(asked) == day + 1
         assert f"2024-05-0{day + 1}" in asked[-1]

@@ -15,7 +15,7 @@ from fleet_slip.errors import (
     StorageError,
     UsageError,
 )
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import recording

@@ -16,7 +16,7 @@ import pytest
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams import check
 from fleet_slip.grams.check import check_grams
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import CHAMPION, Registry
 from fleet_slip.operations import verify as verification
 from fleet_slip.operations.find_drives import vacuum

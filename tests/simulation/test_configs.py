@@ -59,14 +59,14 @@ def changed(name: str, old: str, new: str) -> str:
         (SMOKE, "first_day = 2024-05-01", "first_day = 2024-05-32", "not valid TOML"),
         (SMOKE, "number_of_days = 2", "number_of_days = 0", "number_of_days"),
         (SMOKE, "steer_std_rad = 0.0002", "steer_std_rad = -1", "sensors.steer_std_rad"),
-        (SMOKE, "rate_hz = 10", "rate_hz = 30", "gps.rate_hz: 30 Hz does not divide 100 Hz"),
+        (SMOKE, "rate_hz = 10", "rate_hz = 30", "gps.rate_hz: give a divisor of 100 Hz, not 30 Hz"),
         (SMOKE, 'name = "smoke"', 'name = "smoke test"', "name"),
         (SMOKE, "seed = 1", "", "seed"),
         ("campaigns/fleet", "min = 0.85", "min = 1.85", "tyre_stiffness: min 1.85 is above max"),
         ("campaigns/fleet", "cars = 300", "cars = 0", "plan.fleet.cars"),
         ("campaigns/proving_ground", "share = 0.4", "share = 1.4", "share"),
         ("campaigns/proving_ground", "other_every = 10", "other_every = 1", "other_every"),
-        ("campaigns/proving_roads", "load_position_m", "# load_position_m", "need each other"),
+        ("campaigns/proving_roads", "load_position_m", "# load_position_m", "give both load_kg"),
         ("campaigns/proving_roads", "tread_wear_per", "# tread_wear_per", "needs imperfections."),
         ("campaigns/proving_roads", '"city_1"', '"waterford_hills"', "such as country_17, not wat"),
         ("scenarios/nominal", "[limits]", "load_position_m = -1.0\n[limits]", "a sprung_mass_kg"),
@@ -77,7 +77,7 @@ def changed(name: str, old: str, new: str) -> str:
         ("scenarios", "", MINE + 'drive = "nominal"', "cannot be given"),
         ("scenarios", "", MINE + 'vehicle = "bicycle"', "nothing is called 'bicycle'"),
         ("scenarios", "", MINE.replace("mine", "nominal"), "leads back"),
-        ("scenarios", "", f"{MINE}laps = 2\n{FAILURE}", "without laps"),
+        ("scenarios", "", f"{MINE}laps = 2\n{FAILURE}", "unchanged: remove laps"),
         ("scenarios", "", MINE + FAILURE.replace('"ax"', '"vx"'), "cannot fail"),
         ("scenarios", "", f"{MINE}{FAILURE}until_s = 1", "not after"),
         ("scenarios", "", f"{MINE}pace = [{{ station_m = 9999, factor = 1 }}]", "beyond waterford"),
@@ -249,7 +249,7 @@ def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> N
 
 @pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
 def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
-    with pytest.raises(ConfigError, match="goes from 2024-05-01 to 2024-05-02"):
+    with pytest.raises(ConfigError, match="lasts from 2024-05-01 to 2024-05-02"):
         load_campaign("smoke", SHIPPED_CONFIGS).batches(day)
 
 

@@ -39,7 +39,7 @@ def test_ranges_are_drawn_within_their_bounds_in_the_order_of_their_class() -> N
 @pytest.mark.parametrize(
     ("kind", "name", "bounds", "reason"),
     [
-        ("car", "toe_front", (0.0, 0.1), "no imperfection. There are: steering_lash_deg"),
+        ("car", "toe_front", (0.0, 0.1), "no imperfection. Choose from: steering_lash_deg"),
         ("car", "steering_lash_deg", (-1.0, 2.0), "greater than or equal to 0"),
         ("sensors", "label_latency_s", (0.0, 2.0), "less than or equal to 1"),
         ("road", "grade_std_percent", (2.0, 1.0), "is above max"),

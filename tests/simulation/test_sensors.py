@@ -17,13 +17,13 @@ from fleet_slip.simulation.sensors import (
     EXACT,
     Delay,
     Distortion,
+    GaussMarkov,
     Gps,
     LowPass,
     Measurement,
     Pulses,
     Recorder,
     Sensors,
-    Wander,
     noisy_counts,
 )
 from fleet_slip.vehicle.batch_kernel import CHANNELS
@@ -279,7 +279,7 @@ def test_a_drive_in_two_blocks_is_the_drive_in_one() -> None:
 
 
 def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
-    errors = Wander(4, 2.0, np.random.default_rng(5)).next(200_000)
+    errors = GaussMarkov(4, 2.0, np.random.default_rng(5)).next(200_000)
     assert np.std(errors, axis=1) == pytest.approx(np.ones(4), rel=0.1)
     for tau_s in (1.0, 2.0):
         ticks = int(tau_s * 100)
@@ -291,8 +291,8 @@ def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
 
 @pytest.mark.parametrize("cuts", [(1, 9, 1, 10, 11, 7, 300), (339,), (10, 10, 319)])
 def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
-    whole = Wander(3, 10.0, np.random.default_rng(6)).next(400)
-    pieces = Wander(3, 10.0, np.random.default_rng(6))
+    whole = GaussMarkov(3, 10.0, np.random.default_rng(6)).next(400)
+    pieces = GaussMarkov(3, 10.0, np.random.default_rng(6))
     parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
     np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])
 

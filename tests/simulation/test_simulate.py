@@ -66,7 +66,7 @@ def test_a_changed_campaign_is_refused_before_anything_is_written(tmp_path: Path
     with ThreadPoolExecutor(2) as executor:
         simulate_campaign(Warehouse(LocalFolder(tmp_path)), campaign(), late, executor)
     before = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
-    with pytest.raises(RefusedError, match="was changed"):
+    with pytest.raises(RefusedError, match="has changed"):
         run(tmp_path, campaign(seed=77), no_progress)
     after = Warehouse(LocalFolder(tmp_path)).logs.snapshot()
     assert (after.version, after.rows) == (before.version, before.rows)
@@ -80,7 +80,7 @@ def test_a_complete_day_is_never_planned_again(
     monkeypatch.setattr(type(campaign()), "batches", None)
     again = run(tmp_path, campaign(), no_progress)
     assert (again.days_present, again.logs_version) == (DAYS, before.version)
-    with pytest.raises(RefusedError, match="was changed"):
+    with pytest.raises(RefusedError, match="has changed"):
         run(tmp_path, campaign(seed=77), no_progress)
 
 
@@ -96,13 +96,13 @@ def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path)
 
 
 def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulate = batch_kernel.simulate
+    simulate = batch_kernel.simulate_lanes
 
     def skewed(*arguments: Any) -> None:
         simulate(*arguments)
         arguments[4][batch_kernel.STATE * batch_kernel.LANES] *= 1 + 1e-8  # vx of the first lane
 
-    monkeypatch.setattr(batch_kernel, "simulate", skewed)
+    monkeypatch.setattr(batch_kernel, "simulate_lanes", skewed)
 
 
 def broken_bicycle(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +138,7 @@ def test_what_is_not_as_highway_env_drives_is_not_written(
     done = run_command("simulate", "smoke")
     assert done.exit_code == RefusedError.exit_code
     assert "the simulated car departs from highway-env" in done.stderr
-    assert f"of {vehicle}. Its file is not written" in done.stderr
+    assert f"in {vehicle}. The file was not written" in done.stderr
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 

@@ -111,15 +111,15 @@ def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
 
 def test_there_are_others_and_they_move_between_two_steps(spec: DriveSpec) -> None:
     plan = planned(spec)
-    assert max(len(cars) for cars in plan.others) >= 2
+    assert max(len(cars) for cars in plan.other_cars) >= 2
     step = next(
         k
-        for k in range(len(plan.others) - 1)
-        if len(plan.others[k]) == len(plan.others[k + 1]) > 0
+        for k in range(len(plan.other_cars) - 1)
+        if len(plan.other_cars[k]) == len(plan.other_cars[k + 1]) > 0
         and plan.station_m[k + 1] > plan.station_m[k]
     )
-    middle = plan.others_at((plan.station_m[step] + plan.station_m[step + 1]) / 2)
-    np.testing.assert_allclose(middle, (plan.others[step] + plan.others[step + 1]) / 2)
+    middle = plan.other_cars_at((plan.station_m[step] + plan.station_m[step + 1]) / 2)
+    np.testing.assert_allclose(middle, (plan.other_cars[step] + plan.other_cars[step + 1]) / 2)
 
 
 def test_lanes_are_changed_on_the_highway_and_turns_taken_at_the_roundabout() -> None:
@@ -180,7 +180,7 @@ def test_traffic_of_another_kind_is_refused(
     monkeypatch.setattr(IDMVehicle, name, lambda *given, **named: 1.05 * decided(*given, **named))
     done = run_command("simulate", short(tmp_path, 'tracks = ["roundabout"]'))
     assert done.exit_code == RefusedError.exit_code
-    assert "drive on its road 'roundabout' unlike" in done.stderr
+    assert "on its road 'roundabout' differs" in done.stderr
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 

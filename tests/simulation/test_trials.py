@@ -51,7 +51,7 @@ def test_one_car_is_tested_and_others_take_turns(drives: tuple[DriveSpec, ...]) 
     assert {d.vehicle.name for d in tested} == {"d_class_sedan"}
     names = {d.vehicle_id: d.vehicle.name for d in drives}
     others = {car: name for car, name in names.items() if car != tested[0].vehicle_id}
-    assert len(others) == plan.others
+    assert len(others) == plan.other_cars
     assert len(set(others.values())) == 4
 
 

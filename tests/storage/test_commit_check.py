@@ -10,7 +10,7 @@ import pytest
 from deltalake import DeltaTable
 
 from fleet_slip.errors import StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.storage.commits import find_commit_faults

@@ -14,7 +14,7 @@ from fleet_slip.errors import FleetSlipError, StorageError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.operations.verify import verify

@@ -17,7 +17,7 @@ from obstore.exceptions import GenericError, NotFoundError
 
 import fleet_slip
 from fleet_slip.errors import QuestionError, StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.storage import objects
 from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder

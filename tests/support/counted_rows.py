@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.grams.on_board import COLUMNS, counted_sets
+from fleet_slip.grams.on_board import COLUMNS, onboard_feature_sets
 from fleet_slip.regression.gram import Gram
 from tests.support.catalog import CATALOG, SIGNALS
 
@@ -33,7 +33,7 @@ def row_of(
     **other: Any,
 ) -> dict[str, Any]:
     """A row of the table of a Gram; `other` columns are as they should not be."""
-    (key,) = (one.key for one in counted_sets(CATALOG).values() if one.name == of)
+    (key,) = (one.key for one in onboard_feature_sets(CATALOG).values() if one.name == of)
     start = datetime.fromtimestamp(start_s, UTC)
     row = {"source": "received", "vehicle_id": vehicle, "day": start.date(), "feature_set": key}
     row |= {"drive_id": f"{vehicle}-{start:%Y%m%dT%H%M%SZ}", "part": None, "course_late": None}
@@ -60,7 +60,7 @@ def _reading() -> dict[str, Any]:
 def rows_of_messages(content: bytes, catalog: Catalog = CATALOG) -> list[dict[str, Any]]:
     """The rows that the page makes of messages one behind the other."""
     rows: list[dict[str, Any]] = []
-    sets = {one.definition: one for one in counted_sets(catalog).values()}
+    sets = {one.definition: one for one in onboard_feature_sets(catalog).values()}
     while content:
         size = int.from_bytes(content[6:8], "little")
         rows.append(_reading()["row_of"](content[:size], sets))
@@ -158,7 +158,7 @@ def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = F
         "vehicle_id": names,
         "drive_id": [f"{name}-{start:%Y%m%dT%H%M%SZ}" for name in names],
         "day": [start.date()] * cars,
-        "feature_set": [next(iter(counted_sets(CATALOG).values())).key] * cars,
+        "feature_set": [next(iter(onboard_feature_sets(CATALOG).values())).key] * cars,
         "part": [None] * cars,
         "course_late": [None] * cars,
         "signals": [",".join(signals)] * cars,

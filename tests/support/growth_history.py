@@ -18,7 +18,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.grams.job import transaction_name
+from fleet_slip.grams.update import transaction_name
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change

@@ -72,7 +72,7 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
         )
         done_on(root, "simulate", few, "--days", "1")
         done_on(root, "gram")
-        done_on(root, "publish", "few", "--nested", "ay", "--cohort", "campaign = 'few'", "--force")
+        done_on(root, "publish", "few", "--order", "ay", "--cohort", "campaign = 'few'", "--force")
 
     return made_once(tmp_path_factory, "benchmarks", make)
 

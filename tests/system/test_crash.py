@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import verify
@@ -288,7 +288,7 @@ def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     assert [code for code, _ in at_once(parallel, *jobs, *jobs, ["gram"], ["gram"])] == [0] * 8
     run_command("gram", root=parallel)
     assert contents(run_command, parallel) == contents(run_command, serial)
-    publishing = ["publish", "m", "--nested", "ay,steering_wheel", "--cohort", "campaign = 'smoke'"]
+    publishing = ["publish", "m", "--order", "ay,steering_wheel", "--cohort", "campaign = 'smoke'"]
     for code, text in at_once(parallel, publishing, publishing, publishing):
         assert code == 0, text
     versions = run_command("models", "m", "--json", root=parallel).json

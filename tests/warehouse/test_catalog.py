@@ -13,7 +13,7 @@ from fleet_slip.catalog.definitions import Combination
 from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.resources import folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse

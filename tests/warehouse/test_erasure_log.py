@@ -10,7 +10,7 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder

@@ -171,8 +171,9 @@ def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_p
     root = tmp_path / "data"
     done_on(root, "ingest", tmp_path / "log.csv", "--mapping", tmp_path / "noise.toml")
     done_on(root, "gram")
-    search = ("--search", "exchange", "--most", "3", "--worth", "0deg", "--folds", "each")
-    done_on(root, "publish", "again", *search, "--force")
+    fleet = fleet_slip.open(root)
+    search = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
+    fleet.publish("again", fleet.cohort().select(**search), force=True)
     chosen = fleet_slip.open(root).model("again").manifest.signals
     done_on(root, "publish", "once", "--model", ",".join(chosen), "--force")
     found = fleet_slip.open(root).evaluate_measured("again", "true", ["once"]).content

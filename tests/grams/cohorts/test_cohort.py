@@ -10,15 +10,21 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
-from fleet_slip.grams import reader
 from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
+from fleet_slip.grams.drive_weights import (
+    FULL,
+    MAX_LOST_SHARE,
+    DriveWeights,
+    robust_weights,
+    weighted,
+)
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.gram_files import hash_names
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import GramReader
-from fleet_slip.grams.weights import FULL, MOST_LOST, DriveWeights, robust_weights, weighted
+from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.warehouse import gram_reader
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse, open_tables
 from tests.support.catalog import CATALOG, SIGNALS
@@ -59,7 +65,7 @@ def test_drives_with_signals_are_those_of_rows_that_have_them_all() -> None:
 def test_a_car_counts_once() -> None:
     assert cohort().count_vehicles_with(["ax"]) == 1
     assert cohort().count_vehicles_with(["steering_wheel"]) == 0
-    assert cohort().count_received_with(["ax"]) == 1
+    assert cohort().count_onboard_with(["ax"]) == 1
     assert (cohort().rows, cohort().drive_count) == (40, 3)
 
 
@@ -109,7 +115,7 @@ def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) ->
         mine = [one for one, fold in zip(drives, fold_of, strict=True) if fold == number]
         assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
     assert training.folds.total.n == 20 * 80
-    table = cohort.serving(INPUTS).table
+    table = cohort.complete_cases(INPUTS).table
     assert np.array_equal(training.drives.moments, DriveMoments.from_table(table).moments)
 
 
@@ -137,7 +143,7 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[object]:
         found.append(given)
         return open_tables(*given)
 
-    monkeypatch.setattr(reader, "open_tables", counting)
+    monkeypatch.setattr(gram_reader, "open_tables", counting)
     return found
 
 
@@ -148,11 +154,11 @@ def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
         land_another(warehouse, number)
         assert [len(load_cohort(warehouse).drives) for _ in range(3)] == [number + 1] * 3
         assert len(opened) == number + 1
-    monkeypatch.setattr(reader, "USES", 3)
+    monkeypatch.setattr(gram_reader, "USES", 3)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 3
-    monkeypatch.setattr(reader, "KEPT_BYTES", 0)
+    monkeypatch.setattr(gram_reader, "KEPT_BYTES", 0)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 4
@@ -227,7 +233,7 @@ def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
     found = robust_weights(DriveMoments.from_table(table))
     lost = (table.n * (FULL - found.parts)).sum() / (FULL * table.n.sum())
-    assert 0 < lost <= MOST_LOST
+    assert 0 < lost <= MAX_LOST_SHARE
 
 
 def test_the_order_and_the_size_of_counts_do_not_matter() -> None:

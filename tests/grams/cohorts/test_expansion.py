@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import fleet_slip
+from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.errors import DataError, InputError
-from fleet_slip.grams.calibration import calibrate
+from fleet_slip.grams.calibrated_columns import expand
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.expansion import expand
 from fleet_slip.grams.folding import Folding
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score
 from fleet_slip.regression.gram import Gram
@@ -123,7 +123,7 @@ def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:
 def test_sums_over_folds_are_those_of_the_drives(filled: Warehouse) -> None:
     summed = load_cohort(filled, "true", "fleet", Folding(by="vehicle", count=10))
     total = load_cohort(filled, "true", "fleet").tables[0].total()
-    found = summed.folds("vehicle", 10).serving(WANTED[:-1], WANTED[-1]).total
+    found = summed.folds("vehicle", 10).complete_cases(WANTED[:-1], WANTED[-1]).total
     assert found == total.restrict(WANTED)
     assert "understeer_ay" not in summed.gram_condition(["understeer_ay"])
     assert "ay_mean_16" in summed.gram_condition(["understeer_ay"])
@@ -142,7 +142,7 @@ def test_a_new_car_takes_running_means_and_is_usual(filled: Warehouse) -> None:
 def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
     fleet = fleet_slip.open(filled.root)
     chosen = fleet.cohort("true").select(
-        nested="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
+        order="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
     )
     version = fleet.publish("calibrated", chosen, force=True).version
     manifest = version.manifest

@@ -9,16 +9,16 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError
-from fleet_slip.grams import reader as gram_reader
 from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
 from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import GramReader
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import answer_request, select
+from fleet_slip.models.select import run_selection, select
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import VIEWS, connect, needed_views
+from fleet_slip.warehouse import gram_reader
+from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
@@ -92,7 +92,7 @@ def test_days_add_up_to_those_of_the_drives(
         land(warehouse, str(number), *rows, day=DAY + timedelta(days=number))
     update_grams(warehouse)
     for inputs in (["ax"], ["ax", "steering_wheel"]):
-        served = load_cohort(warehouse).serving(inputs)
+        served = load_cohort(warehouse).complete_cases(inputs)
         sums = sum_days(warehouse, inputs)
         monkeypatch.setattr(gram_reader, "BATCH_ROWS", 7)
         assert sum_days(warehouse, inputs) == sums
@@ -155,7 +155,7 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     query = "SELECT count(*) FROM grams"
     with connect(tmp_path, query=query) as database:
         assert database.execute(query).fetchone() == (20,)
-    assert answer_request(warehouse, SelectionRequest()).cohort.drive_count == 20
+    assert run_selection(warehouse, SelectionRequest()).cohort.drive_count == 20
 
 
 def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:

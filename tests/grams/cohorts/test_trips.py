@@ -141,7 +141,8 @@ def test_a_log_that_was_cut_gives_the_folds_of_the_whole(roots: tuple[Fleet, Fle
     whole, cut = (load_cohort(fleet.warehouse) for fleet in roots)
     assert (whole.drive_count, cut.drive_count) == (5, 20)
     folds = [
-        cohort.folds("drive", EACH).serving(["ax", "ay"], "sideslip") for cohort in (whole, cut)
+        cohort.folds("drive", EACH).complete_cases(["ax", "ay"], "sideslip")
+        for cohort in (whole, cut)
     ]
     assert len(folds[1].names) == 5
     sums = [sorted((gram.n, gram.products) for gram in one.grams) for one in folds]

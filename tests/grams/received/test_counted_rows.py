@@ -46,7 +46,7 @@ def gram_rows(fleet: fleet_slip.Fleet) -> list[dict[str, Any]]:
 def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     grams = [gram_of(seed) for seed in range(6)]
     rows = [row_of(gram, f"VIN{i}") for i, gram in enumerate(grams)]
-    report = fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     assert (report.new, report.gram_rows, report.drives, report.rows) == (True, 6, 6, 3000)
     for row, gram in zip(gram_rows(fleet), grams, strict=True):
         assert (row["n"], tuple(row["sums"]), tuple(row["products"])) == (
@@ -56,7 +56,7 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path:
         )
         assert (row["source"], row["day"]) == ("received", date(2024, 5, 1))
     found = fleet.cohort().select(model="ax,ay")
-    assert (found.cohort.rows, found.cohort.count_received_with()) == (3000, 6)
+    assert (found.cohort.rows, found.cohort.count_onboard_with()) == (3000, 6)
     assert "sent Gram rows of logged signals" in fleet.cohort().select().remark
     assert not fleet.verify(full=True).findings
 
@@ -66,15 +66,15 @@ def test_the_same_file_counts_once_and_is_forgotten_for_good(
 ) -> None:
     rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
     path = write_counted(tmp_path / "rows", rows)
-    fleet.ingest_counted(path)
+    fleet.import_onboard_grams(path)
     before = gram_rows(fleet)
-    assert not fleet.ingest_counted(path).new
+    assert not fleet.import_onboard_grams(path).new
     assert gram_rows(fleet) == before
     fleet.forget(vehicle="VIN1")
     assert [row["vehicle_id"] for row in gram_rows(fleet)] == ["VIN2"]
     again = write_counted(tmp_path / "again", [row_of(gram_of(3), "VIN1", START_S + DAY_S)])
     with pytest.raises(InputError, match=r"row 1 \(drive VIN1-.*\) was forgotten"):
-        fleet.ingest_counted(again)
+        fleet.import_onboard_grams(again)
     assert [row["vehicle_id"] for row in gram_rows(fleet)] == ["VIN2"]
 
 
@@ -128,14 +128,14 @@ def test_a_row_that_cannot_be_keeps_the_whole_file_out(
 ) -> None:
     path = write_counted(tmp_path / "rows", [row_of(gram_of(1)), other(GRAM, **changed)])
     with pytest.raises(InputError, match=rf"rows: row [12] \(drive .*\) .*{reason}"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
     assert gram_rows(fleet) == []
 
 
 def test_a_drive_that_is_there_is_refused_under_any_name(
     fleet: fleet_slip.Fleet, tmp_path: Path
 ) -> None:
-    fleet.ingest_counted(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
     for number, rows in enumerate(
         (
             [other(GRAM), row_of(gram_of(3))],
@@ -143,9 +143,11 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
         )
     ):
         with pytest.raises(RepeatedError, match=r"row 2 .* is there already, as VIN1-2024"):
-            fleet.ingest_counted(write_counted(tmp_path / f"{number}", rows))
+            fleet.import_onboard_grams(write_counted(tmp_path / f"{number}", rows))
     with pytest.raises(InputError, match=r"row 2 .* is there twice"):
-        fleet.ingest_counted(write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))]))
+        fleet.import_onboard_grams(
+            write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))])
+        )
     assert len(gram_rows(fleet)) == 1
 
 
@@ -164,10 +166,10 @@ def test_a_replay_is_refused_on_any_day_of_any_car(
     replay = row_of(gram_of(1), drive_id="replay", **change)
     both = write_counted(tmp_path / "both", [row_of(gram_of(1)), replay])
     with pytest.raises(InputError, match=r"row 2 \(drive replay\) is there twice, first as VIN1-"):
-        fleet.ingest_counted(both)
-    fleet.ingest_counted(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
+        fleet.import_onboard_grams(both)
+    fleet.import_onboard_grams(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
     with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
-        fleet.ingest_counted(write_counted(tmp_path / "replay", [replay]))
+        fleet.import_onboard_grams(write_counted(tmp_path / "replay", [replay]))
     assert len(gram_rows(fleet)) == 1
 
 
@@ -176,11 +178,11 @@ def test_rows_of_a_standing_car_may_equal_those_of_another(
 ) -> None:
     standing = Gram.from_counts(GRAM.signals, np.zeros((3000, K), np.int64))
     rows = [row_of(standing, car) for car in ("VIN1", "VIN2")]
-    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
-    fleet.ingest_counted(write_counted(tmp_path / "third", [row_of(standing, "VIN3")]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+    fleet.import_onboard_grams(write_counted(tmp_path / "third", [row_of(standing, "VIN3")]))
     again = write_counted(tmp_path / "again", [row_of(standing, "VIN1", drive_id="again")])
     with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
-        fleet.ingest_counted(again)
+        fleet.import_onboard_grams(again)
 
 
 def long_drive(seed: int, rows: int, name: str) -> dict[str, Any]:
@@ -195,14 +197,14 @@ def test_a_car_drives_24_hours_a_day_at_most(fleet: fleet_slip.Fleet, tmp_path: 
     drives = [long_drive(seed, LONGEST_ROWS // 2, f"drive-{seed}") for seed in range(4)]
     reason = "makes its car drive more than 24 hours on a day"
     with pytest.raises(InputError, match=rf"row 3 \(drive drive-2\) {reason}"):
-        fleet.ingest_counted(write_counted(tmp_path / "three", drives[:3]))
-    fleet.ingest_counted(write_counted(tmp_path / "one", drives[:1]))
-    fleet.ingest_counted(write_counted(tmp_path / "two", drives[1:2]))
+        fleet.import_onboard_grams(write_counted(tmp_path / "three", drives[:3]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "one", drives[:1]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "two", drives[1:2]))
     other = drives[2] | {"vehicle_id": "VIN2"}
     tomorrow = drives[3] | {"day": date(2024, 5, 2)}
     with pytest.raises(InputError, match=rf"row 1 \(drive drive-2\) {reason}, with what is stored"):
-        fleet.ingest_counted(write_counted(tmp_path / "third", drives[2:3]))
-    fleet.ingest_counted(write_counted(tmp_path / "others", [other, tomorrow]))
+        fleet.import_onboard_grams(write_counted(tmp_path / "third", drives[2:3]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "others", [other, tomorrow]))
     assert len(gram_rows(fleet)) == 4
 
 
@@ -211,10 +213,10 @@ def test_an_erased_car_does_not_come_back_under_a_similar_name(
     fleet: fleet_slip.Fleet, tmp_path: Path, name: str
 ) -> None:
     rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
-    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     fleet.forget(vehicle="VIN1")
     with pytest.raises(InputError, match="was forgotten"):
-        fleet.ingest_counted(
+        fleet.import_onboard_grams(
             write_counted(tmp_path / "again", [row_of(gram_of(3), name, drive_id="a")])
         )
 
@@ -223,7 +225,7 @@ def test_names_are_stored_without_spaces_and_composed(
     fleet: fleet_slip.Fleet, tmp_path: Path
 ) -> None:
     row = row_of(gram_of(1), " Zoe\u0308 ", drive_id="d1\n")
-    fleet.ingest_counted(write_counted(tmp_path / "rows", [row]))
+    fleet.import_onboard_grams(write_counted(tmp_path / "rows", [row]))
     ((stored),) = gram_rows(fleet)
     assert (stored["vehicle_id"], stored["drive_id"]) == ("Zo\u00eb", "d1")
 
@@ -233,14 +235,14 @@ def test_an_erased_drive_is_refused_under_another_name_until_it_is_allowed(
     fleet: fleet_slip.Fleet, tmp_path: Path, subject: dict[str, Any]
 ) -> None:
     rows = [row_of(gram_of(1)), row_of(gram_of(2), "VIN2")]
-    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     assert fleet.forget(**subject).drives == 1
     again = row_of(gram_of(1), "pseudonym", START_S + DAY_S)
     path = write_counted(tmp_path / "again", [again])
     with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
     fleet.allow(**subject)
-    assert fleet.ingest_counted(path).new
+    assert fleet.import_onboard_grams(path).new
 
 
 def test_an_erased_drive_with_a_log_does_not_come_back_as_gram_rows(
@@ -251,7 +253,7 @@ def test_an_erased_drive_with_a_log_does_not_come_back_as_gram_rows(
     fleet.forget(drive=drive)
     again = write_counted(tmp_path / "rows", [same | {"vehicle_id": "pseudonym"}])
     with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
-        fleet.ingest_counted(again)
+        fleet.import_onboard_grams(again)
 
 
 def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:
@@ -269,7 +271,7 @@ def test_a_drive_with_a_log_is_refused(smoke_copy: Path, tmp_path: Path) -> None
     same, _ = renamed(fleet, "other")
     path = write_counted(tmp_path / "rows", [same])
     with pytest.raises(RepeatedError, match="is there already"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
 
 
 def test_pages_need_checksums_and_a_flipped_bit_is_found(
@@ -280,29 +282,29 @@ def test_pages_need_checksums_and_a_flipped_bit_is_found(
     for options in ({}, {"use_dictionary": False}, {"compression": "none"}):
         pq.write_table(table, path, **options)
         with pytest.raises(InputError, match="no checksums"):
-            fleet.ingest_counted(path)
+            fleet.import_onboard_grams(path)
     pq.write_table(table, path, write_page_checksum=True, compression="none")
     content = bytearray(path.read_bytes())
     at = content.index(np.array(table["products"][7].as_py()[3:5], np.int64).tobytes())
     content[at] ^= 2
     path.write_bytes(content)
     with pytest.raises(InputError, match="table of Gram rows"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
     assert gram_rows(fleet) == []
 
 
 def test_what_is_no_table_is_not_taken(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     table = rows_of_fleet(3, START_S, seed=1).drop_columns(["part", "course_late"])
-    assert fleet.ingest_counted(write_counted(tmp_path / "rows", table)).gram_rows == 3
+    assert fleet.import_onboard_grams(write_counted(tmp_path / "rows", table)).gram_rows == 3
     (tmp_path / "text").write_text("FSGR")
     with pytest.raises(InputError, match="table of Gram rows"):
-        fleet.ingest_counted(tmp_path / "text")
+        fleet.import_onboard_grams(tmp_path / "text")
     write_counted(tmp_path / "lacks", rows_of_fleet(3, START_S, seed=1).drop_columns(["n"]))
     with pytest.raises(InputError, match="column n is missing"):
-        fleet.ingest_counted(tmp_path / "lacks")
+        fleet.import_onboard_grams(tmp_path / "lacks")
     write_counted(tmp_path / "empty", pa.Table.from_pylist([], schema=COLUMNS))
     with pytest.raises(InputError, match="has no Gram rows"):
-        fleet.ingest_counted(tmp_path / "empty")
+        fleet.import_onboard_grams(tmp_path / "empty")
 
 
 def test_the_command_says_what_landed(run_command: RunCommand, tmp_path: Path) -> None:
@@ -319,7 +321,7 @@ def test_rows_of_a_drive_go_when_its_log_comes(smoke_root: Path, tmp_path: Path)
     fleet = fleet_slip.open(tmp_path / "data")
     other = row_of(gram_of(1), drive_id=drive)  # the same name, and other counts
     rows = [same, other, row_of(gram_of(2), "VIN2")]
-    fleet.ingest_counted(write_counted(tmp_path / "rows", rows))
+    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
     report = fleet.gram()
     assert report.received_dropped == 2

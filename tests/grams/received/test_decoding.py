@@ -44,7 +44,7 @@ def test_a_text_that_is_repeated_is_refused_by_its_decoded_size(
     for name in ("signals", "source", "feature_set", "part"):
         path = write(tmp_path / name, with_column(table, name, repeated("x" * 20_000)))
         with pytest.raises(InputError, match="decodes to more than"):
-            fleet.ingest_counted(path)
+            fleet.import_onboard_grams(path)
 
 
 def test_lists_of_equal_numbers_are_refused_before_they_are_decoded(
@@ -57,7 +57,7 @@ def test_lists_of_equal_numbers_are_refused_before_they_are_decoded(
     path = write(tmp_path / "rows", with_column(table, "sums", zeros))
     assert path.stat().st_size < 20_000
     with pytest.raises(InputError, match="decodes to more than"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
 
 
 def test_a_column_that_is_not_documented_is_not_read(
@@ -68,20 +68,20 @@ def test_a_column_that_is_not_documented_is_not_read(
     content = bytearray(path.read_bytes())
     content[content.index(b"marked text")] ^= 1  # its checksum no longer fits
     path.write_bytes(content)
-    assert fleet.ingest_counted(path).gram_rows == 20
+    assert fleet.import_onboard_grams(path).gram_rows == 20
 
 
 def test_a_column_of_another_type_is_named(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     table = rows_of_fleet(2, START_S, seed=1)
     nested = with_column(table, "n", list_array(np.zeros((2, 1), np.int64)))
     with pytest.raises(InputError, match=r"column n has the type list<.*write it as int64"):
-        fleet.ingest_counted(write(tmp_path / "nested", nested))
+        fleet.import_onboard_grams(write(tmp_path / "nested", nested))
     texts = with_column(table, "sums", pa.array([["1"], ["2"]]))
     with pytest.raises(InputError, match=r"column sums has the type list<"):
-        fleet.ingest_counted(write(tmp_path / "texts", texts))
+        fleet.import_onboard_grams(write(tmp_path / "texts", texts))
     twice = table.append_column("n", table["n"])
     with pytest.raises(InputError, match="two columns n"):
-        fleet.ingest_counted(write(tmp_path / "twice", twice))
+        fleet.import_onboard_grams(write(tmp_path / "twice", twice))
 
 
 def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Pa
         pa.array([row[field.name]], wide.get(field.name, field.type)) for field in on_board.COLUMNS
     ]
     table = pa.table(columns, names=on_board.COLUMNS.names)
-    assert fleet.ingest_counted(write(tmp_path / "rows", table)).rows == 500
+    assert fleet.import_onboard_grams(write(tmp_path / "rows", table)).rows == 500
 
 
 def test_texts_that_repeat_prefixes_are_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_texts_that_repeat_prefixes_are_refused(fleet: fleet_slip.Fleet, tmp_pat
         column_encoding={"drive_id": "DELTA_BYTE_ARRAY"},
     )
     with pytest.raises(InputError, match="drive_id has the encoding DELTA_BYTE_ARRAY"):
-        fleet.ingest_counted(path)
+        fleet.import_onboard_grams(path)
 
 
 @pytest.mark.parametrize("version", ["1.0", "2.0"])

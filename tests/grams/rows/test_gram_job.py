@@ -16,11 +16,11 @@ from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
 from fleet_slip.grams.check import check_grams, differing_drives, grams_of
 from fleet_slip.grams.compute import aggregate, compute_grams
-from fleet_slip.grams.gram_files import find_backlog, gram_table, is_of_received, named_files
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
+from fleet_slip.warehouse.gram_rows import find_backlog, gram_table, is_onboard_file, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
@@ -202,10 +202,10 @@ def test_rows_of_cars_are_not_read(tmp_path: Path) -> None:
     fleet = fleet_slip.open(tmp_path / "data")
     path = tmp_path / "day"
     write_counted(path, rows_of_fleet(3, START_S, seed=1))
-    fleet.ingest_counted(path)
+    fleet.import_onboard_grams(path)
     grams = fleet.warehouse.grams.snapshot()
     [file] = grams.files
-    assert is_of_received(file)
+    assert is_onboard_file(file)
     Path(str(fleet.warehouse.grams.folder), file.path).write_bytes(b"nobody reads it")
     found = find_backlog(fleet.warehouse.logs.snapshot(), grams)
     assert not found.missing

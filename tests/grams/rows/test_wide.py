@@ -27,7 +27,7 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
 from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.export.models import DEFINITIONS as OF_MODELS
@@ -244,7 +244,7 @@ def test_duckdb_takes_as_many_sums_of_a_group_as_a_statement_may_have() -> None:
     for name in ("gated", "course"):
         with pytest.raises(QuestionError, match="SQL cannot compute"):
             gram_statement(CATALOG, name)
-    sums = ", ".join(f"sum(i + {n})" for n in range(statement.MOST_SUMS))
+    sums = ", ".join(f"sum(i + {n})" for n in range(statement.MAX_SUMS))
     with duckdb.connect() as database:
         rows = database.execute(f"SELECT {sums} FROM range(9) t(i) GROUP BY i % 3").fetchall()
     assert sorted(row[0] for row in rows) == [9, 12, 15]

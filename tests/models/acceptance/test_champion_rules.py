@@ -11,12 +11,12 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError, StorageError
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.models.publish import Publication, manifest_of, publish_challenger, would_publish
 from fleet_slip.models.registry import CANDIDATE, Registry
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.marked_models import models_trained_on
 from fleet_slip.regression.choice import ZERO_TOLERANCE
@@ -75,7 +75,9 @@ def publish_from(
     warehouse: Warehouse, cohort: str = "true", signals: str = "ay,yaw_rate", **options: Any
 ) -> Publication:
     """Select on a cohort and publish the winner, of which a dry run said what it comes to."""
-    answer = answer_request(warehouse, SelectionRequest(nested=signals, worth="0.0001deg"), cohort)
+    answer = run_selection(
+        warehouse, SelectionRequest(order=signals, tolerance="0.0001deg"), cohort
+    )
     manifest = manifest_of(answer, "beta")
     told = would_publish(registry_of(warehouse), manifest, answer, **options)
     done = publish_challenger(registry_of(warehouse), manifest, answer, **options)
@@ -162,7 +164,7 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
         publish_from(champion)
     with pytest.raises(StorageError, match="checksum"):
         fleet_slip.open(str(champion.root)).publish(
-            "beta", answer_request(champion, SelectionRequest(nested="ay,yaw_rate"))
+            "beta", run_selection(champion, SelectionRequest(order="ay,yaw_rate"))
         )
     assert publish_from(champion, force=True).new
 
@@ -185,12 +187,12 @@ def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
 
 def test_the_champion_is_compared_as_it_is_not_fitted_anew(more: Warehouse) -> None:
     version = registry_of(more).load("beta", 1)
-    request = SelectionRequest(nested="ay,yaw_rate")
-    answer = answer_request(more, request, "drive_id LIKE 'more%'")
+    request = SelectionRequest(order="ay,yaw_rate")
+    answer = run_selection(more, request, "drive_id LIKE 'more%'")
     comparison = champion_rules.compare(answer, [version])
-    (as_it_is,) = comparison.incumbents
-    assert as_it_is.counts.coefficients == version.manifest.counts_model(CATALOG).coefficients
-    assert as_it_is.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
+    (frozen,) = comparison.incumbents
+    assert frozen.counts.coefficients == version.manifest.counts_model(CATALOG).coefficients
+    assert frozen.pooled.rows == comparison.challenger.pooled.rows == 48 * ROWS
 
 
 def test_a_champion_has_no_advantage_on_drives_that_made_it(
@@ -198,19 +200,19 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules.Floor, "worth", ZERO_TOLERANCE)
+    monkeypatch.setattr(champion_rules.PublishThresholds, "tolerance", ZERO_TOLERANCE)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
-    first = answer_request(warehouse, SelectionRequest(model=every))
+    first = run_selection(warehouse, SelectionRequest(model=every))
     made = publish_challenger(registry_of(warehouse), manifest_of(first, "beta"), first, force=True)
     write(warehouse, "more", 16, noise=400.0)
-    version, answer = made.version, answer_request(warehouse, SelectionRequest(model=every))
+    version, answer = made.version, run_selection(warehouse, SelectionRequest(model=every))
     assert champion_rules.compare(answer, [version]).better
     fair = champion_rules.compare_unseen(registry_of(warehouse), answer, [version])
     assert fair is not None
     assert fair.challenger.drives == fair.incumbents[0].drives == 16
     assert not fair.better
-    judged = champion_rules.judge(
+    judged = champion_rules.review_challenger(
         registry_of(warehouse), version, manifest_of(answer, "beta"), answer
     )
     assert "16 drives that are new to both" in judged.reason
@@ -220,12 +222,12 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: Warehouse) -> None:
     """Columns chosen with the held-out cars in view would flatter the challenger."""
     version = registry_of(champion).load("beta", 1)
-    request = SelectionRequest(nested=",".join(CHOICE), search="forward", most=4)
-    answer = answer_request(champion, request)
+    request = SelectionRequest(order=",".join(CHOICE), search="forward", max_features=4)
+    answer = run_selection(champion, request)
     winner = next(model for model in answer.models if len(model.signals) == 4)
     answer = replace(answer, winner=replace(answer.winner, model=winner))
     found = champion_rules.compare(answer, [version]).challenger
-    groups = answer.cohort.folds("vehicle", champion_rules.GROUPS).serving(
+    groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).complete_cases(
         CHOICE, LABEL, sparse=True
     )
     assert found.fold_names == groups.names
@@ -247,8 +249,8 @@ def test_cars_are_held_out_where_there_are_several_else_drives(
     write(warehouse, "good", 60)
     cohort = " OR ".join(f"vehicle_id = 'car-{i}'" for i in range(cars))
     version = publish_from(warehouse, cohort).version
-    request = SelectionRequest(nested="ay,yaw_rate")
-    comparison = champion_rules.compare(answer_request(warehouse, request, cohort), [version])
+    request = SelectionRequest(order="ay,yaw_rate")
+    comparison = champion_rules.compare(run_selection(warehouse, request, cohort), [version])
     assert (comparison.by, len(comparison.challenger.folds)) == (by, groups)
 
 

@@ -38,7 +38,7 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
 def training_of(drives: list[np.ndarray]) -> tuple[TrainingFolds, np.ndarray]:
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([i % 5 for i in range(len(drives))])
-    folds = CohortFolds.from_tables([table], assignment).serving(INPUTS, "y")
+    folds = CohortFolds.from_tables([table], assignment).complete_cases(INPUTS, "y")
     return TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5)), assignment.fold
 
 
@@ -78,7 +78,7 @@ def test_the_choice_is_made_again_inside_every_training_fold() -> None:
         table = table_of([gram_of(counts) for counts in rest])
         folds = CohortFolds.from_tables([table], by_value([i % 4 for i in range(16)]))
         inner = TrainingFolds(
-            folds.serving(INPUTS, "y"), DriveMoments.from_table(table), unit_scales(5)
+            folds.complete_cases(INPUTS, "y"), DriveMoments.from_table(table), unit_scales(5)
         )
         model = select_nested(inner, INPUTS, "y", rule).fit.model
         tests.append(error_sums(model, training.folds.grams[number]))
@@ -101,7 +101,7 @@ def test_inner_cross_validation_needs_folds() -> None:
     drives = sparse_drives(4, drives=6)
     table = table_of([gram_of(counts) for counts in drives])
     assignment = by_value([0, 0, 0, 1, 1, 1])
-    folds = CohortFolds.from_tables([table], assignment).serving(INPUTS, "y")
+    folds = CohortFolds.from_tables([table], assignment).complete_cases(INPUTS, "y")
     training = TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5))
     with pytest.raises(QuestionError, match="at least three folds"):
         cross_validate_selection(

@@ -84,7 +84,7 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
     assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
     assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
     with pytest.raises(DataError, match="these drives lack gyro"):
-        cohort.serving(["gyro"], "y")
+        cohort.complete_cases(["gyro"], "y")
 
 
 def test_folds_lacking_a_signal_are_an_error() -> None:
@@ -94,7 +94,7 @@ def test_folds_lacking_a_signal_are_an_error() -> None:
         [full, full.restrict(["x1", "y"])], by_value(["a", "a", "b", "b"])
     )
     with pytest.raises(DataError, match="fold b has no rows with all of x2, y"):
-        cohort.serving(["x2"], "y")
+        cohort.complete_cases(["x2"], "y")
 
 
 def test_the_hash_of_a_drive_decides_its_fold_for_ever() -> None:

@@ -26,13 +26,13 @@ from fleet_slip.config import load_config
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import FoldKey
-from fleet_slip.grams.job import update_grams
+from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import score
-from fleet_slip.models.select import answer_request
+from fleet_slip.models.select import run_selection
 from fleet_slip.operations.forget import load_retention
 from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.simulation.campaign import load_campaign
@@ -132,7 +132,8 @@ def names(rng: random.Random, place: Path) -> None:
         database.sql("FROM log").fetchall()
         database.sql("FROM drives").fetchall()
     load_cohort(warehouse, predicate)
-    answer_request(warehouse, SelectionRequest(nested="ax", by=rng.choice(FOLD_KEYS)), predicate)
+    request = SelectionRequest(order="ax", group_by=rng.choice(FOLD_KEYS))
+    run_selection(warehouse, request, predicate)
 
 
 def references(rng: random.Random, place: Path) -> None:
@@ -152,9 +153,9 @@ def references(rng: random.Random, place: Path) -> None:
         case 4:
             registry.rollback(word, word)
         case 5:
-            answer_request(warehouse, SelectionRequest(nested=f"ax,{word}", folds=2))
+            run_selection(warehouse, SelectionRequest(order=f"ax,{word}", folds=2))
         case _:
-            answer_request(
+            run_selection(
                 warehouse, SelectionRequest(models=word, features=rng.choice([word, None]))
             )
 
@@ -217,7 +218,7 @@ def _template(temporary: str) -> Path:
         warehouse.logs.snapshot().commit(Change(add=[action], transactions=[transaction]))
     program = "from fleet_slip.cli.main import main; main()"
     command = [sys.executable, "-c", program, "--root", str(root)]
-    for arguments in (["gram"], ["publish", MODEL, "--nested", "ax,ay", "--folds", "2", "--force"]):
+    for arguments in (["gram"], ["publish", MODEL, "--order", "ax,ay", "--folds", "2", "--force"]):
         subprocess.run([*command, *arguments], check=True, capture_output=True)
     return root
 
@@ -321,7 +322,7 @@ def _use(root: Path) -> None:
             lambda: read("log"),
             lambda: read("grams"),
             lambda: load_cohort(warehouse),
-            lambda: answer_request(warehouse, SelectionRequest(nested="ax,ay", folds=2)),
+            lambda: run_selection(warehouse, SelectionRequest(order="ax,ay", folds=2)),
             lambda: score(
                 warehouse, Registry(LocalFolder(root), CATALOG).resolve(MODEL).manifest, "true"
             ),

@@ -1,8 +1,8 @@
 """How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
 
-The numbers of a car are exact functions of the sum of its drives' Gram rows (`car_estimates`) and
-of what the roads of all cars have in common, so that they are the same in whatever order drives
-came, and a drive that is forgotten is gone from them.
+The parameters of a car are exact functions of the sums of its drives (`sensor_relations`) and of
+what the roads of all cars have in common. They do not depend on the order of drives, and nothing of
+an erased drive remains in them.
 
 How sure they are follows from how much single drives move them: drives are the independent pieces
 of evidence. One drive has no other to differ from, so that the variance of residuals, as drives
@@ -10,29 +10,28 @@ differ, is that of the whole fleet; how much a car's driving determines is its o
 the same roads again, so that there is a limit to what more of them determine.
 """
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import date
 from fractions import Fraction
 from math import hypot, sqrt
 from statistics import median, pstdev
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.calibration_parameters import (
-    CALIBRATION,
-    CALIBRATION_PARAMETERS,
-    DELAY,
-    CalibrationParameterName,
+from fleet_slip.calibration.receiver_delay import (
+    LASTING_S,
+    NO_RECEIVERS,
+    ReceiverDelays,
+    receiver_delays,
 )
-from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.course import TURNED, turned_scale
-from fleet_slip.catalog.drive_sources import ALL_DRIVES
-from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.car_estimates import (
+from fleet_slip.calibration.sensor_relations import (
     KINDS,
     LACKING,
     LASTING_BY_SATELLITE,
@@ -43,21 +42,81 @@ from fleet_slip.grams.car_estimates import (
     estimate_numbers,
     kinds_by_set,
 )
-from fleet_slip.grams.reader import (
-    DriveSums,
-    GramReader,
-    OpenedGrams,
-    collect_sums,
-    open_grams,
+from fleet_slip.catalog.calibration_parameters import (
+    CALIBRATION,
+    CALIBRATION_PARAMETERS,
+    DELAY,
+    CalibrationParameterName,
 )
-from fleet_slip.grams.receiver_delay import LASTING_S, NO_RECEIVERS, ReceiverDelays, receiver_delays
-from fleet_slip.quality.course_relation import COLUMNS
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import sqrt as sqrt_exact
-from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
+from fleet_slip.warehouse.gram_reader import GramReader, OpenedGrams, open_grams
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.predicate import Predicate, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
+
+# The sums of every drive of every car, from Gram rows that are read batch by batch.
+
+Drive = tuple[str, date, str]
+"""Car, day and name: the order in which a car drove."""
+
+
+@dataclass(frozen=True)
+class DriveSums:
+    """Sums of columns over rows that have them all, by drive; `cars` tells where each begins."""
+
+    drives: tuple[Drive, ...]
+    table: GramTable
+    cars: Mapping[str, slice]
+
+
+def collect_sums(
+    batches: Iterable[pa.RecordBatch],
+    kinds: Mapping[str, tuple[str, ...]],
+    *,
+    lacking: Mapping[str, str] = MappingProxyType({}),
+    unnamed: bool = False,
+) -> dict[str, DriveSums]:
+    """Return the sums of the columns of each kind over every drive that says whose it is.
+
+    Rows that have the column that a kind is `lacking` are left out of it. With `unnamed` also over
+    drives that do not say it, as of a car without a name.
+    """
+    parts: dict[str, list[GramTable]] = defaultdict(list)
+    drives: dict[str, list[Drive]] = defaultdict(list)
+    for batch in batches:
+        some = batch if unnamed else batch.filter(batch["vehicle_id"].is_valid())
+        for names, rows, _ in by_signals(some):
+            if not len(rows):
+                continue
+            table = gram_table(names, rows)
+            keys = (rows[key].to_pylist() for key in ("vehicle_id", "day", "drive_id"))
+            of = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
+            for kind, columns in kinds.items():
+                there = set(names.split(","))
+                if set(columns) <= there and lacking.get(kind) not in there:
+                    parts[kind].append(table.restrict(columns))
+                    drives[kind] += of
+    return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}
+
+
+def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:
+    drives = sorted(set(rows))
+    number = {drive: i for i, drive in enumerate(drives)}
+    at = np.array([number[row] for row in rows], dtype=np.int64)
+    names = ("n", "sums", "products")
+    stacked = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+    table = GramTable(parts[0].signals, *stacked).merged(at)
+    cars: dict[str, slice] = {}
+    for i, (car, _, _) in enumerate(drives):
+        cars[car] = slice(cars[car].start if car in cars else i, i + 1)
+    return DriveSums(tuple(drives), table, cars)
+
 
 # What the roads of a fleet have in common: they lean to one side, and are banked in bends.
 #
@@ -549,36 +608,3 @@ def calibrate(
         of = "" if predicate.text == ALL_DRIVES else f" of {predicate.quoted}"
         raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
     return calibration
-
-
-# What the course of each drive comes to, from the Gram rows of any set of changes of it.
-
-Moments = Mapping[str, Mapping[str, FloatArray]]
-"""Sums of products of 1, `COLUMNS` and the label in SI units, by car and drive, shape (6, 6)."""
-
-
-def course_moments(reader: GramReader, predicate: Predicate) -> Moments:
-    """Return the moments of each drive that has changes of the course.
-
-    Of the first feature set whose Gram rows are there for the whole cohort; empty without one.
-    """
-    catalog = reader.catalog
-    columns = (*COLUMNS, catalog.signals.label)
-    scale_of: dict[str, Fraction | float] = {**catalog.input_scales}
-    scale_of[TURNED] = turned_scale(catalog.signals)
-    scales = np.array([1.0, *(float(scale_of[name]) for name in columns)])
-    for name in catalog.sets:
-        feature_set = catalog.feature_set(name)
-        if feature_set.change_ticks and set(COLUMNS) <= set(feature_set.columns):
-            try:
-                opened = reader.opened(name, predicate)
-            except DataError:  # it has not been computed, or not for all
-                continue
-            by_kind = collect_sums(opened.batches(predicate), {"course": columns}, unnamed=True)
-            if sums := by_kind.get("course"):
-                moments = sums.table.moments() * np.outer(scales, scales)
-                return {
-                    car: {sums.drives[i][2]: moments[i] for i in range(at.start, at.stop)}
-                    for car, at in sums.cars.items()
-                }
-    return {}

@@ -11,15 +11,15 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalog.calibration_parameters import (
-    BY_COURSE,
-    BY_SATELLITE,
-    CALIBRATION_PARAMETERS,
+from fleet_slip.calibration.car_calibration import (
+    CalibratedNumber,
+    CarEvidence,
+    DriveSums,
+    calibrate,
+    collect_sums,
+    roads_of,
 )
-from fleet_slip.catalog.course import TURNED, turned_scale
-from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.calibration import CalibratedNumber, CarEvidence, calibrate, roads_of
-from fleet_slip.grams.car_estimates import (
+from fleet_slip.calibration.sensor_relations import (
     EVEN,
     FLAT,
     KINDS,
@@ -33,8 +33,14 @@ from fleet_slip.grams.car_estimates import (
     estimate_numbers,
     kinds_by_set,
 )
-from fleet_slip.grams.job import update_grams
-from fleet_slip.grams.reader import DriveSums, collect_sums
+from fleet_slip.catalog.calibration_parameters import (
+    BY_COURSE,
+    BY_SATELLITE,
+    CALIBRATION_PARAMETERS,
+)
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram

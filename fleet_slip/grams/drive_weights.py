@@ -19,13 +19,13 @@ FULL = 16
 """The weight of a drive that is as others are."""
 USUAL_ERRORS = 3.0
 """Root mean squares of the median drive that a drive may have without losing weight."""
-MOST_LOST = 0.1
+MAX_LOST_SHARE = 0.1
 """Of the weight of all rows: where more is unusual, nothing is usual."""
-MOST_ROUNDS = 50
+MAX_ROUNDS = 50
 
 
 @dataclass(frozen=True)
-class Weighed(Record):
+class DownweightedDrive(Record):
     """A drive that counts less than others.
 
     Attributes:
@@ -49,26 +49,26 @@ class Weighed(Record):
 
 @dataclass(frozen=True)
 class DriveWeights:
-    """The weight of each drive in parts of `FULL`, and `Weighed.times` of each, (drives,)."""
+    """Weight of each drive in parts of `FULL`, and `DownweightedDrive.times`; shape (drives,)."""
 
     parts: IntArray
     times: FloatArray
 
-    def of(self, drive: int) -> Weighed:
+    def of(self, drive: int) -> DownweightedDrive:
         """Return what became of a drive."""
-        return Weighed(float(self.parts[drive]) / FULL, float(self.times[drive]))
+        return DownweightedDrive(float(self.parts[drive]) / FULL, float(self.times[drive]))
 
 
 def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeights:
     """Return weights min(1, c median rms / rms)^2 of drives, fitted and weighed in turn.
 
     `drives` are the moments of the inputs, the label last. c is `USUAL_ERRORS`, or so large that no
-    more than `MOST_LOST` of the weight of rows is lost.
+    more than `MAX_LOST_SHARE` of the weight of rows is lost.
     """
     each = drives.moments[:, int(not intercept) :, int(not intercept) :]
     rows, limit = drives.moments[:, 0, 0], USUAL_ERRORS
     found = _weigh(each, rows, limit)
-    while float(rows @ (FULL - found.parts)) > MOST_LOST * FULL * float(rows.sum()):
+    while float(rows @ (FULL - found.parts)) > MAX_LOST_SHARE * FULL * float(rows.sum()):
         limit *= 1.25
         found = _weigh(each, rows, limit)
     return found
@@ -94,7 +94,7 @@ def weighted(table: GramTable, parts: IntArray) -> GramTable:
 def _weigh(each: FloatArray, rows: FloatArray, limit: float) -> DriveWeights:
     """Fit and weigh in turn until no weight changes; `each` are moments, the label last."""
     parts = np.full(len(each), FULL, dtype=np.int64)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         total = np.einsum("d,dij->ij", parts.astype(np.float64), each)
         slopes = np.linalg.pinv(total[:-1, :-1], rcond=1e-13, hermitian=True) @ total[:-1, -1]
         error = np.append(slopes, -1.0)

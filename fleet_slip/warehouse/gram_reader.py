@@ -2,16 +2,12 @@
 
 import contextlib
 import shlex
-from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import date
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Self
 
 import duckdb
-import numpy as np
 import pyarrow as pa
 
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
@@ -20,11 +16,11 @@ from fleet_slip.catalog.course import TURNED
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, LONGEST_PAUSE_S, RECEIVER, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError
-from fleet_slip.grams.gram_files import by_signals, find_backlog, gram_table
-from fleet_slip.regression.gram import GramTable, packed_size
+from fleet_slip.regression.gram import packed_size
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.connections import IdleConnection
+from fleet_slip.warehouse.gram_rows import find_backlog
 from fleet_slip.warehouse.predicate import Predicate, guarded_query
 from fleet_slip.warehouse.warehouse import Warehouse, gram_snapshots, lock, open_tables
 
@@ -241,61 +237,3 @@ def cohort_files(source: Warehouse | GramReader, predicate: Predicate) -> set[st
     if not found:
         raise DataError(f"no drive with a log satisfies {predicate.quoted}.")
     return found
-
-
-# The sums of every drive of every car, from Gram rows that are read batch by batch.
-
-Drive = tuple[str, date, str]
-"""Car, day and name: the order in which a car drove."""
-
-
-@dataclass(frozen=True)
-class DriveSums:
-    """Sums of columns over rows that have them all, by drive; `cars` tells where each begins."""
-
-    drives: tuple[Drive, ...]
-    table: GramTable
-    cars: Mapping[str, slice]
-
-
-def collect_sums(
-    batches: Iterable[pa.RecordBatch],
-    kinds: Mapping[str, tuple[str, ...]],
-    *,
-    lacking: Mapping[str, str] = MappingProxyType({}),
-    unnamed: bool = False,
-) -> dict[str, DriveSums]:
-    """Return the sums of the columns of each kind over every drive that says whose it is.
-
-    Rows that have the column that a kind is `lacking` are left out of it. With `unnamed` also over
-    drives that do not say it, as of a car without a name.
-    """
-    parts: dict[str, list[GramTable]] = defaultdict(list)
-    drives: dict[str, list[Drive]] = defaultdict(list)
-    for batch in batches:
-        some = batch if unnamed else batch.filter(batch["vehicle_id"].is_valid())
-        for names, rows, _ in by_signals(some):
-            if not len(rows):
-                continue
-            table = gram_table(names, rows)
-            keys = (rows[key].to_pylist() for key in ("vehicle_id", "day", "drive_id"))
-            of = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
-            for kind, columns in kinds.items():
-                there = set(names.split(","))
-                if set(columns) <= there and lacking.get(kind) not in there:
-                    parts[kind].append(table.restrict(columns))
-                    drives[kind] += of
-    return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}
-
-
-def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:
-    drives = sorted(set(rows))
-    number = {drive: i for i, drive in enumerate(drives)}
-    at = np.array([number[row] for row in rows], dtype=np.int64)
-    names = ("n", "sums", "products")
-    stacked = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-    table = GramTable(parts[0].signals, *stacked).merged(at)
-    cars: dict[str, slice] = {}
-    for i, (car, _, _) in enumerate(drives):
-        cars[car] = slice(cars[car].start if car in cars else i, i + 1)
-    return DriveSums(tuple(drives), table, cars)

@@ -13,14 +13,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
+from fleet_slip.calibration.car_calibration import calibration_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.course import BESIDE, TURNED
 from fleet_slip.catalog.definitions import ParameterFactor
 from fleet_slip.catalog.drive_sources import ALL_DRIVES
-from fleet_slip.grams.calibration import calibration_of
-from fleet_slip.grams.gram_files import by_signals, gram_table
-from fleet_slip.grams.reader import OpenedGrams
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
+from fleet_slip.warehouse.gram_reader import OpenedGrams
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.predicate import parse_predicate
 
 # Removes what a gyroscope's bias and scale do to the Gram rows of changes, drive by drive.
@@ -31,7 +31,7 @@ from fleet_slip.warehouse.predicate import parse_predicate
 # then zero, and products add up over drives.
 
 
-def swept(table: GramTable) -> GramTable:
+def without_constant_columns(table: GramTable) -> GramTable:
     """Return the table without `BESIDE`, the turned `TURNED`, and what is constant in a drive."""
     signals = tuple(name for name in table.signals if name not in BESIDE)
     kept = [table.signals.index(name) for name in signals]
@@ -81,7 +81,7 @@ class Expansion:
             if self.sweep:
                 if TURNED not in names.split(","):
                     continue  # these drives have no change
-                table = swept(gram_table(names, rows))
+                table = without_constant_columns(gram_table(names, rows))
             else:
                 table = gram_table(names, rows)
             if not self.columns:

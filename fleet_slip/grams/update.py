@@ -15,27 +15,30 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Progress, no_progress, pluralize
+from fleet_slip.calibration.receiver_delay import course_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
+    files_of_other_delay,
     files_to_rewrite,
-    find_backlog,
     find_superseded,
-    is_of_received,
-    is_received,
-    named_files,
     require_active,
-    rows_of_set,
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.grams.reader import cohort_files
-from fleet_slip.grams.receiver_delay import course_delays, files_of_other_delay
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
+from fleet_slip.warehouse.gram_reader import cohort_files
+from fleet_slip.warehouse.gram_rows import (
+    find_backlog,
+    is_onboard,
+    is_onboard_file,
+    named_files,
+    rows_of_set,
+)
 from fleet_slip.warehouse.predicate import parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -280,7 +283,7 @@ def _write_merged(
     some. Returns what adds the new files, the files that give way to them, and how many rows left
     that cars had sent, of drives whose logs have come since.
     """
-    looked_for = any(is_of_received(file) for file in grams.files)
+    looked_for = any(is_onboard_file(file) for file in grams.files)
     replaced: list[TableFile] = []
     superseded = 0
 
@@ -299,7 +302,7 @@ def _write_merged(
                 pc.equal(rows["feature_set"], identity), pc.is_in(rows["file"], computed)
             )
             ids = rows["drive_id"].cast(pa.string())
-            sent = pc.and_(is_received(rows), pc.is_in(ids, logged))
+            sent = pc.and_(is_onboard(rows), pc.is_in(ids, logged))
             superseded += pc.sum(sent).as_py() or 0
             yield rows.filter(pc.invert(pc.or_(dropped, sent)))
 
@@ -312,7 +315,7 @@ def _write_merged(
 # They count while their log file is active: one commit exchanges both.
 
 
-def land_ahead(
+def commit_ahead(
     warehouse: Warehouse, new: Sequence[AddAction], replaced: Collection[TableFile]
 ) -> None:
     """Land the Gram rows of new log files, of the feature sets that replaced ones have.

@@ -13,17 +13,17 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalog.calibration_parameters import DELAY
-from fleet_slip.errors import RefusedError
-from fleet_slip.grams.reader import open_grams
-from fleet_slip.grams.receiver_delay import (
+from fleet_slip.calibration.receiver_delay import (
     ReceiverDelay,
     course_delays,
     receiver_delays,
     with_pooled,
     with_types,
 )
+from fleet_slip.catalog.calibration_parameters import DELAY
+from fleet_slip.errors import RefusedError
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
+from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import parse_predicate
 from tests.support.catalog import SIGNALS
 

@@ -11,7 +11,7 @@ more so the fewer drives they have (`regression/inference.py`).
 import math
 import statistics
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,14 +20,14 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.calibration_parameters import DELAY
-from fleet_slip.catalog.course import COURSE_LATE, LATE_PARTS, MOST_EARLY, MOST_LATE
-from fleet_slip.catalog.drive_sources import RECEIVED_FILES, RECEIVER
+from fleet_slip.catalog.course import LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalog.drive_sources import RECEIVER
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
-from fleet_slip.grams.gram_files import by_signals, gram_table, is_received, rows_of_set
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.erasure_log import find_erased
+from fleet_slip.warehouse.gram_rows import by_signals, gram_table, is_onboard, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SPAN, STEP, STEPS = 40, 5, 12
@@ -262,7 +262,7 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
     def batches() -> Iterator[pa.RecordBatch]:
         identity = warehouse.catalog.identity(DELAY)
         for rows in rows_of_set(grams, identity, *columns, "signals", "n", "sums", "products"):
-            counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_received(rows))
+            counts = pc.or_(pc.is_in(rows["file"].cast(pa.string()), counted), is_onboard(rows))
             for column, names in erased.by_column.items():
                 returned = pc.is_in(rows[column].cast(pa.string()), pa.array(names, pa.string()))
                 counts = pc.and_(counts, pc.invert(returned))
@@ -273,32 +273,3 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
         car: min(max(round(one.value / GRAIN_S), least), most)
         for car, one in receiver_delays(batches()).cars.items()
     }
-
-
-def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
-    """Return the log files that have Gram rows of a set with another delay than their cars have."""
-    return {
-        name
-        for name, car, recorded in _recorded(grams, identity)
-        if recorded != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
-    }
-
-
-def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
-    """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
-    return {
-        car: recorded
-        for name, car, recorded in _recorded(grams, identity)
-        if name == log_file and recorded
-    }
-
-
-def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
-    """Return each log file, car and delay that Gram rows of a set are of; 0 where none is known."""
-    found: set[tuple[str, str, int]] = set()
-    for rows in rows_of_set(grams, identity, "file", "vehicle_id", COURSE_LATE):
-        files, cars, recorded = (
-            rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE)
-        )
-        found.update(zip(files, cars, (late or 0 for late in recorded), strict=True))
-    return found

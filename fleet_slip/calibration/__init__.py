@@ -1,0 +1,1 @@
+"""Parameters of cars and receivers, estimated from Gram rows: sensors, delay, course, intercept."""
