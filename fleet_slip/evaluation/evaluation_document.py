@@ -62,10 +62,10 @@ class Evaluation(Answer):
         if everything:
             yield _error_table(f"\n{title}", drives, names)
         else:
-            yield "Every drive, and all estimators: --all; for machines --json."
+            yield "Every drive and estimator: --all; as JSON: --json."
         if self.number:
             folder = "measured/" if is_measured else ""
-            yield Remark(f"kept as evaluations/{folder}{self.number}.json")
+            yield Remark(f"stored as evaluations/{folder}{self.number}.json")
 
 
 def _error_table(
@@ -95,11 +95,11 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
     """Tabulate the winner of each test drive."""
     coverage, model = ranking["least_coverage"], ranking["estimator"]
     return TextTable(
-        f"\n{model} wins {ranking['won']} of {ranking['drives']} test drives by RMSE, and is "
-        f"within {ranking['close_ratio']:g} of the winner on {ranking['close']} others.\nCompared "
-        f"are estimators without GPS that cover {coverage:.0%} of the rows. Drives that differ "
-        f"only in GPS count once. {model}/3 is model 3 of Table I, trained on what {model} was "
-        "trained on.",
+        f"\n{model} has the smallest RMSE on {ranking['won']} of {ranking['drives']} test drives, "
+        f"and at most {ranking['close_ratio']:g} times the smallest on {ranking['close']} others.\n"
+        f"Compared are estimators without GPS that cover {coverage:.0%} of the rows. Drives that "
+        f"differ only in GPS count once. {model}/3 is model 3 of Table I, trained on the same "
+        "cohort.",
         f"scenario|won by|RMSE deg|{model} deg|ratio",
         (standing for standing in ranking["standings"] if standing["same_as"] is None),
         "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
@@ -110,11 +110,11 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
 def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     """Tabulate statistics on measured drives, the best estimator first."""
     drives = pluralize(len(content["drives"]), "drive")
-    left_out = "quarters of their time" if content["parts_of"] == "time" else "whole"
+    held_out = "in quarters of their time" if content["parts_of"] == "time" else "whole"
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(
-        f"{content['cohort']}: {drives}, left out {left_out} in turn, in {content['parts']} parts",
-        "estimator|knows|RMSE deg|±|mean|std|correlation|rows|worst|kinds left out",
+        f"{content['cohort']}: {drives}, held out {held_out}, in {content['parts']} folds",
+        "estimator|source|RMSE deg|±|mean|std|correlation|rows|worst|kinds held out",
         (
             {**row, "name": name, "kinds": (row["kinds_left_out"] or {}).get("rmse_deg")}
             for name, row in content["estimators"].items()
@@ -125,12 +125,12 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
         left=2,
     )
     yield (
-        "±: standard error over drives; worst: RMSE of the drive that is estimated worst.\n"
+        "±: standard error over drives; worst: RMSE of the worst drive.\n"
         + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
     )
     if content["vehicle"] is None:
         yield (
-            "No filter was evaluated: the car is unknown. Give --mass, --front-axle and "
+            "No filter was evaluated, because no vehicle is known. Give --mass, --front-axle and "
             "--rear-axle, or a vehicle file with --vehicle."
         )
 

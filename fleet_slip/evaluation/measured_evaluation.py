@@ -70,8 +70,8 @@ from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
 
-FITTED = "fitted without what is judged"
-CHOSEN = "chosen and fitted without what is judged"
+FITTED = "fitted without held-out rows"
+CHOSEN = "chosen and fitted without held-out rows"
 
 
 def evaluate_measured(
@@ -347,7 +347,7 @@ class Competition:
             yield (
                 "ekf_identified",
                 FittedEstimator(
-                    "geometry, and a car identified from the other parts",
+                    "geometry, and a car identified from the other folds",
                     on_signals(identified.estimate),
                     identified.as_dict()["found"],
                 ),
@@ -367,7 +367,7 @@ class Competition:
                 yield (
                     name,
                     FittedEstimator(
-                        f"{knowledge}, and labels to be tuned by",
+                        f"{knowledge}, tuned on labels",
                         on_signals(kind.estimate, car, tuned),
                         tuned.model_dump(mode="json"),
                     ),

@@ -160,11 +160,11 @@ def standings(data: ReportData) -> ReportTable:
         "Every estimator on every test drive: root mean square error in degrees",
         ["test drive", *names],
         rows,
-        note="Green: the smallest of the row. Among all without satellite navigation "
-        f"{ranking['estimator']} wins {ranking['won']} of {ranking['drives']} drives, and comes "
-        f"within {ranking['close_ratio']} times the winner in {ranking['close']} more; drives that "
-        "differ in satellite navigation alone are one. A percentage: the share of the drive with "
-        "an estimate; such do not compete.",
+        note="Green: the smallest of the row. Of all estimators without GPS, "
+        f"{ranking['estimator']} has the smallest error on {ranking['won']} of "
+        f"{ranking['drives']} drives, and at most {ranking['close_ratio']} times the smallest on "
+        f"{ranking['close']} more. Drives that differ only in GPS count once. An estimator with a "
+        "percentage covers this share of the drive, and does not compete.",
     )
 
 
@@ -188,12 +188,12 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
     return [
         ReportTable(
             "own-car",
-            "A car of one's own: measured drives with a label",
-            ["estimator", "knows", "RMSE", "mean", "error std", "correlation", "rows"],
+            "Measured drives with a label",
+            ["estimator", "source", "RMSE", "mean", "error std", "correlation", "rows"],
             rows,
             left=2,
-            note=f"{count(len(content['drives']))} drives, left out in parts of their "
-            f"{content['parts_of']} in turn: {content['cohort']}. Green: the smallest.",
+            note=f"{count(len(content['drives']))} drives, held out by {content['parts_of']}: "
+            f"{content['cohort']}. Green: the smallest.",
         )
     ]
 

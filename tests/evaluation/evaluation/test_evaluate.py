@@ -106,7 +106,7 @@ def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
     shutil.copytree(root, copy)
     answer(copy, "evaluate", "smoke", "--scenario", str(file))
     file.write_text(file.read_text().replace("0.1", "0.2"))
-    with pytest.raises(RefusedError, match="was changed"):
+    with pytest.raises(RefusedError, match="has changed"):
         answer(copy, "evaluate", "smoke", "--scenario", str(file))
 
 

@@ -101,10 +101,10 @@ def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
     told = fleet_slip.open(own).evaluate_measured("own", four)
     assert "No filter was evaluated" in str(told)
-    assert f"kept as evaluations/measured/{told.number}.json" in str(told)
+    assert f"stored as evaluations/measured/{told.number}.json" in str(told)
     found = told.content
     assert found["vehicle"] is None
-    assert found["estimators"]["own@1"]["told"] == "chosen and fitted without what is judged"
+    assert found["estimators"]["own@1"]["told"] == "chosen and fitted without held-out rows"
     assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
     assert {name for name in found["estimators"] if "/" not in name} == {"own@1"}
     assert (len(found["drives"]), found["parts"], found["parts_of"]) == (4, 4, "drives")
