@@ -86,8 +86,8 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
-    many = len(files)
-    return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
+    count = min(count, len(files))
+    return [files[(begin + i * len(files) // count) % len(files)] for i in range(count)]
 
 
 def _compare_ways(
