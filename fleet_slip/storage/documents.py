@@ -9,8 +9,8 @@ a lost document, also the newest:
     anchors/FOLDER/3.lost          somebody accepted the loss of document 3
 
 A process killed between document and anchor leaves a valid folder; the next document is anchored
-again. Only the first and the newest anchor stay. The first one separates documents of earlier versions,
-whose checksum covers the content alone, from later ones.
+again. Only the first and the newest anchor stay. The first one separates documents of earlier
+versions, whose checksum covers the content alone, from later ones.
 """
 
 import contextlib
@@ -143,8 +143,8 @@ class DocumentFolder:
             )
         if not place and number >= min(self._anchored(), default=10**MAX_DIGITS):
             raise StorageError(
-                f"{file}: in the format of earlier versions, but the folder is of a later one; the file "
-                f"came from another place. {_RESTORE}"
+                f"{file}: in the format of earlier versions, but the folder is of a later one; the "
+                f"file came from another place. {_RESTORE}"
             )
         return document, text == _rendered(place, content, stated)
 
