@@ -24,7 +24,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.update import commit_ahead, reconcile
-from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
+from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.documents import document_folders
@@ -196,15 +196,15 @@ def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
 # They may come again: their files' transactions are withdrawn. Their Gram rows go with the files.
 
 
-def take_out(
-    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[Origin]
+def build_removal(
+    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[SourceRef]
 ) -> Change:
     """Return the change that takes the drives, or the refused rows, of some origins out."""
     if name == "quarantine":
         return _without_refused(snapshot, origins)
     drives = drives_in(warehouse, snapshot)
     gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
-    left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
+    left = {SourceRef.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
     files = {one.file for one in origins} - {one.file for one in left if one}
     transactions = Fingerprints(snapshot.transactions).withdraw(origins, files)
     concerned = [file for file in snapshot.files if gone.get(file.path)]
@@ -214,7 +214,7 @@ def take_out(
     return Change(write_again(warehouse, snapshot, kept), concerned, transactions)
 
 
-def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
+def _without_refused(snapshot: Snapshot, origins: Collection[SourceRef]) -> Change:
     def mine(rows: pa.Table) -> pa.ChunkedArray:
         names = rows["drive_id"].cast(pa.string())
         some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]

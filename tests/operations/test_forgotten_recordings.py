@@ -18,7 +18,7 @@ from fleet_slip.ingest import load
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.recordings import keep_drives, keep_refused
+from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
 from fleet_slip.ingest.stream import open_measured
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.verify import verify
@@ -206,9 +206,9 @@ def test_the_rows_of_what_was_forgotten_are_left_out(
     of_a, of_b = drives
     erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
     erasure_log.begin(ErasureSubject(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
-    assert keep_drives(drives, erasure_log) == [of_b]
+    assert drop_erased_drives(drives, erasure_log) == [of_b]
     assert cars(refused) == {"a", "b"}
-    assert cars(keep_refused(refused, erasure_log)) == {"b"}
+    assert cars(drop_erased_rejects(refused, erasure_log)) == {"b"}
 
 
 def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
@@ -216,8 +216,8 @@ def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -
     stretch = f"{refused['drive_id'][0]}-2"
     erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
     erasure_log.begin(ErasureSubject("drive", stretch), 1, [], {})
-    assert cars(keep_refused(refused, erasure_log, {stretch})) == {"b"}
-    assert cars(keep_refused(refused, erasure_log)) == {"a", "b"}
+    assert cars(drop_erased_rejects(refused, erasure_log, {stretch})) == {"b"}
+    assert cars(drop_erased_rejects(refused, erasure_log)) == {"a", "b"}
 
 
 GONE = ("WVWGONE", "track-gone", "gone.csv", "lap-gone")
