@@ -178,8 +178,8 @@ class Fleet(HealthAndUpkeep):
         """
         from fleet_slip.ingest.load import ingest_files
         from fleet_slip.ingest.mapping import keep_assumptions
-        from fleet_slip.ingest.recordings import KnownFiles
-        from fleet_slip.operations.rewriting import take_out
+        from fleet_slip.ingest.recordings import IngestCache
+        from fleet_slip.operations.rewriting import build_removal
 
         plan, logs, folders = self._chosen_logs(files, mapping)
         count = count_from_start(progress)
@@ -191,9 +191,9 @@ class Fleet(HealthAndUpkeep):
             figures.rows = 0
             warehouse = within_reach(self.warehouse, executor)
             threads = executor if folders else elsewhere
-            out = partial(take_out, self.warehouse)
+            out = partial(build_removal, self.warehouse)
             remembers = folders or replace == "corrected"
-            known = KnownFiles.of(self.warehouse, plan) if remembers else None
+            known = IngestCache.of(self.warehouse, plan) if remembers else None
             wanted = logs if known is None else known.without_landed(logs, warehouse)
             if landed := len(logs) - len(wanted):
                 count(landed, len(logs))

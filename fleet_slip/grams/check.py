@@ -12,7 +12,7 @@ from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
-from fleet_slip.grams.gram_files import recorded_cars
+from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, on_newest
@@ -86,8 +86,8 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
-    many = len(files)
-    return [files[(begin + i * many // count) % many] for i in range(min(count, many))]
+    count = min(count, len(files))
+    return [files[(begin + i * len(files) // count) % len(files)] for i in range(count)]
 
 
 def _compare_ways(
@@ -98,7 +98,7 @@ def _compare_ways(
     stored = stored_grams(warehouse, [file], places, identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
-    late = recorded_cars(warehouse.grams.snapshot(), identity, file.path)
+    late = recorded_delays(warehouse.grams.snapshot(), identity, file.path)
     rows = wide_grams(warehouse, [file], feature_set, late)
     computed, others = grams_of(rows), {"the stored Gram rows": stored}
     if has_statement(warehouse.catalog, feature_set):

@@ -1,6 +1,6 @@
-"""Gram rows as arrays, and their files: of which log files they are, and how they are written.
+"""Files of Gram rows: digests of rows, writing, merging, and the course delays they were made with.
 
-Each file is of one feature set; they are neither too many nor too large.
+A file contains rows of one feature set. Small files are merged, so that there are never too many.
 """
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -33,25 +33,25 @@ from fleet_slip.warehouse.gram_rows import (
 from fleet_slip.warehouse.warehouse import Warehouse
 
 Hashes = NDArray[np.uint64]
-"""Hashes of drives or cars: what tells one from others, in 8 bytes."""
+"""The first 8 bytes of the SHA-256 of ids of drives or cars."""
 
 
 def hash_names(ids: pa.Array | pa.ChunkedArray) -> Hashes:
     """Return the hash of each id of a drive or a car, see `Hashes`."""
-    first = b"".join([sha256(one.encode("utf-8")).digest()[:8] for one in ids.to_pylist()])
-    return np.frombuffer(first, dtype=">u8").astype(np.uint64)
+    starts = b"".join([sha256(text.encode("utf-8")).digest()[:8] for text in ids.to_pylist()])
+    return np.frombuffer(starts, dtype=">u8").astype(np.uint64)
 
 
-# Digests identify Gram rows by their counts, whatever their drive, car or day is called.
+# Digests identify Gram rows by their counts, under any name of drive or car and any day.
 
 MIN_EVENTFUL_ROWS = 256
 MIN_EVENTFUL_SIGNALS = 2
-"""Signals with a variance of one count or more. Rows with less, as of a car that stands, can be
-equal by chance."""
+"""Signals with a variance of one count or more. Rows with fewer, such as those of a standing car,
+can be equal by chance."""
 
 
 def find_eventful(table: GramTable) -> BoolArray:
-    """Return which Gram rows vary so much that no two drives have equal ones."""
+    """Return a mask of the Gram rows that vary too much to be equal in two drives."""
     n, column = table.n[:, None], np.arange(len(table.signals))
     variances = table.products[:, column * (column + 3) // 2] / n - (table.sums / n) ** 2
     varying: BoolArray = (variances >= 1).sum(axis=1) >= MIN_EVENTFUL_SIGNALS
@@ -59,9 +59,9 @@ def find_eventful(table: GramTable) -> BoolArray:
 
 
 def gram_digests(rows: pa.Table) -> tuple[list[str], BoolArray]:
-    """Return 16 characters for each Gram row that depend on its counts, and which are eventful.
+    """Return a digest of 16 characters of the counts of each Gram row, and the eventful rows.
 
-    Those of a row that is not depend on its car and day too, as those of `digest_counts` do.
+    The digest of a row that is not eventful depends on its car and day too, as in `digest_counts`.
     """
     digests, eventful = np.empty(len(rows), dtype=object), np.zeros(len(rows), dtype=np.bool_)
     for signals, alike, mask in by_signals(rows):
@@ -73,68 +73,81 @@ def gram_digests(rows: pa.Table) -> tuple[list[str], BoolArray]:
         columns = ("feature_set", "part", "vehicle_id", "day")
         names = zip(*(alike[name].to_pylist() for name in columns), strict=True)
         digests[mask] = [
-            _digest(feature_set, part, signals, "" if alone else f"{vehicle}\n{day}", row)
-            for (feature_set, part, vehicle, day), alone, row in zip(
+            _digest(feature_set, block, signals, "" if alone else f"{vehicle}\n{day}", row)
+            for (feature_set, block, vehicle, day), alone, row in zip(
                 names, is_eventful, numbers, strict=True
             )
         ]
     return digests.tolist(), eventful
 
 
-def _digest(feature_set: str, part: str | None, signals: str, owner: str, numbers: IntArray) -> str:
-    text = f"{feature_set}\n{part or ''}\n{signals}\n{owner}\n"
+def _digest(
+    feature_set: str, block: str | None, signals: str, owner: str, numbers: IntArray
+) -> str:
+    text = f"{feature_set}\n{block or ''}\n{signals}\n{owner}\n"
     return blake2b(text.encode() + numbers.tobytes(), digest_size=8).hexdigest()
 
 
-# How files are written, and written again.
+# Writing and rewriting of files.
 
 FILE_ROWS = 100_000
-"""Gram rows of a file, some 700 bytes each; with fewer it is small, and may be merged."""
+"""Gram rows of a full file, some 700 bytes each."""
 
 FILE_BYTES = 2**28
-"""Most bytes of the Gram rows of a file; a row of 200 columns has 160,000."""
+"""Maximum size of the Gram rows of a file in memory; a row of 200 columns has 160,000 bytes."""
 
 SMALL_FILES_MAX = 32
-"""So many small Gram files may stand side by side before a commit merges some."""
+"""Number of small Gram files beyond which a commit merges some."""
 
 
-def write_rows(warehouse: Warehouse, parts: Iterable[pa.Table]) -> list[AddAction]:
-    """Write Gram rows part by part; return the actions that add the files."""
-    actions: list[AddAction] = []
-    waiting: list[pa.Table] = []
-    for part in parts:
-        step = max(1, min(FILE_ROWS, FILE_BYTES * len(part) // max(1, part.nbytes)))
-        for first in range(0, part.num_rows, step):
-            waiting.append(part.slice(first, step))
-            rows = sum(some.num_rows for some in waiting)
-            if rows >= FILE_ROWS or sum(some.nbytes for some in waiting) >= FILE_BYTES:
-                actions += _write_files(warehouse, _together(waiting))
-                waiting.clear()
-    return actions + (_write_files(warehouse, _together(waiting)) if waiting else [])
+class GramWriter:
+    """Writes Gram rows into files of usual size, and collects the actions that add them."""
+
+    def __init__(self, warehouse: Warehouse) -> None:
+        self._warehouse = warehouse
+        self._buffer: list[pa.Table] = []
+        self._actions: list[AddAction] = []
+
+    def write(self, rows: pa.Table) -> None:
+        """Buffer Gram rows; write files as soon as they are full."""
+        step = max(1, min(FILE_ROWS, FILE_BYTES * len(rows) // max(1, rows.nbytes)))
+        for start in range(0, rows.num_rows, step):
+            self._buffer.append(rows.slice(start, step))
+            count = sum(table.num_rows for table in self._buffer)
+            if count >= FILE_ROWS or sum(table.nbytes for table in self._buffer) >= FILE_BYTES:
+                self._flush()
+
+    def close(self) -> list[AddAction]:
+        """Write the remaining Gram rows; return the actions that add all files."""
+        if self._buffer:
+            self._flush()
+        return self._actions
+
+    def _flush(self) -> None:
+        """Write a file for each feature set, and others for rows from cars."""
+        rows = pa.concat_tables(self._buffer, promote_options="default")  # optional columns differ
+        self._buffer.clear()
+        table, onboard = self._warehouse.grams, is_onboard(rows)
+        for prefix, selected in ((ONBOARD_PREFIX, onboard), ("", pc.invert(onboard))):
+            same_origin = _only(rows, selected)
+            for identity in sorted(same_origin["feature_set"].unique().to_pylist()):
+                same_set = _only(same_origin, pc.equal(same_origin["feature_set"], identity))
+                optional = set(table.optional).intersection(same_set.column_names)
+                empty = [name for name in optional if same_set[name].null_count == len(same_set)]
+                file = table.write_file(f"{prefix}{identity}", same_set.drop_columns(empty))
+                self._actions.append(file)
 
 
-def _together(parts: Sequence[pa.Table]) -> pa.Table:
-    return pa.concat_tables(parts, promote_options="default")  # some lack an optional column
+def write_rows(warehouse: Warehouse, tables: Iterable[pa.Table]) -> list[AddAction]:
+    """Write Gram rows table by table; return the actions that add the files."""
+    writer = GramWriter(warehouse)
+    for rows in tables:
+        writer.write(rows)
+    return writer.close()
 
 
-def _write_files(warehouse: Warehouse, rows: pa.Table) -> list[AddAction]:
-    """Write a file for each feature set, and others for received rows, not to be computed again."""
-    came = is_onboard(rows)
-    actions = []
-    for prefix, some in ((ONBOARD_PREFIX, came), ("", pc.invert(came))):
-        mine = _only(rows, some)
-        for identity in sorted(mine["feature_set"].unique().to_pylist()):
-            part = _only(mine, pc.equal(mine["feature_set"], identity))
-            optional = set(warehouse.grams.optional).intersection(part.column_names)
-            empty = [name for name in optional if part[name].null_count == len(part)]
-            part = part.drop_columns(empty)
-            name = f"{prefix}{identity}"
-            actions.append(warehouse.grams.write_file(name, part))
-    return actions
-
-
-def _only(rows: pa.Table, some: pa.ChunkedArray) -> pa.Table:
-    return rows if pc.all(some).as_py() else rows.filter(some)
+def _only(rows: pa.Table, mask: pa.ChunkedArray) -> pa.Table:
+    return rows if pc.all(mask).as_py() else rows.filter(mask)
 
 
 def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
@@ -151,7 +164,7 @@ def files_to_rewrite(grams: Snapshot, stale: frozenset[str]) -> list[TableFile]:
 
 
 def _files_to_merge(grams: Snapshot) -> set[str]:
-    """Return small files that make one of usual size, if too many are: each night merges a few."""
+    """Return small files that fill two files together, if there are too many small ones."""
     small = sorted((_fullness(file), file.path) for file in grams.files if _fullness(file) < 1)
     if len(small) <= SMALL_FILES_MAX:
         return set()
@@ -160,7 +173,7 @@ def _files_to_merge(grams: Snapshot) -> set[str]:
 
 
 def _fullness(file: TableFile) -> float:
-    """Return how full a file is; encoded, Gram rows take down to a quarter of their memory."""
+    """Return the size of a file over that of a full one; encoding saves up to three quarters."""
     return max(file.rows / FILE_ROWS, file.size_bytes / (FILE_BYTES / 4))
 
 
@@ -198,9 +211,9 @@ _COMPARED = ("drive_id", "feature_set", "vehicle_id", "day", "signals", "n", "su
 
 
 def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[str], set[str]]:
-    """Return the drives without a log that new rows of logs are of, and the files that have them.
+    """Return the drives whose logs have arrived after the Gram rows from their cars, and the files.
 
-    The logs count, and the rows that cars sent go, those of other feature sets with them.
+    Logs supersede the rows from cars in all feature sets.
     """
     paths = {grams.table.uri(file.path): file.path for file in grams.files if is_onboard_file(file)}
     if not paths or not new_rows:
@@ -210,9 +223,9 @@ def find_superseded(grams: Snapshot, new_rows: Sequence[pa.Table]) -> tuple[set[
         logged = pa.concat_tables([rows.select(_COMPARED) for rows in new_rows])
         database.register("logged", logged)
         database.execute("SET VARIABLE gram_files = $files", {"files": list(paths)})
-        with reading_files(database, "looking for drives whose logs have come"):
-            found = database.execute(statement).fetchall()
-    return {drive for drive, _ in found}, {paths[file] for _, file in found}
+        with reading_files(database, "finding drives whose logs have arrived"):
+            matches = database.execute(statement).fetchall()
+    return {drive for drive, _ in matches}, {paths[file] for _, file in matches}
 
 
 def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
@@ -225,33 +238,33 @@ def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
         )
 
 
-# Delays of receivers that the courses in Gram rows were corrected for.
+# Receiver delays that the courses in Gram rows were corrected for.
 
 
-def files_of_other_delay(grams: Snapshot, identity: str, late: Mapping[str, int]) -> set[str]:
-    """Return the log files that have Gram rows of a set with another delay than their cars have."""
+def files_of_other_delay(grams: Snapshot, identity: str, delays: Mapping[str, int]) -> set[str]:
+    """Return the log files whose Gram rows of a feature set have another delay than their cars."""
     return {
-        name
-        for name, car, recorded in _recorded(grams, identity)
-        if recorded != late.get(car, 0) and not name.startswith(RECEIVED_FILES)
+        path
+        for path, car, delay in _recorded_delays(grams, identity)
+        if delay != delays.get(car, 0) and not path.startswith(RECEIVED_FILES)
     }
 
 
-def recorded_cars(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
-    """Return the delays that the Gram rows of a set of one log file were corrected by, by car."""
+def recorded_delays(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
+    """Return the delays that Gram rows of a log file were corrected for, by car."""
     return {
-        car: recorded
-        for name, car, recorded in _recorded(grams, identity)
-        if name == log_file and recorded
+        car: delay
+        for path, car, delay in _recorded_delays(grams, identity)
+        if path == log_file and delay
     }
 
 
-def _recorded(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
-    """Return each log file, car and delay that Gram rows of a set are of; 0 where none is known."""
-    found: set[tuple[str, str, int]] = set()
+def _recorded_delays(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
+    """Return the log files, cars and delays in the Gram rows of a feature set; 0 if unknown."""
+    triples: set[tuple[str, str, int]] = set()
     for rows in rows_of_set(grams, identity, "file", "vehicle_id", COURSE_LATE):
-        files, cars, recorded = (
+        paths, cars, delays = (
             rows[name].to_pylist() for name in ("file", "vehicle_id", COURSE_LATE)
         )
-        found.update(zip(files, cars, (late or 0 for late in recorded), strict=True))
-    return found
+        triples.update(zip(paths, cars, (delay or 0 for delay in delays), strict=True))
+    return triples

@@ -1,7 +1,7 @@
-"""Makes the table `grams` agree with the active files of `logs`.
+"""Update of the table `grams` to the active files of the table `logs`.
 
-One commit adds Gram rows of new log files and drops those of inactive ones: one rule for new days,
-interrupted and repeated runs, deletions and compaction.
+One commit adds the Gram rows of new log files and drops those of inactive files. The same rule
+serves new days, interrupted and repeated runs, deletions and compaction.
 """
 
 import json
@@ -21,6 +21,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.gram_files import (
+    GramWriter,
     files_of_other_delay,
     files_to_rewrite,
     find_superseded,
@@ -45,7 +46,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 @dataclass(frozen=True)
 class GramReport(Answer):
-    """What a run of the job did for one feature set."""
+    """Result of an update of one feature set."""
 
     feature_set: str
     files_read: int
@@ -55,15 +56,15 @@ class GramReport(Answer):
     logs_version: int | None
     grams_version: int | None
     received_dropped: int = 0
-    """Gram rows that cars had sent, of drives whose logs have come since."""
+    """Gram rows from cars that the logs of the same drives replaced."""
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """Return True if Gram rows were added or dropped."""
         return bool(self.files_read or self.files_dropped)
 
     def parts(self) -> Iterator[Part]:
-        """Return remarks: what was read, and what there is."""
+        """Return remarks on the files read and the Gram rows."""
         rows = f"{pluralize(self.gram_rows, 'Gram row')} in all"
         if not self.changed:
             yield Remark(f"gram {self.feature_set}: nothing to do, {rows} are up to date")
@@ -85,18 +86,19 @@ def update_grams(
     progress: Progress = no_progress,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
-    among: Collection[str] | None = None,
+    paths: Collection[str] | None = None,
 ) -> GramReport:
-    """Bring the Gram rows of a feature set up to date. Running it again does nothing.
+    """Bring the Gram rows of a feature set up to date; repeating it does nothing.
 
-    For an executor see `compute_grams`; `among` limits the log files read. Sets corrected for
-    receivers' delays bring `delay` up to date first, and are computed again where these moved.
-    Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and `ClusterError`.
+    `paths` limits the log files that are read; for `executor` see `compute_grams`. A feature set
+    corrected for receiver delays updates `delay` first; log files whose delays changed are computed
+    again. Raises `QuestionError` for an unknown set, `StorageError`, `ConflictError` and
+    `ClusterError`.
     """
     *auxiliary, last = _needed_sets(warehouse, feature_set)
     for name in auxiliary:
-        _update_once(warehouse, progress, name, executor, among)
-    return _update_once(warehouse, progress, last, executor, among)
+        _update_set(warehouse, progress, name, executor, paths)
+    return _update_set(warehouse, progress, last, executor, paths)
 
 
 def ensure_grams(
@@ -114,25 +116,71 @@ def ensure_grams(
     step of the run under way, or a run `ensure_grams`. Raises as `update_grams`.
     """
     pending = [_find_work(warehouse, name) for name in _needed_sets(warehouse, feature_set)]
-    missing = {file.path: file.rows for work in pending for file in work.files}
-    files = None
-    if missing and cohort is not None:
-        files = cohort_files(warehouse, parse_cohort(warehouse.catalog.signals, cohort))
-        missing = {path: rows for path, rows in missing.items() if path in files}
-    if not missing or (max_rows is not None and sum(missing.values()) > max_rows):
+    rows = {file.path: file.rows for work in pending for file in work.files}
+    paths = None
+    if rows and cohort is not None:
+        paths = cohort_files(warehouse, parse_cohort(warehouse.catalog.signals, cohort))
+        rows = {path: count for path, count in rows.items() if path in paths}
+    if not rows or (max_rows is not None and sum(rows.values()) > max_rows):
         return None
     LOGGER.info(
         "computing Gram rows of %s from %s (%s): %s",
         feature_set,
-        pluralize(len(missing), "log file"),
-        pluralize(sum(missing.values()), "row"),
+        pluralize(len(rows), "log file"),
+        pluralize(sum(rows.values()), "row"),
         reason,
     )
     arguments = [f"--features={feature_set}", *([f"--cohort={cohort}"] if cohort else [])]
     with recorded_step(warehouse.root, "ensure_grams", arguments) as figures:
-        report = update_grams(warehouse, feature_set=feature_set, among=files)
+        report = update_grams(warehouse, feature_set=feature_set, paths=paths)
         figures.rows = report.rows_read
     return report
+
+
+def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
+    """Update all feature sets that were computed before, except for `unreadable` log files."""
+    grams = warehouse.grams.snapshot()
+    catalog = warehouse.catalog
+    identities = {name: catalog.identity(name) for name in warehouse.feature_sets()}
+    computed = {
+        name: identity
+        for name, identity in identities.items()
+        if grams.landed(transaction_name(identity)) is not None
+    }
+    drives = {
+        name: _distinct(grams, identity, "drive_id")
+        for name, identity in computed.items()
+        if catalog.feature_set(name).windows
+    }
+    reports = []
+    for name in computed:
+        paths = None
+        if name in drives:  # windows are computed for the drives that had them, not for all
+            plain = warehouse.grams.snapshot()
+            paths = set(_distinct(plain, PLAIN, "file", drives[name]).to_pylist())
+        if unreadable:
+            active = {file.path for file in warehouse.logs.snapshot().files}
+            paths = (active if paths is None else paths).difference(unreadable)
+        reports.append(update_grams(warehouse, feature_set=name, paths=paths))
+    return reports
+
+
+def _distinct(
+    grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
+) -> pa.Array:
+    """Return the distinct values of a column in the Gram rows of a feature set, or some drives."""
+    values = [pa.array([], pa.string())]
+    for rows in rows_of_set(grams, identity, *{"drive_id", column}):
+        texts = rows[column].cast(pa.string())
+        if drives is not None:
+            texts = texts.filter(pc.is_in(rows["drive_id"].cast(pa.string()), drives))
+        values.append(texts.unique())
+    return pa.concat_arrays(values).unique()
+
+
+def transaction_name(identity: str) -> str:
+    """Return the name of the transaction that adds Gram rows of a feature set."""
+    return f"gram/{identity}"
 
 
 def _needed_sets(warehouse: Warehouse, feature_set: str) -> tuple[str, ...]:
@@ -143,9 +191,48 @@ def _needed_sets(warehouse: Warehouse, feature_set: str) -> tuple[str, ...]:
     return (feature_set,)
 
 
+@retrying
+def _update_set(
+    warehouse: Warehouse,
+    progress: Progress,
+    feature_set: str,
+    executor: Executor | None,
+    paths: Collection[str] | None,
+) -> GramReport:
+    """Update one feature set: find the work, compute and write Gram rows, commit."""
+    work = _find_work(warehouse, feature_set)
+    if work.logs.version is None and work.stale:
+        raise StorageError(
+            f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
+            f"{pluralize(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
+            "a backup."
+        )
+    if paths is not None:
+        work = work.limited_to(paths)
+    grams, superseded = work.grams, 0
+    if work:
+        rows = compute_grams(warehouse, work.files, progress, feature_set, executor, work.delays)
+        added, replaced, superseded = _write_files(warehouse, work, rows)
+        _commit(work.grams, work.logs, work.identity, added, replaced)
+        # Who removed a log file may have found no Gram row of its drives, and so changed none: the
+        # next attempt drops the rows that were committed here.
+        require_active(work.logs.renewed(), work.files)
+        grams = warehouse.grams.snapshot()
+    return GramReport(
+        feature_set=work.identity,
+        files_read=len(work.files),
+        rows_read=sum(file.rows for file in work.files),
+        files_dropped=len(work.stale),
+        gram_rows=grams.rows,
+        logs_version=work.logs.version,
+        grams_version=grams.version,
+        received_dropped=superseded,
+    )
+
+
 @dataclass(frozen=True)
 class _Work:
-    """What separates the Gram rows of a feature set from the log files.
+    """Difference between the Gram rows of a feature set and the log files.
 
     Attributes:
         grams, logs: the snapshots that were compared.
@@ -168,15 +255,15 @@ class _Work:
         return bool(self.files or self.stale)
 
     def limited_to(self, paths: Collection[str]) -> "_Work":
-        """Return the work without the log files that are not among `paths`."""
+        """Return the work without the log files that are not in `paths`."""
         files = tuple(file for file in self.files if file.path in paths)
         return replace(self, files=files, outdated=self.outdated & frozenset(paths))
 
 
 def _find_work(warehouse: Warehouse, feature_set: str) -> _Work:
     """Compare the Gram rows of a feature set with the log files; change nothing."""
-    # The logs are looked at last: if they lose a drive from now on, whoever removed it changes its
-    # Gram rows after this snapshot of them, and a commit on it is a conflict.
+    # The snapshot of the logs is the later one. Who removes a drive from the logs after it changes
+    # the Gram rows after the snapshot of these, and a commit on that snapshot is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
     identity = warehouse.catalog.identity(feature_set)
@@ -190,137 +277,45 @@ def _find_work(warehouse: Warehouse, feature_set: str) -> _Work:
     return _Work(grams, logs, identity, files, outdated, backlog.stale, delays)
 
 
-def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list[GramReport]:
-    """Bring up to date what was computed here before, but for `unreadable` log files."""
-    grams = warehouse.grams.snapshot()
-    identities = {name: warehouse.catalog.identity(name) for name in warehouse.feature_sets()}
-    used = [n for n, i in identities.items() if grams.landed(transaction_name(i)) is not None]
-    over_time = [name for name in used if warehouse.catalog.feature_set(name).windows]
-    drives = {name: _unique(grams, identities[name], "drive_id") for name in over_time}
-    reports = []
-    for name in used:
-        among = None
-        if name in drives:
-            plain = warehouse.grams.snapshot()
-            among = set(_unique(plain, PLAIN, "file", drives[name]).to_pylist())
-        if unreadable:
-            active = {file.path for file in warehouse.logs.snapshot().files}
-            among = (active if among is None else among).difference(unreadable)
-        reports.append(update_grams(warehouse, feature_set=name, among=among))
-    return reports
-
-
-def _unique(
-    grams: Snapshot, identity: str, column: str, drives: pa.Array | None = None
-) -> pa.Array:
-    found = [pa.array([], pa.string())]
-    for rows in rows_of_set(grams, identity, *{"drive_id", column}):
-        values = rows[column].cast(pa.string())
-        if drives is not None:
-            values = values.filter(pc.is_in(rows["drive_id"].cast(pa.string()), drives))
-        found.append(values.unique())
-    return pa.concat_arrays(found).unique()
-
-
-def transaction_name(identity: str) -> str:
-    """Return the name of the transaction that lands Gram rows of a feature set."""
-    return f"gram/{identity}"
-
-
-@retrying
-def _update_once(
-    warehouse: Warehouse,
-    progress: Progress,
-    feature_set: str,
-    executor: Executor | None,
-    among: Collection[str] | None,
-) -> GramReport:
-    work = _find_work(warehouse, feature_set)
-    if work.logs.version is None and work.stale:
-        raise StorageError(
-            f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
-            f"{pluralize(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
-            "a backup."
-        )
-    if among is not None:
-        work = work.limited_to(among)
-    grams, dropped = work.grams, 0
-    if work:
-        new_rows = compute_grams(
-            warehouse, work.files, progress, feature_set, executor, work.delays
-        )
-        add, replaced, dropped = _write_merged(
-            warehouse, work.grams, new_rows, work.stale, work.identity, work.outdated
-        )
-        _land(work.grams, work.logs, work.identity, add, replaced)
-        # Who removed a file may have found no Gram row of its drives, and so have changed none; the
-        # next attempt drops those that landed.
-        require_active(work.logs.renewed(), work.files)
-        grams = warehouse.grams.snapshot()
-    return GramReport(
-        feature_set=work.identity,
-        files_read=len(work.files),
-        rows_read=sum(file.rows for file in work.files),
-        files_dropped=len(work.stale),
-        gram_rows=grams.rows,
-        logs_version=work.logs.version,
-        grams_version=grams.version,
-        received_dropped=dropped,
-    )
-
-
-def _write_merged(
-    warehouse: Warehouse,
-    grams: Snapshot,
-    new_rows: Iterable[pa.Table],
-    stale: frozenset[str],
-    identity: str,
-    again: frozenset[str],
+def _write_files(
+    warehouse: Warehouse, work: _Work, new_rows: Iterable[pa.Table]
 ) -> tuple[list[AddAction], list[TableFile], int]:
-    """Write new Gram rows, and those that stay of the files that are written again with them.
+    """Write new Gram rows, and those that remain of the files that the commit replaces.
 
-    Log files that are gone are `stale`; the feature set of an `identity` is computed `again` for
-    some. Returns what adds the new files, the files that give way to them, and how many rows left
-    that cars had sent, of drives whose logs have come since.
+    Returns the actions that add files, the replaced files, and the number of Gram rows from cars
+    that logs of the same drives supersede.
     """
-    looked_for = any(is_onboard_file(file) for file in grams.files)
-    replaced: list[TableFile] = []
+    grams, writer, logged = work.grams, GramWriter(warehouse), []
+    has_onboard = any(is_onboard_file(file) for file in grams.files)
+    for rows in new_rows:
+        writer.write(rows)
+        if has_onboard:
+            logged.append(rows)
+    drives, paths = find_superseded(grams, logged)
+    paths |= {file.path for file in files_to_rewrite(grams, work.stale | work.outdated)}
+    replaced = [file for file in grams.files if file.path in paths]
+    superseded_drives = pa.array(sorted(drives), pa.string())
+    outdated_files = pa.array(sorted(work.outdated), pa.string())
     superseded = 0
-
-    def merged() -> Iterator[pa.Table]:
-        nonlocal superseded
-        new: list[pa.Table] = []
-        for rows in new_rows:
-            new += [rows] if looked_for else []
-            yield rows
-        drives, paths = find_superseded(grams, new)
-        paths |= {file.path for file in files_to_rewrite(grams, stale | again)}
-        replaced.extend(file for file in grams.files if file.path in paths)
-        logged, computed = (pa.array(sorted(some), pa.string()) for some in (drives, again))
-        for rows in rows_to_keep(grams, replaced, stale):
-            dropped = pc.and_(
-                pc.equal(rows["feature_set"], identity), pc.is_in(rows["file"], computed)
-            )
-            ids = rows["drive_id"].cast(pa.string())
-            sent = pc.and_(is_onboard(rows), pc.is_in(ids, logged))
-            superseded += pc.sum(sent).as_py() or 0
-            yield rows.filter(pc.invert(pc.or_(dropped, sent)))
-
-    added = write_rows(warehouse, merged())
-    return added, replaced, superseded
-
-
-# Lands the Gram rows of log files before the files themselves, where others are written again.
-#
-# They count while their log file is active: one commit exchanges both.
+    for rows in rows_to_keep(grams, replaced, work.stale):
+        is_outdated = pc.and_(
+            pc.equal(rows["feature_set"], work.identity), pc.is_in(rows["file"], outdated_files)
+        )
+        ids = rows["drive_id"].cast(pa.string())
+        is_superseded = pc.and_(is_onboard(rows), pc.is_in(ids, superseded_drives))
+        superseded += pc.sum(is_superseded).as_py() or 0
+        writer.write(rows.filter(pc.invert(pc.or_(is_outdated, is_superseded))))
+    return writer.close(), replaced, superseded
 
 
 def commit_ahead(
     warehouse: Warehouse, new: Sequence[AddAction], replaced: Collection[TableFile]
 ) -> None:
-    """Land the Gram rows of new log files, of the feature sets that replaced ones have.
+    """Commit the Gram rows of log files that are about to replace others.
 
-    Raises `ConflictError` if a replaced file is gone, or the Gram rows change at that moment.
+    Gram rows count while their log file is active, so the commit of the log files exchanges both at
+    once. Computes the feature sets that the replaced files have. Raises `ConflictError` if a
+    replaced file is gone, or the Gram rows change at that moment.
     """
     files = [_as_file(action) for action in new]
     for name in warehouse.feature_sets():
@@ -330,19 +325,18 @@ def commit_ahead(
         missing = [file for file in files if file.path not in done]
         if done.isdisjoint(file.path for file in replaced) or not missing:
             continue
-        # The logs are looked at last. Whoever removes a file from them fences the Gram rows after
-        # it: a commit of Gram rows that has not seen the file go is in conflict.
-        logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())  # in whatever scales
+        # The logs are opened last, as in `_find_work`, in the scales that they have.
+        logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())
         require_active(logs, replaced)
-        late = None
+        delays = None
         if warehouse.catalog.feature_set(name).in_time:
             active = frozenset(file.path for file in logs.files)
-            late = course_delays(warehouse, grams, active)
-        rows = aggregate(warehouse, missing, feature_set=name, late=late)
-        _land(grams, logs, identity, write_rows(warehouse, [rows]))
+            delays = course_delays(warehouse, grams, active)
+        rows = aggregate(warehouse, missing, name, delays)
+        _commit(grams, logs, identity, write_rows(warehouse, [rows]))
 
 
-def _land(
+def _commit(
     grams: Snapshot,
     logs: Snapshot,
     identity: str,
@@ -355,12 +349,13 @@ def _land(
 
 
 def _as_file(action: AddAction) -> TableFile:
-    stated = json.loads(action.stats)
+    """Return a file that is not committed yet as a file of a snapshot."""
+    statistics = json.loads(action.stats)
     day = action.partition_values.get("day")
     return TableFile(
         action.path,
-        stated["numRecords"],
+        statistics["numRecords"],
         action.size,
-        stated["nullCount"],
+        statistics["nullCount"],
         date.fromisoformat(day) if day else None,
     )

@@ -30,19 +30,19 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
     FILES,
     PREFIX,
+    DuplicateDetector,
     Fingerprints,
-    KnownFiles,
-    Origin,
+    IngestCache,
     Replace,
-    SameRecordings,
+    SourceRef,
     TableName,
-    are_gone,
     digest_of,
+    drop_erased_drives,
+    drop_erased_rejects,
     file_transaction,
     fingerprints_of,
-    keep_drives,
-    keep_refused,
-    let_return,
+    is_fully_erased,
+    readmit_file,
     size_of,
     tables_of,
 )
@@ -60,20 +60,20 @@ BATCH_FILES = 500
 FAILURES_SHOWN = 5
 
 
-class AskedFile(NamedTuple):
+class IngestTask(NamedTuple):
     """A file to ingest, and the digest of what this very path had when it was ingested before."""
 
     file: Path
     earlier: str | None = None
 
 
-Batch: TypeAlias = tuple[AskedFile, ...]
-TakeOut: TypeAlias = Callable[[TableName, Snapshot, Collection[Origin]], Change]
+Batch: TypeAlias = tuple[IngestTask, ...]
+BuildRemoval: TypeAlias = Callable[[TableName, Snapshot, Collection[SourceRef]], Change]
 """Returns what takes the drives of origins, or their refused rows, out of a table."""
 
 
 @dataclass
-class _Judged(Record):
+class FileReport(Record):
     """What a file became, and what looks wrong in it."""
 
     file: str
@@ -88,7 +88,7 @@ class _Judged(Record):
 
 
 @dataclass
-class IngestReport(_Judged):
+class IngestReport(FileReport):
     """What became of one file."""
 
     DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
@@ -118,7 +118,7 @@ class SignalRange:
 
 
 @dataclass
-class Preview(_Judged, Answer):
+class Preview(FileReport, Answer):
     """What would become of a file."""
 
     DOCUMENT = "file *counts ranges suspicions"
@@ -155,8 +155,8 @@ class WrittenFile:
     digest: str
     report: IngestReport
     fingerprints: dict[str, int] = field(default_factory=dict)
-    same: frozenset[Origin] = frozenset()
-    replaced: frozenset[Origin] = frozenset()
+    same: frozenset[SourceRef] = frozenset()
+    replaced: frozenset[SourceRef] = frozenset()
 
 
 class NewFiles(NamedTuple):
@@ -176,9 +176,9 @@ class WrittenBatch:
     new: dict[TableName, NewFiles]
 
     @property
-    def replaced(self) -> frozenset[Origin]:
+    def replaced(self) -> frozenset[SourceRef]:
         """What gives way to it."""
-        return frozenset[Origin]().union(*(one.replaced for one in self.files))
+        return frozenset[SourceRef]().union(*(one.replaced for one in self.files))
 
 
 def ingest_files(
@@ -186,15 +186,15 @@ def ingest_files(
     files: Iterable[Path],
     mapping: Mapping,
     executor: Executor | None = None,
-    known: KnownFiles | None = None,
+    known: IngestCache | None = None,
     replace: Replace = "no",
-    take_out: TakeOut | None = None,
+    build_removal: BuildRemoval | None = None,
 ) -> Iterator[IngestReport]:
     """Ingest files, and yield a report of each as it is committed; small files land together.
 
     An executor's workers read batches in any order, but its threads none of large files, each of
     which keeps all cores busy. `known` remembers what is in. A recording that is there is refused,
-    unless it is to be replaced: then `take_out` takes it out in the same commit.
+    unless it is to be replaced: then `build_removal` takes it out in the same commit.
 
     At the end raises `InputError`, which names all files that cannot be used, or `RepeatedError`
     where all of these are there already; `ClusterError` for files that workers died of; and
@@ -208,12 +208,14 @@ def ingest_files(
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
     failures: list[InputError] = []
-    asked = (AskedFile(file, known.digest_of(file) if known else None) for file in files)
+    asked = (IngestTask(file, known.digest_of(file) if known else None) for file in files)
     for batch, written in _written(executor, write, _batches(asked)):
         # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
         digest = digest_of([one.digest for one in written.files])
         note = {"job": "ingest", "mapping": mapping.name, "digest": digest}
-        committed, new = commit_batch(warehouse, written, partial(write, batch), note, take_out)
+        committed, new = commit_batch(
+            warehouse, written, partial(write, batch), note, build_removal
+        )
         failures += committed.failures
         for one in committed.files:
             transaction = file_transaction(one.digest).name
@@ -239,9 +241,9 @@ def _written(
     yield from ((batch, write(batch)) for batch in alone)
 
 
-def _batches(files: Iterable[AskedFile]) -> Iterator[Batch]:
+def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
     """Group files, in their order, into batches of `BATCH_BYTES` and one file at least."""
-    batch: list[AskedFile] = []
+    batch: list[IngestTask] = []
     size = 0
     for asked in files:
         more = size_of(asked.file)
@@ -260,7 +262,7 @@ def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> Ingest
     report.new = is_new
     if not is_new:
         report.suspicions, report.drives_replaced = (), 0
-        if not report.drives_forgotten and are_gone(warehouse, one.digest):
+        if not report.drives_forgotten and is_fully_erased(warehouse, one.digest):
             report.drives_forgotten = report.counts.drives
             report.counts = dataclasses.replace(report.counts, drives=0, ticks=0)
     return report
@@ -294,7 +296,7 @@ def write_batch(
     """
     failures: list[InputError] = []
     written: list[WrittenFile] = []
-    longest: list[tuple[_Judged, MeasuredDrive | None]] = []
+    longest: list[tuple[FileReport, MeasuredDrive | None]] = []
     with ThreadPoolExecutor(WRITERS) as writers:
         batch = _Writer(warehouse, mapping, files, writers, replace)
         for asked in files:
@@ -319,7 +321,7 @@ def write_batch(
 
 
 def _judge_longest(
-    signals: SignalCatalog, results: Iterable[tuple[_Judged, MeasuredDrive | None]]
+    signals: SignalCatalog, results: Iterable[tuple[FileReport, MeasuredDrive | None]]
 ) -> None:
     """Add what looks wrong in the longest drive of files to the report of its file.
 
@@ -350,7 +352,7 @@ class _Writer:
         self.forgotten, self._number = self.erasure_log.begun(), len(files)
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
-        self._same = SameRecordings(warehouse, logs, mapping.name, replace)
+        self._same = DuplicateDetector(warehouse, logs, mapping.name, replace)
 
     def _look(self) -> Snapshot:
         """Look at the tables as they are now; return a snapshot of the logs."""
@@ -362,21 +364,23 @@ class _Writer:
         """Whether a file's rows are neither in a table nor about to be."""
         return digest not in self.data[name].digests and not self._landed[name](FILES + digest)
 
-    def write(self, stream: MeasuredStream, asked: AskedFile) -> WrittenFile:
+    def write(self, stream: MeasuredStream, asked: IngestTask) -> WrittenFile:
         """Read a file, and write all but its last rows, which wait; return what it became.
 
         Raises `InputError`, and `RepeatedError` for a recording that is in the logs.
         """
         digest, first_drive = stream.digest, drive_id(stream.prefix, 0)
-        if not self._lacks("logs", digest) and let_return(self.warehouse, digest, first_drive):
+        if not self._lacks("logs", digest) and readmit_file(self.warehouse, digest, first_drive):
             self._look()
         is_new = self._lacks("logs", digest)
         for name, data in self.data.items():
             data.begin_log(digest, wanted=is_new and self._lacks(name, digest))
-        fingerprints = {f"{PREFIX}{stream.content[:16]}": Origin.of(digest).number}
+        fingerprints = {f"{PREFIX}{stream.content[:16]}": SourceRef.of(digest).number}
         left_out, ticks = set[str](), 0
         for drives in _groups(stream.drives()):
-            kept = keep_drives(sorted(drives, key=lambda drive: drive.drive_id), self.erasure_log)
+            kept = drop_erased_drives(
+                sorted(drives, key=lambda drive: drive.drive_id), self.erasure_log
+            )
             left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
             ticks += _rows_of(kept)
             if is_new and kept:
@@ -384,7 +388,7 @@ class _Writer:
                 self.data["logs"].add(log_table(kept, self.mapping), full=full)
                 fingerprints |= fingerprints_of(kept)
         for table, following in pairwise(chain(stream.quarantine(), [None])):
-            allowed = keep_refused(table, self.erasure_log, left_out)
+            allowed = drop_erased_rejects(table, self.erasure_log, left_out)
             self.data["quarantine"].add(allowed, full=following is not None)
         report = IngestReport(str(asked.file), stream.counts, new=is_new)
         one = WrittenFile(asked.file, digest, report)
@@ -425,7 +429,7 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     Raises `InputError`.
     """
     previews: list[Preview] = []
-    for batch in _batches(map(AskedFile, logs)):
+    for batch in _batches(map(IngestTask, logs)):
         results = [preview_log(task.file, mapping) for task in batch]
         _judge_longest(mapping.signal_catalog, results)
         previews += [preview for preview, _ in results]
@@ -591,7 +595,7 @@ def commit_batch(
     written: WrittenBatch,
     write: Callable[[], WrittenBatch],
     note: dict[str, str],
-    take_out: TakeOut | None = None,
+    build_removal: BuildRemoval | None = None,
 ) -> tuple[WrittenBatch, frozenset[str]]:
     """Commit what was written of a batch; return it, and the transactions added to the logs.
 
@@ -621,8 +625,8 @@ def commit_batch(
             snapshot = tables[name].snapshot()
         new = written.new[name]
         gone = Change()
-        if written.replaced and take_out and written.new["logs"].files:
-            gone = take_out(name, snapshot, written.replaced)
+        if written.replaced and build_removal and written.new["logs"].files:
+            gone = build_removal(name, snapshot, written.replaced)
         transactions = {
             transaction.name: transaction for transaction in (*gone.transactions, *new.transactions)
         }

@@ -45,7 +45,9 @@ def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
 # What was forgotten does not come back.
 
 
-def keep_drives(drives: Sequence[MeasuredDrive], erasure_log: ErasureLog) -> list[MeasuredDrive]:
+def drop_erased_drives(
+    drives: Sequence[MeasuredDrive], erasure_log: ErasureLog
+) -> list[MeasuredDrive]:
     """Return the drives that were not forgotten under any name, nor their cars."""
     cars = {drive.drive_id: str(drive.metadata["vehicle_id"]) for drive in drives}
     erased = erasure_log.erased(set(cars.values()), set(cars))
@@ -59,7 +61,7 @@ def keep_drives(drives: Sequence[MeasuredDrive], erasure_log: ErasureLog) -> lis
     ]
 
 
-def keep_refused(
+def drop_erased_rejects(
     refused: pa.Table, erasure_log: ErasureLog, left_out: Collection[str] = ()
 ) -> pa.Table:
     """Return the refused rows of what was not forgotten; `left_out` are drives of their file.
@@ -97,7 +99,7 @@ MEASURED = rf"-([0-9a-f]{{{DIGEST_CHARACTERS}}})[0-9a-f]{{2}}((-[0-9]+){{1,2}})$
 _MEASURED = re.compile(MEASURED)
 
 
-class Origin(NamedTuple):
+class SourceRef(NamedTuple):
     """Where a recording is from: the first characters of a file's digest, and a drive's hash or 0.
 
     0 stands for the whole file.
@@ -107,12 +109,12 @@ class Origin(NamedTuple):
     drive: int = 0
 
     @classmethod
-    def of(cls, digest: str) -> "Origin":
+    def of(cls, digest: str) -> "SourceRef":
         """Return the origin of a file with this digest."""
         return cls(digest[:DIGEST_CHARACTERS])
 
     @classmethod
-    def of_drive(cls, drive_id: str) -> "Origin | None":
+    def of_drive(cls, drive_id: str) -> "SourceRef | None":
         """Return the origin of a drive; None if its name is not that of a measured one."""
         if (found := _MEASURED.search(drive_id)) is None:
             return None
@@ -120,7 +122,7 @@ class Origin(NamedTuple):
         return cls(found[1], 1 + hashed % (2**_DRIVE_BITS - 1))
 
     @classmethod
-    def of_number(cls, number: int) -> "Origin":
+    def of_number(cls, number: int) -> "SourceRef":
         """Return the origin that a fingerprint's number says."""
         digest = number >> (_KIND_BITS + _DRIVE_BITS)
         return cls(f"{digest:0{DIGEST_CHARACTERS}x}", number % 2**_DRIVE_BITS)
@@ -132,14 +134,14 @@ class Origin(NamedTuple):
         return int(self.digest, 16) << (_KIND_BITS + _DRIVE_BITS) | kind | self.drive
 
     @property
-    def file(self) -> "Origin":
+    def file(self) -> "SourceRef":
         """The file that it is, or is in."""
-        return Origin(self.digest)
+        return SourceRef(self.digest)
 
 
-def is_from(drive_id: str, origins: Collection[Origin]) -> bool:
+def is_from(drive_id: str, origins: Collection[SourceRef]) -> bool:
     """Whether a drive is one of some, or came in a file of theirs."""
-    origin = Origin.of_drive(drive_id)
+    origin = SourceRef.of_drive(drive_id)
     return origin is not None and (origin in origins or origin.file in origins)
 
 
@@ -152,27 +154,27 @@ class Fingerprints:
         self._numbers = {name: n for name, n in there.items() if name.startswith(PREFIX)}
         self._files = [name for name in there if name.startswith(FILES)]
 
-    def find(self, fingerprints: Iterable[str]) -> frozenset[Origin]:
+    def find(self, fingerprints: Iterable[str]) -> frozenset[SourceRef]:
         """Return which files, and which drives of others, have the same fingerprints."""
         numbers = map(self._numbers.get, fingerprints)
-        return frozenset(Origin.of_number(number) for number in numbers if number is not None)
+        return frozenset(SourceRef.of_number(number) for number in numbers if number is not None)
 
     def withdraw(
-        self, origins: Collection[Origin], files: Collection[Origin]
+        self, origins: Collection[SourceRef], files: Collection[SourceRef]
     ) -> list[AppTransaction]:
         """Return what withdraws fingerprints of origins, and files themselves that are all gone."""
         of_drives = [
             name
             for name, number in self._numbers.items()
-            if (origin := Origin.of_number(number)) in origins or origin.file in files
+            if (origin := SourceRef.of_number(number)) in origins or origin.file in files
         ]
-        of_files = [n for n in self._files if Origin.of(n.removeprefix(FILES)) in files]
+        of_files = [n for n in self._files if SourceRef.of(n.removeprefix(FILES)) in files]
         return [AppTransaction(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
 def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
     """Return the fingerprint of each drive's counts, and the number of its origin."""
-    of = ((drive, Origin.of_drive(drive.drive_id)) for drive in drives)
+    of = ((drive, SourceRef.of_drive(drive.drive_id)) for drive in drives)
     return {f"{PREFIX}{drive.counts_digest}": origin.number for drive, origin in of if origin}
 
 
@@ -191,7 +193,7 @@ def digest_of(digests: Sequence[str]) -> str:
 
 
 @dataclass
-class KnownFiles:
+class IngestCache:
     """Which content the files of this machine had when they were ingested through a mapping.
 
     `digests` has size, time of change and digest by path.
@@ -201,7 +203,7 @@ class KnownFiles:
     digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, warehouse: Warehouse, mapping: Mapping) -> "KnownFiles":
+    def of(cls, warehouse: Warehouse, mapping: Mapping) -> "IngestCache":
         """Return what is remembered for a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
         cache = cache_folder("ingested") / f"{about[:32]}.json"
@@ -255,7 +257,7 @@ def size_of(log: Path) -> int:
 # What becomes of a file whose recording is in the logs already.
 
 
-class SameRecordings:
+class DuplicateDetector:
     """Looks for the recordings of a batch of files, in the logs and in the batch."""
 
     def __init__(
@@ -275,7 +277,7 @@ class SameRecordings:
         fingerprints: Named[str, int],
         name: str,
         earlier: str | None,
-    ) -> tuple[frozenset[Origin], frozenset[Origin], int]:
+    ) -> tuple[frozenset[SourceRef], frozenset[SourceRef], int]:
         """Return what has a file's fingerprints, there or not, what gives way, and how many drives.
 
         `name` is the file's as `source_file` has it; `earlier` is the digest of what its path had
@@ -293,7 +295,7 @@ class SameRecordings:
         origins = self._logs_have.find(fingerprints)
         changed = earlier is not None and earlier != digest
         if earlier is not None and changed:
-            origins |= {Origin.of(earlier)}
+            origins |= {SourceRef.of(earlier)}
         there = _drives_of(self._warehouse, {origin.file for origin in origins})
         replaced = _replaced(there, origins, name)
         drives = [drive for drive in there if is_from(drive, replaced)]
@@ -314,11 +316,11 @@ class SameRecordings:
                 f"the old one: --replace. To remove it: fleet-slip forget --drive {drives[0]}"
             )
         self._batch.update(fingerprints)
-        self._files[Origin.of(digest).digest] = log
+        self._files[SourceRef.of(digest).digest] = log
         return origins, replaced if drives else frozenset(), len(drives)
 
 
-def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
+def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
     """Withdraw a file of which no drive is left, and whose first one may come back; say if so.
 
     Only what was forgotten by a drive's name may: what is too old stays away.
@@ -332,7 +334,7 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
     def attempt(table: Table) -> None:
         snapshot = table.snapshot()
-        if _drives_of(warehouse, {Origin.of(digest)}):
+        if _drives_of(warehouse, {SourceRef.of(digest)}):
             return
         if snapshot.landed(f"{FILES}{digest}") not in {None, WITHDRAWN}:
             transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
@@ -343,16 +345,18 @@ def let_return(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
     return True
 
 
-def are_gone(warehouse: Warehouse, digest: str) -> bool:
+def is_fully_erased(warehouse: Warehouse, digest: str) -> bool:
     """Whether drives were forgotten, and none is left of a file that was ingested."""
     return bool(ErasureLog(warehouse.root).entries()) and not _drives_of(
-        warehouse, {Origin.of(digest)}
+        warehouse, {SourceRef.of(digest)}
     )
 
 
-def _replaced(there: Named[str, str], origins: frozenset[Origin], name: str) -> frozenset[Origin]:
+def _replaced(
+    there: Named[str, str], origins: frozenset[SourceRef], name: str
+) -> frozenset[SourceRef]:
     """Return what gives way: of a file of the same name all, else the drives that are the same."""
-    same = {drive: Origin.of_drive(drive) for drive in there if is_from(drive, origins)}
+    same = {drive: SourceRef.of_drive(drive) for drive in there if is_from(drive, origins)}
     return frozenset(
         origin.file if origin.file in origins or there[drive] == name else origin
         for drive, origin in same.items()
@@ -360,7 +364,7 @@ def _replaced(there: Named[str, str], origins: frozenset[Origin], name: str) -> 
     )
 
 
-def _drives_of(warehouse: Warehouse, files: Collection[Origin]) -> dict[str, str]:
+def _drives_of(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
     """Return the drives that came in some files and are in the logs, and their `source_file`."""
     if not files:
         return {}

@@ -217,15 +217,12 @@ def find_in_file(
     subject: ErasureSubject,
     drives: Collection[str],
 ) -> set[str] | None:
-    """Return a subject's drives in a file; None if no row, and no dictionary, has the subject."""
+    """Return a subject's drives in a file, None if no row is of the subject."""
     rows = table.read(file.path, ["drive_id", "vehicle_id"])
     is_quarantine = table is warehouse.quarantine
     mask = quarantined_of(rows, subject, drives) if is_quarantine else rows_of(rows, subject)
     matches = rows["drive_id"].filter(mask)
-    dictionaries = table.read_names(file.path).values()
-    if not len(matches) and not any(subject.value in names.unused for names in dictionaries):
-        return None
-    return set(matches.drop_null().to_pylist())
+    return set(matches.drop_null().to_pylist()) if len(matches) else None
 
 
 def find_remains(

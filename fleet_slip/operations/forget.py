@@ -39,7 +39,6 @@ from fleet_slip.operations.find_drives import (
 from fleet_slip.operations.marked_models import models_trained_on
 from fleet_slip.operations.rewriting import (
     Rewriting,
-    drop_unused_names,
     forget_received,
     rewrite,
     write_without,
@@ -143,8 +142,6 @@ def forget(
     models = erasure_log.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
         models = _begin(warehouse, erasure_log, subject, drives, located)
-    for name in (cleared := warehouse.root / "cleared").names():
-        cleared.delete(name)  # releases up to 0.2 listed cars there that were not forgotten
     for table in (warehouse.quarantine, warehouse.logs):
         if drives or state:
             table.fence()
@@ -155,8 +152,6 @@ def forget(
     if drives:
         _forget_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
-    if not erasure_log.names_are_exact:
-        drop_unused_names(warehouse)
     if drives or state:
         warehouse.grams.fence()
     rows += forget_received(warehouse, subject)

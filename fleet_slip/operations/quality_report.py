@@ -16,7 +16,7 @@ from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
-from fleet_slip.ingest.recordings import Origin
+from fleet_slip.ingest.recordings import SourceRef
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
@@ -185,7 +185,7 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
 
 def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
     """Return the days of drives and the files that they came in, as numbers, and their cars."""
-    origins = [Origin.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
+    origins = [SourceRef.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
     files = [one.digest if one else "" for one in origins]
     of_day, of_file, of_car = (
         np.unique(np.array(values, dtype=str), return_inverse=True)[1]

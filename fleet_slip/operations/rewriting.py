@@ -19,12 +19,12 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Progress, no_progress, pluralize
+from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.update import commit_ahead, reconcile
-from fleet_slip.ingest.recordings import Fingerprints, Origin, TableName, is_from
+from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.documents import document_folders
@@ -172,17 +172,6 @@ def write_without(
 
 
 @retrying
-def drop_unused_names(warehouse: Warehouse) -> int:
-    """Write files anew without names that none of their rows has; return how many."""
-    logs = warehouse.logs.snapshot()
-    files = [file for file in logs.files if warehouse.logs.has_unused_names(file.path)]
-    if files:
-        rewritings = [Rewriting("kept", [file]) for file in files]
-        rewrite(warehouse, logs, rewritings, note={"job": "names"}, data_change=False)
-    return len(files)
-
-
-@retrying
 def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
     """Commit the Gram rows without those that came without a log; return how many rows."""
     snapshot = warehouse.grams.snapshot()
@@ -207,15 +196,15 @@ def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
 # They may come again: their files' transactions are withdrawn. Their Gram rows go with the files.
 
 
-def take_out(
-    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[Origin]
+def build_removal(
+    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[SourceRef]
 ) -> Change:
     """Return the change that takes the drives, or the refused rows, of some origins out."""
     if name == "quarantine":
         return _without_refused(snapshot, origins)
     drives = drives_in(warehouse, snapshot)
     gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
-    left = {Origin.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
+    left = {SourceRef.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
     files = {one.file for one in origins} - {one.file for one in left if one}
     transactions = Fingerprints(snapshot.transactions).withdraw(origins, files)
     concerned = [file for file in snapshot.files if gone.get(file.path)]
@@ -225,7 +214,7 @@ def take_out(
     return Change(write_again(warehouse, snapshot, kept), concerned, transactions)
 
 
-def _without_refused(snapshot: Snapshot, origins: Collection[Origin]) -> Change:
+def _without_refused(snapshot: Snapshot, origins: Collection[SourceRef]) -> Change:
     def mine(rows: pa.Table) -> pa.ChunkedArray:
         names = rows["drive_id"].cast(pa.string())
         some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
@@ -243,7 +232,7 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
         for row in rows.to_pylist():
             found.setdefault(row["file"], set()).add(row["drive_id"])
     return {
-        file.path: found.get(file.path) or set(logs.table.read_names(file.path)["drive_id"].used)
+        file.path: found.get(file.path) or set(logs.table.read_names(file.path)["drive_id"])
         for file in logs.files
     }
 
@@ -331,8 +320,8 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
 
 # Brings the tables of a data root to this program and to the signal catalog, step by step.
 #
-# 1. Every table gets the columns that came later. No file is touched: there they are null.
-# 2. Files whose dictionaries have names that none of their rows has are written again.
+# 1. Documents of earlier formats are rewritten, and their folders anchored.
+# 2. Every table gets the columns that came later. No file is touched: there they are null.
 
 
 @dataclass(frozen=True)
@@ -342,15 +331,13 @@ class MigrationReport(Answer):
     added: tuple[str, ...]
     retired: tuple[str, ...]
     logs_version: int | None
-    files_without_names: int = 0
-    """Files that were written anew because they had names that none of their rows has."""
     sealed: tuple[str, ...] = ()
     """Folders whose documents were brought to the present format, or anchored."""
 
     @property
     def changed(self) -> bool:
         """Whether there was anything to do."""
-        return bool(self.added or self.files_without_names or self.sealed)
+        return bool(self.added or self.sealed)
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: what was added and written anew."""
@@ -358,9 +345,6 @@ class MigrationReport(Answer):
             yield Remark("migrate: nothing to do, the logs agree with the signal catalog")
         if self.added:
             yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
-        if self.files_without_names:
-            files = pluralize(self.files_without_names, "file")
-            yield Remark(f"{files} written anew, without names that none of their rows has")
         if self.sealed:
             yield Remark(f"anchored the documents of {', '.join(self.sealed)}")
 
@@ -381,9 +365,8 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
             _add_columns(table, delta, found)
     if found is None:
         return MigrationReport((), (), None, sealed=sealed)
-    cleaned = drop_unused_names(warehouse)
     version = warehouse.logs.snapshot().version
-    return MigrationReport(found.added, found.retired, version, cleaned, sealed)
+    return MigrationReport(found.added, found.retired, version, sealed)
 
 
 def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:

@@ -286,7 +286,10 @@ def _stale(age: float | None, backlog_age: float | None, limit: float | None) ->
 
 def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[str]:
     """Yield the erased cars and drives that the tables have again, and what to run."""
-    erased = find_erased(warehouse.root, warehouse.grams, snapshots, ended=True)
+    try:
+        erased = find_erased(warehouse.root, warehouse.grams, snapshots, ended=True)
+    except StorageError:  # a lost document, which `find_lost` reports
+        return
     options = [f"--vehicle {shlex.quote(printable(name))}" for name in sorted(erased.vehicles)]
     options += [f"--drive {shlex.quote(printable(name))}" for name in sorted(erased.drives)]
     if options:

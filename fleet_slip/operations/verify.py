@@ -46,7 +46,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
 from fleet_slip.storage.documents import document_folders
-from fleet_slip.storage.encoding import Names, read_names
+from fleet_slip.storage.encoding import read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
@@ -158,7 +158,7 @@ class ReadFile:
 
     file: TableFile
     problem: str | None
-    names: Mapping[str, Names] = field(default_factory=dict)
+    names: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
 
 def verify_files(
@@ -227,40 +227,22 @@ def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
 def verify_names(
     warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
 ) -> None:
-    """Look for forgotten cars; for forgotten drives too with `full`."""
-    unused = frozenset(name for one in _all(read) for name in _unused(one))
-    cars, drives = (_used(_all(read), column) for column in ("vehicle_id", "drive_id"))
-    erasure_log = ErasureLog(warehouse.root)
+    """Find files with rows of erased cars; with `full`, also of erased drives."""
+    columns = ("vehicle_id", "drive_id")
+    all_files = [file for files in read.values() for file in files]
+    cars, drives = (
+        frozenset().union(*(file.names.get(column, ()) for file in all_files)) for column in columns
+    )
     try:
-        erased = erasure_log.erased(
-            cars | unused, (drives if full else frozenset()) | unused, ended=True
-        )
+        erased = ErasureLog(warehouse.root).erased(cars, drives if full else (), ended=True)
     except StorageError:  # a lost or damaged document, which is reported as such
         return
-    wrong = {"vehicle_id": erased.vehicles, "drive_id": erased.drives}
+    names = dict(zip(columns, (erased.vehicles, erased.drives), strict=True))
     for table, files in read.items():
-        for one in files:
-            if any(not wrong[name].isdisjoint(_used([one], name)) for name in wrong):
+        for file in files:
+            if any(not names[column].isdisjoint(file.names.get(column, ())) for column in columns):
                 problem = "has rows of a car or drive that was forgotten; give forget again"
-            elif not (erased.vehicles | erased.drives).isdisjoint(_unused(one)):
-                problem = (
-                    "has the name of a car or drive that was forgotten; run: fleet-slip migrate"
-                )
-            else:
-                continue
-            report.note("name", f"{table}/{one.file.path}", problem)
-
-
-def _all(read: Mapping[str, Sequence[ReadFile]]) -> Iterator[ReadFile]:
-    return (one for files in read.values() for one in files)
-
-
-def _unused(one: ReadFile) -> frozenset[str]:
-    return frozenset().union(*(names.unused for names in one.names.values()))
-
-
-def _used(files: Collection[ReadFile] | Iterator[ReadFile], column: str) -> frozenset[str]:
-    return frozenset().union(*(one.names[column].used for one in files if column in one.names))
+                report.note("name", f"{table}/{file.file.path}", problem)
 
 
 SAMPLE = 4
@@ -352,7 +334,7 @@ def verify_documents(root: Folder, report: Verification) -> None:
         for file, problem in faults.items():
             report.note("document", file.removeprefix(f"{root}/"), problem)
         if not faults and folder.needs_seal():
-            problem = "documents without an anchor, or of release 0.2; run: fleet-slip migrate"
+            problem = "documents without an anchor or of an earlier format; run: fleet-slip migrate"
             report.note("backlog", folder.path, problem)
     for path, problem in find_changed_lines(root):
         report.note("document", path, problem)

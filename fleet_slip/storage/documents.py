@@ -9,8 +9,8 @@ a lost document, also the newest:
     anchors/FOLDER/3.lost          somebody accepted the loss of document 3
 
 A process killed between document and anchor leaves a valid folder; the next document is anchored
-again. Only the first and the newest anchor stay. The first one separates documents of release 0.2,
-whose checksum covers the content alone, from later ones.
+again. Only the first and the newest anchor stay. The first one separates documents of earlier
+versions, whose checksum covers the content alone, from later ones.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ ANCHORS = "anchors"
 """Folder of the anchors. It sorts before all others, so a copy in that order takes them first."""
 
 FORMAT = 2
-"""Format of the documents; those of release 0.2 state none."""
+"""Format of the documents. Those of versions before 0.3.0 state none."""
 
 MAX_LOST = 100
 """Number of lost documents of a folder that are listed."""
@@ -143,8 +143,8 @@ class DocumentFolder:
             )
         if not place and number >= min(self._anchored(), default=10**MAX_DIGITS):
             raise StorageError(
-                f"{file}: in the format of release 0.2, but the folder is of a later one; the file "
-                f"came from another place. {_RESTORE}"
+                f"{file}: in the format of earlier versions, but the folder is of a later one; the "
+                f"file came from another place. {_RESTORE}"
             )
         return document, text == _rendered(place, content, stated)
 
@@ -207,7 +207,7 @@ class DocumentFolder:
         return bool(numbers) and not {numbers[0], numbers[-1]} <= self._anchored()
 
     def seal(self) -> bool:
-        """Rewrite documents of release 0.2 in the present format, and anchor the folder.
+        """Rewrite documents of earlier versions in the present format, and anchor the folder.
 
         Returns False if there was nothing to do. Raises `StorageError` if a document is damaged or
         lost.
@@ -215,7 +215,7 @@ class DocumentFolder:
         if not self.needs_seal():
             return False
         documents = [self.read(number) for number in self.numbers()]
-        for document in reversed(documents):  # never one of 0.2 after one of the present format
+        for document in reversed(documents):  # never an earlier format after the present one
             text = self._sealed(document)
             if self.folder.read(document_file(document.number)) != text:
                 self.folder.put(document_file(document.number), text)

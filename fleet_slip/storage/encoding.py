@@ -95,29 +95,19 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
 
 
-@dataclass(frozen=True)
-class Names:
-    """The values of one column's dictionary that rows have, and those that none has."""
-
-    used: frozenset[str]
-    unused: frozenset[str]
-
-
-def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, Names]:
-    """Return the names in each dictionary of a Parquet file, of the columns with texts."""
+def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, frozenset[str]]:
+    """Return the names that rows of a Parquet file have, by column with a dictionary."""
     metadata = pq.read_metadata(file)
     stored = [name for name in columns if name in metadata.schema.names]
     with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:
         schema = parquet.schema_arrow
         there = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
         groups = [parquet.read_row_group(i, there) for i in range(parquet.num_row_groups)]
-    return {n: _names([part for rows in groups for part in rows[n].chunks]) for n in there}
+    return {n: _names([chunk for rows in groups for chunk in rows[n].chunks]) for n in there}
 
 
-def _names(parts: Sequence[pa.DictionaryArray]) -> Names:
-    every: set[str] = set()
-    used: set[str] = set()
-    for part in parts:
-        every.update(part.dictionary.to_pylist())
-        used.update(part.dictionary.take(part.indices.unique().drop_null()).to_pylist())
-    return Names(frozenset(used), frozenset(every - used))
+def _names(chunks: Sequence[pa.DictionaryArray]) -> frozenset[str]:
+    names: set[str] = set()
+    for chunk in chunks:
+        names.update(chunk.dictionary.take(chunk.indices.unique().drop_null()).to_pylist())
+    return frozenset(names)

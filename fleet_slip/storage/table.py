@@ -29,7 +29,7 @@ from fleet_slip.storage.commits import (
     read_removals,
     read_transactions,
 )
-from fleet_slip.storage.encoding import Encoded, Encoding, Names, read_names
+from fleet_slip.storage.encoding import Encoded, Encoding, read_names
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.storage_errors import first_line, storage_errors
 
@@ -510,14 +510,10 @@ class Table:
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return pq.read_metadata(file)
 
-    def read_names(self, path: str) -> dict[str, Names]:
-        """Return the names in the dictionaries of one of the table's files, by column."""
+    def read_names(self, path: str) -> dict[str, frozenset[str]]:
+        """Return the names that rows of one of the table's files have, by column."""
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return read_names(file, self.encoding.dictionary)
-
-    def has_unused_names(self, path: str) -> bool:
-        """Whether a dictionary of one of the table's files has names that none of its rows has."""
-        return any(names.unused for names in self.read_names(path).values())
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
         """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""

@@ -8,8 +8,7 @@ root and a name can ask whether it was erased.
 
 "begun" of a car or drive also contains the digests of the drives' counts, by which a drive under
 another name is recognised: of its log (`digest_counts`) and of its Gram rows (`gram_digests`).
-Releases up to 0.2 hashed names with scrypt, 40 ms each, and stored other hashes of samples: their
-names still count, their samples do not.
+Entries of release 0.2, which have no key, are an error: its data roots are not read any more.
 
 Names are hashed after `name_key`: `V1`, ` v1 ` and `V1` are one car. Entries of earlier releases
 contain the hash of the name as typed.
@@ -79,23 +78,15 @@ class ErasedIds:
         return {"vehicle_id": sorted(self.vehicles), "drive_id": sorted(self.drives)}
 
 
-_SCRYPT = "scrypt:"
-
-
 def _digests(kind: str, name: str, key: str) -> set[str]:
     """Return the keyed hashes under which an entry of any release has a name."""
-    forms = {name, normalize_name(name)}
-    if not key.startswith(_SCRYPT):  # slow, and used by releases that hashed names as typed
-        forms.add(name_key(name))
+    forms = {name, normalize_name(name), name_key(name)}
     return {_digest(f"{kind}:{form}", key) for form in forms}
 
 
 @functools.lru_cache(300_000)
 def _digest(text: str, key: str) -> str:
     name = text.encode("utf-8", "surrogatepass")
-    if key.startswith(_SCRYPT):
-        salt = bytes.fromhex(key.removeprefix(_SCRYPT))
-        return hashlib.scrypt(name, salt=salt, n=2**14, r=8, p=1, dklen=32).hex()
     return hashlib.blake2b(name, key=bytes.fromhex(key), digest_size=32).hexdigest()
 
 
@@ -103,7 +94,12 @@ def _digest(text: str, key: str) -> str:
 def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
     """Return an entry. Entries never change, so each is read once."""
     entry = folder.read(number).content
-    return entry if "key" in entry else {**entry, "key": f"{_SCRYPT}{entry['salt']}"}
+    if "key" not in entry:
+        raise StorageError(
+            f"{folder.file(number)}: of release 0.2, whose data roots this release does not read. "
+            "Ingest and simulate into a new data root."
+        )
+    return entry
 
 
 def skipped_drives(count: int) -> str:
@@ -197,13 +193,8 @@ class ErasureLog:
 
     def end(self, subject: ErasureSubject, grams_version: int | None = None) -> None:
         """Record the end, and the version since which the Gram rows are without the subject."""
-        done = {"event": "done", "grams_version": grams_version, "names_are_exact": True}
+        done = {"event": "done", "grams_version": grams_version}
         self._append(subject, done)
-
-    @property
-    def names_are_exact(self) -> bool:
-        """True if files contain no name without rows; since this was recorded, none is written."""
-        return any(entry.get("names_are_exact") for entry in self.entries())
 
     @property
     def allows_drives(self) -> bool:
@@ -224,8 +215,8 @@ class ErasureLog:
 
     def _append(self, subject: ErasureSubject, content: Mapping[str, Any]) -> None:
         # One key, or more if several processes made the first entries at once.
-        keys = [e["key"] for e in self.entries() if not e["key"].startswith(_SCRYPT)]
-        key = keys[0] if keys else secrets.token_hex(32)
+        entries = self.entries()
+        key = entries[0]["key"] if entries else secrets.token_hex(32)
         at = datetime.now(UTC).isoformat(timespec="seconds")
         earlier = [(entry["subject"], entry["key"]) for entry in self._entries_of(subject)]
         digest = _digest(f"{subject.kind}:{name_key(subject.value)}", key)

@@ -12,6 +12,7 @@ import pytest
 from markdown_it import MarkdownIt
 
 import fleet_slip
+from fleet_slip.cli.app import GROUPS
 
 HERE = Path(__file__).resolve().parents[2]
 DOCS = HERE / "docs"
@@ -68,6 +69,20 @@ def test_the_architecture_names_what_exists() -> None:
         text = "".join((PACKAGE / name).read_text() for name in re.findall("`(.+?)`", where))
         for name in re.findall(r"`(?:\w+\.)?(\w+)`", functions):
             assert re.search(rf"def {name}\(", text), name
+
+
+def test_the_diagram_names_commands_and_folders_that_exist() -> None:
+    text = (DOCS / "images" / "flow.svg").read_text()
+    boxes = re.findall(
+        r'fill="(#\w+)" stroke=[^\n]*\n<text[^>]*>([^<]*)</text><text[^>]*>([^<]*)<', text
+    )
+    steps = [(title, subtitle) for fill, title, subtitle in boxes if fill == "#e3ecf7"]
+    assert len(steps) > 5
+    commands = {name for group in GROUPS.values() for name in group}
+    places = {path.stem for path in PACKAGE.iterdir()}
+    for title, subtitle in steps:
+        assert set(title.split(", ")) - {"Python"} <= commands
+        assert set(subtitle.partition(":")[0].split(", ")) <= places
 
 
 def test_folder_and_section_agree_in_both_directions() -> None:

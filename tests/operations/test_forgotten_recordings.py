@@ -12,17 +12,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from fleet_slip.errors import StorageError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import load
 from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.recordings import keep_drives, keep_refused
+from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
 from fleet_slip.ingest.stream import open_measured
 from fleet_slip.operations.forget import forget
-from fleet_slip.operations.rewriting import compact, migrate
 from fleet_slip.operations.verify import verify
-from fleet_slip.storage import encoding
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.erasure_log import FOLDER, ErasureLog, ErasureSubject
@@ -45,7 +44,7 @@ def after_it_was_forgotten(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warehouse = Warehouse(LocalFolder(tmp_path / "data"))
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
-    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"]
     assert forget(warehouse, ErasureSubject("drive", name), now=True).drives == 1
     return tmp_path / "data"
 
@@ -91,7 +90,7 @@ def test_a_car_that_stands_is_known_by_its_name_and_day(
     standing = recording() | {"ax": ["0"] * ROWS, "beta": ["0"] * ROWS}
     ingest_file(warehouse, write(tmp_path, standing), a_mapping())
     (file,) = warehouse.logs.snapshot().files
-    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"]
     forget(warehouse, ErasureSubject("drive", name))
     again = write(tmp_path, standing, "again.csv")
     assert ingest_file(warehouse, again, a_mapping(name="other")).drives_forgotten == 1
@@ -126,7 +125,7 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
 ) -> None:
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
-    (name,) = warehouse.logs.read_names(file.path)["drive_id"].used
+    (name,) = warehouse.logs.read_names(file.path)["drive_id"]
     land = load.commit_batch
 
     def overtaken(*written: Any) -> Any:
@@ -140,31 +139,12 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     assert is_empty(warehouse)
 
 
-def test_what_an_earlier_release_forgot_stays_away_by_name(
-    warehouse: Warehouse, tmp_path: Path
-) -> None:
-    """It kept salted scrypt hashes; this one of the vehicle "car", with this salt."""
-    hashed = hashlib.scrypt(b"vehicle:car", salt=bytes(16), n=2**14, r=8, p=1, dklen=32).hex()
-    old = {"kind": "vehicle", "subject": hashed, "salt": "00" * 16, "at": "2026-11-01T00:00:00"}
-    erasure_log = ErasureLog(warehouse.root)
-    for event in ({"event": "begun", "drives": 1, "models": []}, {"event": "done"}):
-        erasure_log._folder.append({**old, **event})
-    file, car = write(tmp_path, recording()), ErasureSubject("vehicle", "car")
-    assert ingest_file(warehouse, file, a_mapping()).drives_forgotten == 1
-    assert erasure_log.state(car) == "done"
-    erasure_log.allow(car)
-    assert ingest_file(warehouse, file, a_mapping()).counts.drives == 1
-    forget(warehouse, car, now=True)
-    assert ingest_file(warehouse, file, a_mapping(name="again")).drives_forgotten == 1
-
-
-def test_names_of_other_cars_that_an_earlier_release_listed_go(
-    warehouse: Warehouse, tmp_path: Path
-) -> None:
-    ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
-    (warehouse.root / "cleared").create("1.txt", b"car")
-    forget(warehouse, ErasureSubject("vehicle", "car"), now=True)
-    assert (warehouse.root / "cleared").names() == []
+def test_an_erasure_of_release_02_is_an_error(warehouse: Warehouse, tmp_path: Path) -> None:
+    old = {"kind": "vehicle", "subject": "00" * 32, "salt": "00" * 16, "event": "done"}
+    DocumentFolder(warehouse.root, FOLDER).append(old)
+    with pytest.raises(StorageError, match=r"release 0\.2.*into a new data root"):
+        ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
+    assert is_empty(warehouse)
 
 
 def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
@@ -226,9 +206,9 @@ def test_the_rows_of_what_was_forgotten_are_left_out(
     of_a, of_b = drives
     erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
     erasure_log.begin(ErasureSubject(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
-    assert keep_drives(drives, erasure_log) == [of_b]
+    assert drop_erased_drives(drives, erasure_log) == [of_b]
     assert cars(refused) == {"a", "b"}
-    assert cars(keep_refused(refused, erasure_log)) == {"b"}
+    assert cars(drop_erased_rejects(refused, erasure_log)) == {"b"}
 
 
 def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
@@ -236,8 +216,8 @@ def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -
     stretch = f"{refused['drive_id'][0]}-2"
     erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
     erasure_log.begin(ErasureSubject("drive", stretch), 1, [], {})
-    assert cars(keep_refused(refused, erasure_log, {stretch})) == {"b"}
-    assert cars(keep_refused(refused, erasure_log)) == {"a", "b"}
+    assert cars(drop_erased_rejects(refused, erasure_log, {stretch})) == {"b"}
+    assert cars(drop_erased_rejects(refused, erasure_log)) == {"a", "b"}
 
 
 GONE = ("WVWGONE", "track-gone", "gone.csv", "lap-gone")
@@ -291,14 +271,6 @@ def named(root: Path, names: tuple[str, ...]) -> set[str]:
     return {name for name in names if any(name in text for text in texts)}
 
 
-@pytest.fixture
-def old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Warehouse:
-    """A data root of an earlier version, whose files have the dictionaries of their batch."""
-    with monkeypatch.context() as patch:
-        patch.setattr(encoding, "_only_used_values", lambda rows: rows)
-        return ingest_two_days(tmp_path / "data", tmp_path)
-
-
 @pytest.mark.parametrize(
     "subject", [ErasureSubject("vehicle", GONE[0]), ErasureSubject("before", "2024-05-02")]
 )
@@ -306,45 +278,12 @@ def test_a_forgotten_car_is_named_nowhere_though_it_landed_beside_another(
     subject: ErasureSubject, tmp_path: Path
 ) -> None:
     warehouse = ingest_two_days(tmp_path / "data", tmp_path)
-    files = warehouse.logs.snapshot().files
-    assert not any(warehouse.logs.has_unused_names(file.path) for file in files)
     assert named(tmp_path / "data", GONE) == set(GONE)
     report = forget(warehouse, subject, now=True)
     assert not report.pending
     assert named(tmp_path / "data", GONE) == set()
     assert named(tmp_path / "data", STAYS) == set(STAYS)
     assert not verify(warehouse, full=True).damage
-
-
-def test_forgetting_in_a_root_of_an_earlier_version_takes_names_of_other_files_away(
-    old: Warehouse, tmp_path: Path
-) -> None:
-    before = update_grams(old)
-    assert not forget(old, ErasureSubject("vehicle", GONE[0]), now=True).pending
-    assert named(tmp_path / "data", GONE) == set()
-    assert named(tmp_path / "data", STAYS) == set(STAYS)
-    assert not before.rows_read
-    assert not update_grams(old).rows_read
-    assert not verify(old, full=True).damage
-
-
-def test_a_car_that_an_earlier_version_forgot_is_found_by_verify_and_taken_away_by_migrate(
-    old: Warehouse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr("fleet_slip.operations.forget.drop_unused_names", lambda _: 0)
-        patch.setattr(ErasureLog, "names_are_exact", False)
-        patch.setattr("fleet_slip.storage.table.Table.has_unused_names", lambda *_: False)
-        patch.setattr(encoding, "_only_used_values", lambda rows: rows)
-        forget(old, ErasureSubject("vehicle", GONE[0]), now=True)
-    assert named(tmp_path / "data", GONE) == set(GONE)
-    compact(old)
-    assert {f.kind for f in verify(old).damage} == {"name"}
-    assert migrate(old).files_without_names == 1
-    assert not migrate(old).changed
-    assert not verify(old, full=True).damage
-    assert forget(old, ErasureSubject("vehicle", GONE[0]), now=True).old_files_deleted
-    assert named(tmp_path / "data", GONE) == set()
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "drive"])
@@ -354,7 +293,7 @@ def test_rows_of_what_was_forgotten_are_found_if_a_copy_brings_them_back(
     warehouse = ingest_two_days(tmp_path / "data", tmp_path)
     column = {"vehicle": "vehicle_id", "drive": "drive_id"}[kind]
     (file, _) = warehouse.logs.snapshot().files
-    (name,) = warehouse.logs.read_names(file.path)[column].used
+    (name,) = warehouse.logs.read_names(file.path)[column]
     erasure_log = ErasureLog(warehouse.root)
     erasure_log.begin(ErasureSubject(kind, name), 1, [], {})  # type: ignore[arg-type]
     assert not verify(warehouse, full=True).damage  # it is being forgotten

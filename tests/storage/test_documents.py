@@ -25,7 +25,7 @@ PATH = "models/m/history"
 
 
 def write_old(folder: DocumentFolder, number: int, content: dict[str, Any]) -> None:
-    """Write a document as release 0.2 did, whose checksum covers the content alone."""
+    """Write a document as versions before 0.3.0 did, whose checksum covers the content alone."""
     envelope = {"content": content, "sha256": checksum(content)}
     text = json.dumps(envelope, indent=1, ensure_ascii=False) + "\n"
     folder.folder.put(f"{number}.json", text.encode())
@@ -219,7 +219,7 @@ def test_a_newest_document_of_another_root_is_a_fault(
 
 @pytest.fixture
 def old(place: Folder) -> DocumentFolder:
-    """Three documents of release 0.2."""
+    """Three documents in the format before 0.3.0."""
     folder = DocumentFolder(place, PATH)
     for number in (1, 2, 3):
         write_old(folder, number, {"n": number})
@@ -230,18 +230,18 @@ def numbers_read(folder: DocumentFolder) -> list[int]:
     return [folder.read(number).content["n"] for number in folder.numbers()]
 
 
-def test_documents_of_release_02_are_read_and_continued(old: DocumentFolder) -> None:
+def test_documents_of_earlier_versions_are_read_and_continued(old: DocumentFolder) -> None:
     assert numbers_read(old) == [1, 2, 3]
     assert not old.faults()
     old.append({"n": 4})
     assert numbers_read(old) == [1, 2, 3, 4]
     write_old(old, 4, {"n": 3})
-    with pytest.raises(StorageError, match=r"release 0\.2"):
+    with pytest.raises(StorageError, match="earlier versions"):
         old.read(4)
 
 
 @pytest.mark.parametrize("appended", [False, True])
-def test_documents_of_release_02_get_the_present_format(
+def test_documents_of_earlier_versions_get_the_present_format(
     old: DocumentFolder, appended: bool
 ) -> None:
     if appended:
