@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
@@ -43,18 +44,20 @@ def band(x: FloatArray, y: FloatArray, bins: int) -> Band:
     return Band(middle, *(np.where(none, np.nan, values) for values in (mean, low, high)))
 
 
-ANGLE_IN = 1.75
-STRIP_IN = 0.62
-GAP_IN = 0.12
-HEAD_IN = 0.42
-FOOT_IN = 0.42
-LEFT_IN = 0.42
-RIGHT_IN = 0.08
+ANGLE_IN = 2.3
+STRIP_IN = 0.85
 SPEED_IN = 2.0
+"""Height of a panel of angles with its title, of the strip of a difference, and of a speed."""
+
 KMH_PER_MPS = 3.6
 REACHES_DEG = (0.2, 0.4, 0.6, 1.0, 2.0, 4.0, 6.0, 10.0, 20.0, 40.0, 90.0, 180.0, 360.0)
+"""Half-heights of strips."""
+
 COMPARABLE = 3
-"""Largest ratio of scales at which blocks share the larger one."""
+"""Largest ratio of half-heights at which all blocks have the larger one."""
+
+SHADES = {"unstable": ("unstable", "unstable"), "gps_outage": ("no GPS", "outage")}
+"""Label and colour of marked sections."""
 
 
 class Line(NamedTuple):
@@ -95,10 +98,9 @@ class DriveBlock:
         return (*self.lines, *self.strips)
 
     @property
-    def height_in(self) -> float:
-        """Height with its strips, head and foot."""
-        strips_in = len(self.all_strips) * (STRIP_IN + GAP_IN)
-        return HEAD_IN + ANGLE_IN + strips_in + FOOT_IN
+    def heights_in(self) -> list[float]:
+        """Height of its panels."""
+        return [ANGLE_IN, *[STRIP_IN] * len(self.all_strips)]
 
     @property
     def section(self) -> Section | None:
@@ -119,59 +121,58 @@ class DriveBlock:
 
 def side_slip(blocks: Sequence[DriveBlock]) -> Figure:
     """Draw the blocks one above another: the angles, and beneath them the differences."""
-    top_in = sum(block.height_in for block in blocks)
-    figure = Figure(figsize=(WIDTH_IN, top_in))
-    for block, reach in zip(blocks, _reaches(blocks), strict=True):
-        _draw_block(figure, block, top_in, reach)
-        top_in -= block.height_in
+    heights_in = [sum(block.heights_in) for block in blocks]
+    figure = Figure(figsize=(WIDTH_IN, sum(heights_in)), layout="constrained")
+    parts = figure.subfigures(len(blocks), height_ratios=heights_in, squeeze=False)[:, 0]
+    for part, block, reach_deg in zip(parts, blocks, _reaches(blocks), strict=True):
+        _draw_block(part, block, reach_deg)
     return figure
 
 
-def _draw_block(figure: Figure, block: DriveBlock, top_in: float, reach: float) -> None:
-    angle, *strips = _panels(figure, block, top_in)
-    time_s, tone = block.run.drive.time_s, "unstable" if block.shaded == "unstable" else "outage"
-    section = block.section
-    stretches = find_stretches(block.run.drive, section.rows) if section else ()
-    for axes in (angle, *strips):
-        axes.set_xlim(time_s[0], time_s[-1])
-        for stretch in stretches:
-            axes.axvspan(
-                stretch.from_s, stretch.until_s, color=colour(tone), alpha=0.16, linewidth=0
-            )
-    for line in block.lines:
-        _plot(angle, time_s, block.estimate_deg(line), line)
-    truth = band(time_s, block.truth_deg, BINS)
-    angle.plot(truth.x, truth.mean, color=colour("truth"), linewidth=1.1)
-    names = [("true", "truth"), *((line.label, line.colour) for line in block.lines)]
+def _draw_block(figure: FigureBase, block: DriveBlock, reach_deg: float) -> None:
+    ratios = {"height_ratios": block.heights_in}
+    panels = figure.subplots(len(block.heights_in), sharex=True, gridspec_kw=ratios)
+    angle, *strips = panels
+    time_s, section = block.run.drive.time_s, block.section
+    angle.set_xlim(time_s[0], time_s[-1])
+    angle.set_ylabel("side-slip angle (deg)")
+    angle.set_title(f"{block.title}\n", fontweight="bold")
+    lines = [_plot(angle, time_s, block.estimate_deg(line), line) for line in block.lines]
+    lines.insert(0, _plot(angle, time_s, block.truth_deg, Line("", "true", "truth")))
     if section:
-        names.append(("unstable" if tone == "unstable" else "no GPS", tone))
-    _legend(figure, block.title, names, top_in)
-    angle.set_ylabel("side-slip angle (deg)", labelpad=2)
+        label, tone = SHADES[section.name]
+        for stretch in find_stretches(block.run.drive, section.rows):
+            for axes in panels:
+                area = axes.axvspan(
+                    stretch.from_s, stretch.until_s, color=colour(tone), alpha=0.16, linewidth=0
+                )
+        area.set_label(label)
+        lines.append(area)
+    angle.legend(
+        handles=lines,
+        ncols=len(lines),
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        borderaxespad=0,
+        frameon=False,
+    )
     for axes, line in zip(strips, block.all_strips, strict=True):
         _plot(axes, time_s, block.estimate_deg(line) - block.truth_deg, line)
-        axes.set_ylim(-reach, reach)
-        axes.set_yticks([-reach / 2, 0, reach / 2])
-        _caption(axes, block, line)
-    for axes in (angle, *strips[:-1]):
-        axes.tick_params(labelbottom=False, bottom=False)
+        axes.set_ylim(-reach_deg, reach_deg)
+        axes.set_yticks([-reach_deg / 2, 0, reach_deg / 2])
+        axes.set_title(_errors(block, line), color=colour(line.colour), pad=1)
+    for axes in panels[:-1]:
+        axes.tick_params(bottom=False)
         axes.spines["bottom"].set_visible(False)
-    strips[-1].set_xlabel("time (s)", labelpad=2)
+    panels[-1].set_xlabel("time (s)")
 
 
-def _panels(figure: Figure, block: DriveBlock, top_in: float) -> Iterator[Axes]:
-    width, height = figure.get_size_inches()
-    begin, across = LEFT_IN / width, 1 - (LEFT_IN + RIGHT_IN) / width
-    bottom = top_in - HEAD_IN - ANGLE_IN
-    yield figure.add_axes((begin, bottom / height, across, ANGLE_IN / height))
-    for _ in block.all_strips:
-        bottom -= GAP_IN + STRIP_IN
-        yield figure.add_axes((begin, bottom / height, across, STRIP_IN / height))
-
-
-def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line) -> None:
+def _plot(axes: Axes, x: FloatArray, y: FloatArray, line: Line) -> Artist:
+    """Plot the mean of a series, and its range as an area; return the artist for a legend."""
     series, tone = band(x, y, BINS), colour(line.colour)
-    axes.fill_between(series.x, series.low, series.high, color=tone, alpha=0.3, linewidth=0)
-    axes.plot(series.x, series.mean, color=tone, linewidth=1.0)
+    if line.estimator:
+        axes.fill_between(series.x, series.low, series.high, color=tone, alpha=0.3, linewidth=0)
+    return axes.plot(series.x, series.mean, color=tone, linewidth=1.0, label=line.label)[0]
 
 
 def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
@@ -185,48 +186,22 @@ def _reaches(blocks: Sequence[DriveBlock]) -> list[float]:
     return [max(reaches)] * len(reaches) if comparable else reaches
 
 
-def _legend(figure: Figure, title: str, names: Sequence[tuple[str, str]], top_in: float) -> None:
-    """Write the title, and below it the name of each line in its colour."""
-    width, height = figure.get_size_inches()
-    x_in = LEFT_IN
-    figure.text(x_in / width, (top_in - 0.05) / height, title, fontweight="bold", va="top")
-    for name, tone in names:
-        mark = "\N{BLACK SQUARE}" if tone in ("unstable", "outage") else "\N{EM DASH}"
-        figure.text(
-            x_in / width, (top_in - 0.24) / height, f"{mark} {name}", color=colour(tone), va="top"
-        )
-        x_in += 0.07 * (len(name) + 3.5)
-
-
-def _caption(axes: Axes, block: DriveBlock, line: Line) -> None:
+def _errors(block: DriveBlock, line: Line) -> str:
+    """Return the errors of an estimator in words."""
     errors = block.run.statistics[line.estimator]
-    text = f"{line.label} \N{MINUS SIGN} true"
-    if errors.error_std_deg is not None and errors.error_mean_deg is not None:
-        std, mean = degrees(errors.error_std_deg), degrees(errors.error_mean_deg, sign=True)
-        text += f": std {std}, mean {mean}"
-    axes.text(
-        0.0,
-        1.0,
-        text,
-        transform=axes.transAxes,
-        color=colour(line.colour),
-        fontsize=8.5,
-        va="center",
-        bbox={"facecolor": colour("surface"), "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
-    )
+    std, mean = degrees(errors.error_std_deg), degrees(errors.error_mean_deg, sign=True)
+    return f"{line.label} \N{MINUS SIGN} true: std {std}, mean {mean}"
 
 
 def speed(drive: TestDrive) -> Figure:
     """Draw the true speed of a drive."""
-    figure = Figure(figsize=(WIDTH_IN, SPEED_IN))
-    kmh = drive.speed_mps * KMH_PER_MPS
-    across = 1 - 0.5 / WIDTH_IN
-    axes = figure.add_axes((0.42 / WIDTH_IN, 0.42 / SPEED_IN, across, 1.32 / SPEED_IN))
+    figure = Figure(figsize=(WIDTH_IN, SPEED_IN), layout="constrained")
+    axes, kmh = figure.subplots(), drive.speed_mps * KMH_PER_MPS
     series = band(drive.time_s, kmh, BINS)
     axes.plot(series.x, series.mean, color=colour("model_4"), linewidth=1.3)
     axes.set_xlim(drive.time_s[0], drive.time_s[-1])
     axes.set_ylim(0, 1.05 * float(kmh.max()))
-    axes.set_xlabel("time (s)", labelpad=2)
+    axes.set_xlabel("time (s)")
     axes.set_title("speed (km/h)", color=colour("muted"))
     return figure
 
@@ -327,13 +302,8 @@ def _series(key: str, title: str, blocks: Sequence[DriveBlock]) -> Picture:
 
 def _results(block: DriveBlock, named: bool) -> Iterator[str]:
     """Yield the sentences of a caption about the errors in a block."""
-    texts = []
-    for line in block.all_strips:
-        errors = block.run.statistics[line.estimator]
-        std, mean = degrees(errors.error_std_deg), degrees(errors.error_mean_deg, sign=True)
-        texts.append(f"{line.label} {std} ({mean})")
-    place = f"{block.title}: standard" if named else "Standard"
-    yield f"{place} deviation (mean) of the error: {', '.join(texts)}."
+    errors = "; ".join(_errors(block, line) for line in block.all_strips)
+    yield f"{block.title}: {errors}." if named else f"{errors}."
     if block.shaded != "unstable":
         return
     if block.section is None:
@@ -342,7 +312,7 @@ def _results(block: DriveBlock, named: bool) -> Iterator[str]:
     estimator, rows = block.lines[0].estimator, block.section.rows
     inside, outside = (block.run.within(r).statistics[estimator] for r in (rows, ~rows))
     yield (
-        f"Where the car is unstable (shaded) it is {degrees(inside.error_std_deg)}, elsewhere "
+        f"Where the car is unstable (shaded) std is {degrees(inside.error_std_deg)}, elsewhere "
         f"{degrees(outside.error_std_deg)} with a correlation of {number(outside.correlation)}."
     )
 
