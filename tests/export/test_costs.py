@@ -53,7 +53,7 @@ def test_a_feature_is_computed_once() -> None:
 
 
 def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> None:
-    version = fleet_slip.open(smoke_root).model("smoke")
+    version = fleet_slip.open(smoke_root).models.get("smoke")
     counted = costs_content(version)
     assert counted["columns"] == len(version.manifest.terms)
     assert counted["memory_bytes"] > 1000 < counted["estimated_instructions"]
