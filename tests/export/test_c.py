@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c import LARGEST_UNSIGNED
+from fleet_slip.export.c import MAX_UNSIGNED
 from fleet_slip.export.compile import angles_by_kernel, compile_program
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
@@ -196,7 +196,7 @@ def test_the_page_beside_them_tells_inputs_and_files(smoke_root: Path) -> None:
         page = files[f"sideslip_smoke_{to}_README.md"]
         assert all(f"| `{name}` | " in page for name in files if not name.endswith(".md"))
         assert "| `ay` | m/s^2 | 0.001 | -30000 to 30000 |" in page
-        assert "every 0.01 s" in page
+        assert "A tick is 0.01 s" in page
         assert ("view `log`," in page) == (to == "sql")
 
 
@@ -220,7 +220,7 @@ def test_quotients_take_64_bits_only_where_they_need_them() -> None:
     ]
     assert "nearest_32" in text
     assert "nearest_64" not in text
-    assert LARGEST_UNSIGNED > 2 * 3 * 32767 * 16 + 3
+    assert MAX_UNSIGNED > 2 * 3 * 32767 * 16 + 3
 
 
 NAMES = ("mean_3", "sum_4", "heavy")
@@ -250,7 +250,7 @@ def text(tmp_path: Path) -> str:
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     found = files["sideslip_any.a2l"]
-    declared = re.search(r"functions:\n(.*?) \*/", found, re.DOTALL)
+    declared = re.search(r"program:\n(.*?) \*/", found, re.DOTALL)
     assert declared is not None
     measured = re.findall(r"MEASUREMENT (\S+) .*\n  (\w+) .*\n  SYMBOL_LINK \"(\S+)\" 0", found)
     assert {symbol for _, _, symbol in measured} >= {"sideslip_any_in.ay_count"}

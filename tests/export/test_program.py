@@ -171,7 +171,7 @@ def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> No
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(QuestionError, match="no version"):
         fleet.models.export("smoke@9", "json", tmp_path)
-    with pytest.raises(UsageError, match="export to one of json"):
+    with pytest.raises(UsageError, match="Choose from: json"):
         fleet.models.export("smoke", "pascal", tmp_path)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
