@@ -56,7 +56,7 @@ WRITING: tuple[tuple[str, ...], ...] = (
     ("run", "--campaign", "{campaign}", "--threads", "1", "--json"),
     ("publish", "other", "--cohort", "adhesion > 0", "--json"),
     ("promote", "smoke@1"),
-    ("promote", "smoke", "--previous"),
+    ("rollback", "smoke"),
     ("compact",),
     ("forget", "--drive", "smoke-2024-05-01-0001", "--now"),
     ("verify", "--repair"),

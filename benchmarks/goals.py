@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--nights", action="store_true")
     options = parser.parse_args()
     fleet = fleet_slip.open(options.root)
-    versions = [fleet.model(name) for name in options.models]
+    versions = [fleet.models.get(name) for name in options.models]
     seed = int(versions[0].sha256[:15], 16)
     if options.nights:
         print_nights(versions[0], seed)

@@ -70,7 +70,9 @@ def main() -> None:
     given = parser.parse_args()
     fleet = fleet_slip.open(given.root)
     print(
-        json.dumps([measure(fleet, fleet.model(m), given.seconds) for m in given.models], indent=2)
+        json.dumps(
+            [measure(fleet, fleet.models.get(m), given.seconds) for m in given.models], indent=2
+        )
     )
 
 
@@ -85,7 +87,7 @@ def measure(fleet: fleet_slip.Fleet, version: ModelVersion, seconds: float) -> d
             files = export_files(version, fleet.warehouse, "c")
             texts = {name: content.decode() for name, content in files.items()}
             board["cortex_m4"] = measure_cortex_m(Path(folder), c_prefix(version), texts)
-    estimator = fleet.estimator(version)
+    estimator = fleet.models.estimator(version)
     rows = drive.select(estimator.columns).to_dicts()
     estimator.step(rows[0])
     steps = best_of(lambda: [estimator.step(row) for row in rows], seconds) / len(rows)

@@ -31,7 +31,7 @@ SHOWN_S = (31.0, 66.0)
 
 def plot(root: str, model: str, file: str) -> None:
     """Draw our car among the others, and its true and estimated angle below."""
-    version = fleet_slip.open(root).model(model)
+    version = fleet_slip.open(root).models.get(model)
     frames = scenario_frames("traffic", version).part(*SHOWN_S)
     mpl.rcParams.update({**STYLE, "svg.hashsalt": "fleet_slip"})
     figure, (above, below) = plt.subplots(2, figsize=(8.0, 4.4), height_ratios=(1.5, 1))

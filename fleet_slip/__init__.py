@@ -1,8 +1,8 @@
 """Side-slip angle estimation from fleet logs.
 
-Many cars log cheap signals, a few also log their side-slip angle. Logs become exact Gram matrices;
-from these every model, cohort and fold follows without reading a row again; the winner becomes a
-numbered model version, which a car computes in whole numbers.
+Many cars log cheap signals, and a few also log their side-slip angle. Logs are reduced to exact
+Gram matrices. From these, models are selected, cross-validated and published without reading a row
+again. A published version is a linear model that a car computes in integer arithmetic.
 
     import fleet_slip
 
@@ -10,15 +10,14 @@ numbered model version, which a car computes in whole numbers.
     fleet.simulate("smoke")
     fleet.gram()
     selection = fleet.cohort("adhesion > 0.8").select(models="table1")
-    fleet.publish("dry", selection)
+    fleet.models.publish("dry", selection)
     log = fleet.sql("SELECT * FROM log WHERE day = '2024-05-01'").pl()
-    model = fleet.model("dry@1")
+    model = fleet.models.get("dry@1")
     beta_rad = model.predict(log)
 
-`open` returns a `Fleet`, whose methods are the commands of `fleet-slip`; `connect` returns a DuckDB
-connection with the views alone. Physical values are in SI units, and names carry them: `ax_mps2`,
-`yaw_rate_rad_s`, `sideslip_rad`. Axes and signs are those of ISO 8855. Every error that can be
-expected is a `FleetSlipError`, and says what to do next.
+`open` returns a `Fleet`; `connect` returns a DuckDB connection with the views. Physical values are
+in SI units, and names carry them: `ax_mps2`, `yaw_rate_rad_s`, `sideslip_rad`. Axes and signs are
+those of ISO 8855. Every expected error is a `FleetSlipError`, whose message contains the remedy.
 """
 
 from importlib import import_module
@@ -26,8 +25,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fleet_slip.api.cohort import FleetCohort
     from fleet_slip.api.fleet import Fleet
+    from fleet_slip.api.fleet_cohort import FleetCohort
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.storage.folder import Folder
@@ -37,12 +36,12 @@ __all__ = ["Fleet", "FleetCohort", "FleetSlipError", "ModelVersion", "connect", 
 
 _HOMES = {
     "Fleet": "fleet_slip.api.fleet",
-    "FleetCohort": "fleet_slip.api.cohort",
+    "FleetCohort": "fleet_slip.api.fleet_cohort",
     "FleetSlipError": "fleet_slip.errors",
     "ModelVersion": "fleet_slip.models.registry",
     "connect": "fleet_slip.views",
 }
-"""Where the names are that are imported when they are first used: importing the package is fast."""
+"""Modules of the names that are imported on first use: importing the package is fast."""
 
 
 def open(  # noqa: A001 - as in gzip
@@ -56,8 +55,13 @@ def open(  # noqa: A001 - as in gzip
         A folder, or a URL (`s3://BUCKET/PATH`, `gs://`, `az://`). None means `$FLEET_SLIP_ROOT`,
         else `./data`. Credentials come from the environment.
     config
-        A folder of configs that is laid over the shipped ones. None means `$FLEET_SLIP_CONFIG`,
-        else the shipped ones alone.
+        A folder of configs that override the shipped ones. None means `$FLEET_SLIP_CONFIG`, else
+        the shipped ones alone.
+
+    Returns
+    -------
+    Fleet
+        Close it, or use it in a `with` block.
 
     Raises
     ------
@@ -73,7 +77,7 @@ def open(  # noqa: A001 - as in gzip
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name of the package when it is first used."""
+    """Import a name of the package on first use."""
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

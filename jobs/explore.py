@@ -110,7 +110,7 @@ def _(
     Figure, LinearSegmentedColormap, colour, drive, drive_frames, fleet, mo, name, np
 ):  # fmt: skip
     mo.stop(name.value is None, mo.md("No model yet: `fleet-slip publish`."))
-    frames = drive_frames(fleet.warehouse, drive.value, fleet.model(name.value))
+    frames = drive_frames(fleet.warehouse, drive.value, fleet.models.get(name.value))
     error = frames.estimate_deg - frames.sideslip_deg
     # From far below to far above; the hundredth of points beyond the bound have the last colour.
     shades = LinearSegmentedColormap.from_list(
@@ -134,7 +134,7 @@ def _(
 @app.cell
 def _(fleet, mo, name, pluralize, pl):
     mo.stop(name.value is None)
-    versions = fleet.registry()
+    versions = fleet.models.registry
     terms = pl.DataFrame(
         [
             {"version": number, "input": term.signal, "coefficient": term.coefficient}
@@ -171,7 +171,7 @@ def _(FleetSlipError, alt, fleet, mo, name, pl):
     days = [day for (day,) in fleet.sql("SELECT DISTINCT day FROM drives ORDER BY 1").fetchall()]
     try:
         _since = days[len(days) // 2] if len(days) > 8 else None
-        _found = fleet.monitor(name.value, since=_since)
+        _found = fleet.maintenance.monitor(name.value, since=_since)
         drift = alt.vconcat()
         for _figure, _limits in (("mean", _found.mean_limits), ("std", _found.std_limits)):
             _points = pl.DataFrame(

@@ -140,7 +140,7 @@ def main() -> None:
     given = parser.parse_args()
     names, asked = given.drives.split(","), given.rivals.split(",")
     fleet = fleet_slip.open(given.root)
-    manifest = fleet.model(given.model).manifest
+    manifest = fleet.models.get(given.model).manifest
     drives = simulate_drives(SIGNALS, [load_scenario(name, SHIPPED_CONFIGS) for name in names])
 
     def show(*cells: Any) -> None:

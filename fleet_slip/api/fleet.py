@@ -1,71 +1,100 @@
-"""A fleet's warehouse in Python."""
+"""The fleet of a data root: its logs, Gram rows, queries and pipelines."""
 
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
-from dataclasses import replace
+from dataclasses import replace as changed
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
-
-from typing_extensions import Doc
+from typing import TYPE_CHECKING, Self
 
 from fleet_slip.api.calls import (
-    CAMPAIGN,
-    COHORT,
-    DAYS,
-    MODELS,
-    THROUGH,
-    UNEXAMINED,
-    NightRequest,
     ShowProgress,
     ShowStep,
     Workers,
-    count_from_start,
-    of_step,
+    for_workers,
     open_workers,
     record_call,
-    takes,
-    unless_local,
-    within_reach,
+    remote_executor,
+    step_progress,
+    total_progress,
 )
-from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.operations import HealthAndUpkeep
-from fleet_slip.base import last_day
+from fleet_slip.base import date_of, last_day
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.models.manifest import require_model_name
-from fleet_slip.models.request import DEFAULT_MODELS, TOLERANCE
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import LOGGER, step
 
 if TYPE_CHECKING:
     import duckdb
 
+    from fleet_slip.api.fleet_cohort import FleetCohort
+    from fleet_slip.api.fleet_evaluation import FleetEvaluation
+    from fleet_slip.api.fleet_maintenance import FleetMaintenance
+    from fleet_slip.api.fleet_models import FleetModels
     from fleet_slip.api.session import Session
     from fleet_slip.api.training import LearnReport, RunReport
-    from fleet_slip.grams.check import CheckReport
     from fleet_slip.grams.on_board import OnboardImport
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport, Preview
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.night import NightReport
-    from fleet_slip.operations.rewriting import MigrationReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.simulate import SimulationReport
+    from fleet_slip.warehouse.warehouse import Warehouse
 
 
-class Fleet(HealthAndUpkeep):
-    """All that can be asked of a data root, and done to it; `fleet_slip.open` makes one.
+class Fleet:
+    """The fleet of a data root; `fleet_slip.open` returns one.
 
-    Threads may share it. Close it, or use it in a `with` block, to release what it keeps between
-    calls; it can be used again afterwards. Changes leave a record in the view `runs`. Every call
-    raises `StorageError` where the root cannot be read or written.
+    Threads may share it. Close it, or use it in a `with` block, to release the connections that it
+    keeps between calls; it can be used again afterwards. Calls that change the data root are
+    recorded in the view `runs`. Every call raises `StorageError` if the root cannot be read or
+    written.
+
+    Attributes
+    ----------
+    models : FleetModels
+        Publishes, lists, compares and exports models.
+    evaluation : FleetEvaluation
+        Scores models, and compares them with filters on test drives.
+    maintenance : FleetMaintenance
+        Reports health, sensor faults and drift; verifies, compacts and erases.
     """
 
+    def __init__(self, warehouse: "Warehouse") -> None:
+        self.warehouse = warehouse
+
+    @property
+    def root(self) -> Folder:
+        """The data root: a local folder, or a folder of an object store."""
+        return self.warehouse.root
+
+    @property
+    def models(self) -> "FleetModels":
+        """The registry of published models, and what publishes and exports them."""
+        from fleet_slip.api.fleet_models import FleetModels
+
+        return FleetModels(self.warehouse)
+
+    @property
+    def evaluation(self) -> "FleetEvaluation":
+        """Scores, evaluations, reports and pages of drives."""
+        from fleet_slip.api.fleet_evaluation import FleetEvaluation
+
+        return FleetEvaluation(self.warehouse)
+
+    @property
+    def maintenance(self) -> "FleetMaintenance":
+        """Health, sensor quality and drift; verification, compaction and erasure."""
+        from fleet_slip.api.fleet_maintenance import FleetMaintenance
+
+        return FleetMaintenance(self.warehouse)
+
     def close(self) -> None:
-        """Release the connections and models that the warehouse keeps between calls."""
+        """Release the connections and models that are kept between calls."""
         self.warehouse.close()
 
     def __enter__(self) -> Self:
@@ -74,76 +103,131 @@ class Fleet(HealthAndUpkeep):
     def __exit__(self, *_error: object) -> None:
         self.close()
 
-    def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
-        """Return the answer to an SQL query on the views as a DuckDB relation.
+    def __repr__(self) -> str:
+        return f"Fleet({str(self.root)!r})"
 
-        It is computed when asked for rows: `.df()`, `.pl()`, `.to_arrow_table()`, `.fetchall()`;
-        what is made of it keeps the connection open. Evaluation scenarios are there if the query
-        names the column `source`. Raises `QuestionError` for a query
-        that is not valid or would write, and `StorageError` without a data root.
+    # Queries.
+
+    def sql(self, query: str, *, threads: int | None = None) -> "duckdb.DuckDBPyRelation":
+        """Query the views of the data root.
+
+        Parameters
+        ----------
+        query
+            One SQL statement that reads. Drives of evaluation scenarios are included only if the
+            query names the column `source`.
+        threads
+            Threads of DuckDB. None means one per core.
+
+        Returns
+        -------
+        duckdb.DuckDBPyRelation
+            A relation that is computed by `.df()`, `.pl()`, `.to_arrow_table()` or `.fetchall()`.
+            It keeps its connection open.
+
+        Raises
+        ------
+        QuestionError
+            If the query is invalid or would write.
+        StorageError
+            If there is no data root.
         """
         return self.session(query, threads=threads).sql(query)
 
     def session(
-        self,
-        query: str | None = None,
-        *,
-        threads: int | None = None,
-        unlocked: bool = False,
+        self, query: str | None = None, *, threads: int | None = None, unlocked: bool = False
     ) -> "Session":
-        """Open the views of this moment for many queries, which all see the same commits.
+        """Open the views for several queries, which all read the same commits.
 
-        With a `query`, only those that it names, which is faster. For scenarios see `sql`. If it
-        is `unlocked`, it allows any statement, and any file that you may read or write: only for
-        SQL that you trust, since it can overwrite the warehouse. Raises `StorageError` without a
-        data root.
+        Parameters
+        ----------
+        query
+            If given, open only the views that it names, which is faster.
+        threads
+            Threads of DuckDB. None means one per core.
+        unlocked
+            Allow any statement, and any file that the user may read or write. Use it only for SQL
+            that you trust: it can overwrite the data root.
+
+        Raises
+        ------
+        StorageError
+            If there is no data root.
         """
         from fleet_slip.api.session import Session
         from fleet_slip.views import open_views
 
-        opened = open_views(self.warehouse, query, threads, unlocked=unlocked)
-        return Session(opened, unlocked)
+        database = open_views(self.warehouse, query, threads, unlocked=unlocked)
+        return Session(database, unlocked)
 
     def cohort(
-        self,
-        predicate: Annotated[str, COHORT] = TRAINING_DRIVES,
-        *,
-        include_faulty: Annotated[bool, UNEXAMINED] = False,
-    ) -> FleetCohort:
-        """Return the drives of an SQL predicate, by default all but evaluation scenarios."""
+        self, predicate: str = TRAINING_DRIVES, *, include_faulty: bool = False
+    ) -> "FleetCohort":
+        """Select the drives that satisfy an SQL predicate.
+
+        Parameters
+        ----------
+        predicate
+            SQL predicate on the view `drives`, such as `"track = 'waterford_hills'"`. Default: all
+            drives but those of evaluation scenarios.
+        include_faulty
+            Include drives with faulty sensors.
+        """
+        from fleet_slip.api.fleet_cohort import FleetCohort
+
         return FleetCohort(self.warehouse, predicate, include_faulty)
 
-    # Logs, and Gram rows made of them. Whatever was done is not done again.
+    # Logs and Gram rows. Completed work is never repeated.
 
     @record_call
     def simulate(
         self,
-        campaign: Annotated["str | Campaign", CAMPAIGN],
+        campaign: "str | Campaign",
         *,
-        days: Annotated[int | None, DAYS] = None,
-        through: Annotated[date | str | None, THROUGH] = None,
+        days: int | None = None,
+        through: date | str | None = None,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "SimulationReport":
-        """Simulate what is missing of a campaign and write it to the logs.
+        """Simulate the drives of a campaign that are missing in the logs.
 
-        Progress is in rows. Raises `ConfigError` for an invalid campaign, `UsageError` if it has no
-        such days, `RefusedError` for one changed since it was written, and `ClusterError`.
+        Parameters
+        ----------
+        campaign
+            Name of a campaign of `configs/campaigns`, path of a TOML file, or a `Campaign`.
+        days
+            Simulate only the first days of the campaign. None means all.
+        through
+            Last day to simulate: a date, `YYYY-MM-DD`, or `today`. None means all days.
+        workers
+            A number of threads, the address of a Dask scheduler, or an executor.
+        progress
+            Called with the rows done so far and the rows in total.
+
+        Raises
+        ------
+        ConfigError
+            If the campaign is invalid.
+        UsageError
+            If the campaign has no such days.
+        RefusedError
+            If the campaign changed since its logs were written.
+        ClusterError
+            If the cluster cannot be used.
         """
         from fleet_slip.simulation.campaign import load_campaign
         from fleet_slip.simulation.simulate import simulate_campaign
 
-        chosen = campaign
-        if isinstance(chosen, str):
-            chosen = load_campaign(chosen, self.warehouse.configs)
-        wanted = chosen.chosen_days(days, last_day(through, "through"))
+        if isinstance(campaign, str):
+            campaign = load_campaign(campaign, self.warehouse.configs)
+        chosen_days = campaign.chosen_days(days, last_day(through, "through"))
         with open_workers(self.root, workers) as executor, step("simulate") as figures:
             report = simulate_campaign(
-                within_reach(self.warehouse, executor),
-                chosen,
-                wanted,
+                for_workers(self.warehouse, executor),
+                campaign,
+                chosen_days,
                 executor,
-                count_from_start(progress),
+                total_progress(progress),
             )
             figures.rows, figures.size_bytes = report.rows, report.size_bytes
         return report
@@ -156,68 +240,107 @@ class Fleet(HealthAndUpkeep):
         *,
         replace: "Replace" = "no",
         workers: Workers = None,
-        each: "Callable[[IngestReport], None] | None" = None,
+        on_report: "Callable[[IngestReport], None] | None" = None,
         progress: ShowProgress | None = None,
     ) -> "list[IngestReport]":
-        """Bring measured logs in through a mapping of columns, units and axes.
+        """Bring measured logs into the data root.
 
-        `mapping` is a name, the path of a TOML file, or a `Mapping`. Rows that cannot be used go to
-        the view `quarantine`. Of folders, at any depth, and patterns, the logs are taken that have
-        not landed unchanged.
-        Returns a report of each file read, in order; `each` gets it once the file is committed.
-        Progress is in files.
-        Without a cluster, threads read a folder's small files; large ones are read one by one, by
-        all cores.
+        Rows that cannot be used go to the view `quarantine` with a reason. A recording that was
+        ingested before is recognised by its bytes and samples.
 
-        A recording that is there already is recognised by its bytes and samples. With
-        `replace="all"` its drives give way to the new ones, in one commit; with `corrected` those
-        of the same file and an older state of the same mapping do. Raises `ConfigError` for an
-        invalid mapping;
-        `InputError`, when all others are in, for files that cannot be used, or `RepeatedError`
-        where these are all in already; `StorageError` and `ClusterError`.
+        Parameters
+        ----------
+        files
+            Log files, folders at any depth, or patterns. Of folders and patterns, files that were
+            ingested unchanged are skipped.
+        mapping
+            The mapping of columns, units and axes: a name, the path of a TOML file, or a `Mapping`.
+        replace
+            `all` replaces the drives of the same recordings, in one commit. `corrected` replaces
+            drives of the same file that an older state of this mapping wrote.
+        workers
+            A number of threads, the address of a Dask scheduler, or an executor. Threads read the
+            small files of a folder; large files are read one by one by all cores.
+        on_report
+            Called with the report of each file after its commit.
+        progress
+            Called with the files done so far and the files in total.
+
+        Returns
+        -------
+        list of IngestReport
+            A report of each file that was read, in the order of the files.
+
+        Raises
+        ------
+        ConfigError
+            If the mapping is invalid.
+        InputError
+            If a file cannot be used; all other files are ingested first.
+        RepeatedError
+            If recordings are in the logs already; all others are ingested first.
+        ClusterError
+            If the cluster cannot be used.
         """
         from fleet_slip.ingest.load import ingest_files
         from fleet_slip.ingest.mapping import keep_assumptions
         from fleet_slip.ingest.recordings import IngestCache
         from fleet_slip.operations.rewriting import build_removal
 
-        plan, logs, folders = self._chosen_logs(files, mapping)
-        count = count_from_start(progress)
+        mapping, logs, from_folders = self._find_logs(files, mapping)
+        count = total_progress(progress)
         reports: list[IngestReport] = []
         with open_workers(self.root, workers) as executor, step("ingest") as figures:
-            elsewhere = unless_local(executor)
-            if elsewhere:  # a worker has a working directory of its own
-                logs = [one.absolute() for one in logs]
+            remote = remote_executor(executor)
+            if remote:  # workers have their own working directory
+                logs = [log.absolute() for log in logs]
             figures.rows = 0
-            warehouse = within_reach(self.warehouse, executor)
-            threads = executor if folders else elsewhere
-            out = partial(build_removal, self.warehouse)
-            remembers = folders or replace == "corrected"
-            known = IngestCache.of(self.warehouse, plan) if remembers else None
-            wanted = logs if known is None else known.without_landed(logs, warehouse)
-            if landed := len(logs) - len(wanted):
-                count(landed, len(logs))
+            warehouse = for_workers(self.warehouse, executor)
+            uses_cache = from_folders or replace == "corrected"
+            cache = IngestCache.of(self.warehouse, mapping) if uses_cache else None
+            new_logs = logs if cache is None else cache.without_landed(logs, warehouse)
+            if skipped := len(logs) - len(new_logs):
+                count(skipped, len(logs))
             try:
-                for report in ingest_files(warehouse, wanted, plan, threads, known, replace, out):
+                for report in ingest_files(
+                    warehouse,
+                    new_logs,
+                    mapping,
+                    executor if from_folders else remote,
+                    cache,
+                    replace,
+                    partial(build_removal, self.warehouse),
+                ):
                     reports.append(report)
                     figures.rows += report.counts.ticks if report.new else 0
-                    if each is not None:
-                        each(report)
+                    if on_report is not None:
+                        on_report(report)
                     count(1, len(logs))
             finally:
-                if known is not None:
-                    known.save()
+                if cache is not None:
+                    cache.save()
                 if any(report.new for report in reports):
-                    keep_assumptions(self.root, plan)
+                    keep_assumptions(self.root, mapping)
         order = {str(log): number for number, log in enumerate(logs)}
         return sorted(reports, key=lambda report: order[report.file])
 
     @record_call
     def import_onboard_grams(self, file: Path | str) -> "OnboardImport":
-        """Bring in Gram rows that cars counted: a Parquet table (`docs/export.md`).
+        """Bring in Gram rows that cars computed on board, in one commit.
 
-        It lands whole and once. Raises `InputError` for a row that no drive can have or of what was
-        forgotten, `RepeatedError` for a drive that is there, `StorageError` and `ConflictError`.
+        Parameters
+        ----------
+        file
+            A Parquet table of Gram rows, as described in `docs/export.md`.
+
+        Raises
+        ------
+        InputError
+            If a row is impossible for any drive, or belongs to an erased drive or vehicle.
+        RepeatedError
+            If the Gram rows of a drive are in the data root already.
+        ConflictError
+            If other processes keep changing the table.
         """
         from fleet_slip.grams.on_board import import_onboard_grams
 
@@ -229,180 +352,208 @@ class Fleet(HealthAndUpkeep):
     def preview(
         self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
     ) -> "list[Preview]":
-        """Read measured files as `ingest` does, and store nothing; raises the same.
+        """Read measured logs as `ingest` does, and store nothing.
 
-        Reports rows, drives, rejections, each signal's range, and what `ingest` would find wrong: a
-        sign, a unit, swapped wheels.
+        Returns
+        -------
+        list of Preview
+            For each file its rows, drives, rejected rows and ranges of signals, and what looks
+            wrong: a sign, a unit, swapped wheels.
+
+        Raises
+        ------
+        ConfigError, InputError
+            As `ingest`.
         """
         from fleet_slip.ingest.load import preview_logs
 
-        plan, logs, _ = self._chosen_logs(files, mapping)
-        return preview_logs(logs, plan)
+        mapping, logs, _ = self._find_logs(files, mapping)
+        return preview_logs(logs, mapping)
 
     @record_call
     def gram(
         self,
-        features: Annotated[
-            str,
-            Doc(
-                "A feature set of configs/features.toml; signals is the logged signals themselves."
-            ),
-        ] = PLAIN,
+        features: str = PLAIN,
         *,
-        cohort: Annotated[
-            str | None,
-            Doc(
-                "Read only the log files that have a drive of this cohort, an SQL predicate on the "
-                "view drives. Default: all."
-            ),
-        ] = None,
+        cohort: str | None = None,
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "GramReport":
-        """Reduce new log files to Gram rows, and drop the rows of files that are gone.
+        """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
 
-        A set's first time costs a pass over the logs. Which files have a cohort's drives is known
-        from the Gram rows of `signals`. Progress is in rows. Raises `QuestionError` for an unknown
-        set, `StorageError`, `ConflictError` and `ClusterError`.
+        Parameters
+        ----------
+        features
+            A feature set of `configs/features.toml`. The first call for a set reads all logs;
+            later calls read new files. Default: the logged signals.
+        cohort
+            SQL predicate on the view `drives`. Only log files with a drive of this cohort are
+            read; the Gram rows of the logged signals tell which. None means all files.
+        workers
+            A number of threads, the address of a Dask scheduler, or an executor.
+        progress
+            Called with the rows done so far and the rows in total.
+
+        Raises
+        ------
+        QuestionError
+            If there is no such feature set, or the predicate is invalid.
+        ConflictError
+            If other processes keep changing the tables.
+        ClusterError
+            If the cluster cannot be used.
         """
         from fleet_slip.grams.update import update_grams
         from fleet_slip.warehouse.gram_reader import cohort_files
         from fleet_slip.warehouse.predicate import parse_cohort
 
-        among = None
+        files = None
         if cohort:
             predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
-            among = cohort_files(self.warehouse, predicate)
+            files = cohort_files(self.warehouse, predicate)
         with open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
-                within_reach(self.warehouse, executor),
-                count_from_start(progress),
+                for_workers(self.warehouse, executor),
+                total_progress(progress),
                 features,
-                unless_local(executor),
-                among,
+                remote_executor(executor),
+                files,
             )
             figures.rows = report.rows_read
         return report
 
-    def check(
-        self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
-    ) -> "CheckReport":
-        """Compute the Gram rows of some log files three ways; compare them bit for bit.
-
-        By the compiled kernel, by SQL where a set has it, and as stored. Files are evenly chosen;
-        those of `begin` + 1 are the next ones. Progress is in files. Raises `StorageError` naming
-        the first drive that differs, and `DataError` if there is nothing to check.
-        """
-        from fleet_slip.grams.check import check_grams
-
-        return check_grams(self.warehouse, files, count_from_start(progress), begin)
-
-    @record_call
-    def migrate(self) -> "MigrationReport":
-        """Bring the tables to this program and its catalog (`docs/configuration.md`).
-
-        Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
-        """
-        from fleet_slip.operations.rewriting import migrate
-
-        with step("migrate"):
-            return migrate(self.warehouse)
-
-    # The whole job.
+    # Pipelines.
 
     @record_call
     def run(
         self,
-        campaign: Annotated["str | Campaign", CAMPAIGN] = "waterford",
+        campaign: "str | Campaign" = "waterford",
         *,
-        days: Annotated[int | None, DAYS] = None,
-        through: Annotated[date | str | None, THROUGH] = None,
-        name: Annotated[str | None, Doc("Name of the model. Default: the campaign's.")] = None,
-        models: Annotated[str, MODELS] = DEFAULT_MODELS,
-        tolerance: Annotated[str | None, TOLERANCE] = None,
+        days: int | None = None,
+        through: date | str | None = None,
+        name: str | None = None,
+        models: str | None = None,
+        tolerance: str | None = None,
         workers: Workers = None,
         progress: ShowStep | None = None,
     ) -> "RunReport":
-        """Do the whole job: simulate what is missing, gram, select, publish if it is not worse.
+        """Simulate a campaign, update Gram rows, select a model, publish it if it is not worse.
 
-        It can be repeated at any time, and after any interruption: what is done is not done again.
-        A second run of the campaign on this machine waits for the first, and says so. A winner that
-        is worse than the champion is no error: the report says so. Progress is in rows of each
-        step. Raises what `simulate`, `gram`, `FleetCohort.select` and `publish` raise.
+        It can be repeated at any time, also after an interruption. A second run of the campaign on
+        this machine waits for the first.
+
+        Parameters
+        ----------
+        campaign, days, through, workers
+            As in `simulate`.
+        name
+            Name of the model. Default: the campaign's.
+        models
+            A model list of `configs/models`, or a TOML file. Default: `estimator`.
+        tolerance
+            As in `FleetCohort.select`.
+        progress
+            Called with the name of the step, the rows done so far and the rows in total.
+
+        Returns
+        -------
+        RunReport
+            What each step did. A winner that is worse than the champion is not published; the
+            report gives the reason.
+
+        Raises
+        ------
+        FleetSlipError
+            What `simulate`, `gram`, `FleetCohort.select` and `FleetModels.publish` raise.
         """
         from fleet_slip.api.training import RunReport, Training
-        from fleet_slip.models.request import parse_tolerance
+        from fleet_slip.models.manifest import require_model_name
+        from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
         from fleet_slip.simulation.campaign import load_campaign
 
-        begun = time.monotonic()
-        chosen = campaign
-        if isinstance(chosen, str):
-            chosen = load_campaign(chosen, self.warehouse.configs)
-        model_name = require_model_name(name or chosen.name)
+        start = time.monotonic()
+        if isinstance(campaign, str):
+            campaign = load_campaign(campaign, self.warehouse.configs)
+        model_name = require_model_name(name or campaign.name)
         parse_tolerance(tolerance)  # before anything is written
-        predicate = f"campaign = '{chosen.name}'"
-        with self._alone("run", chosen.name):
+        predicate = f"campaign = '{campaign.name}'"
+        with self._exclusive("run", campaign.name):
             with open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
-                    chosen,
+                    campaign,
                     days=days,
                     through=through,
                     workers=executor,
-                    progress=of_step(progress, f"simulate {chosen.name}"),
+                    progress=step_progress(progress, f"simulate {campaign.name}"),
                 )
-                training = Training(model_name, predicate, models, tolerance)
+                training = Training(model_name, predicate, models or DEFAULT_MODELS, tolerance)
                 grams = training.gram(self, executor, progress)
             selection, publication, refusal = training.publish(self, replace_marked=True)
         return RunReport(
-            campaign=chosen.name,
+            campaign=campaign.name,
             simulation=simulation,
             grams=grams,
             selection=selection,
             publication=publication,
             refusal=refusal,
-            seconds=round(time.monotonic() - begun, 3),
+            seconds=round(time.monotonic() - start, 3),
         )
 
     @record_call
     def learn(
         self,
-        name: Annotated[str, Doc("Name of the model, such as golf.")],
-        logs: Annotated[
-            Iterable[Path | str] | Path | str,
-            Doc("Measured logs, or folders of them, of which what is new is taken."),
-        ],
-        mapping: Annotated["str | Mapping", Doc("A mapping: of configs/mappings, or a TOML file.")],
+        name: str,
+        logs: Iterable[Path | str] | Path | str,
+        mapping: "str | Mapping",
         *,
         workers: Workers = None,
         progress: ShowStep | None = None,
     ) -> "LearnReport":
-        """Make a model of measured logs: ingest, gram, select and publish.
+        """Train a model on measured logs: ingest, update Gram rows, select and publish.
 
-        It is trained on the drives of this mapping, without faulty ones; on their
-        side-slip angle, or on the course where the mapping has no such angle. What is done is not
-        done again. Drives give way to those of a corrected mapping. Files that cannot be used are
-        passed over and are the `problem` of the report; so is a refusal.
+        The label is the side-slip angle of the mapping, else its course over ground. Drives with
+        faulty sensors are left out. Drives of a corrected mapping replace the older ones.
 
-        Raises `ConfigError` for an invalid mapping or one that has neither label, and what
-        `ingest`, `gram` and `FleetCohort.select` raise.
+        Parameters
+        ----------
+        name
+            Name of the model, such as `golf`.
+        logs, mapping, workers
+            As `files`, `mapping` and `workers` of `ingest`.
+        progress
+            Called with the name of the step, the units done so far and the units in total.
+
+        Returns
+        -------
+        LearnReport
+            What each step did and assumed. Its `problem` is the error of files that could not be
+            used, a refusal to publish, or what looks wrong in the logs.
+
+        Raises
+        ------
+        ConfigError
+            If the mapping is invalid or has neither label.
+        FleetSlipError
+            What `ingest`, `gram` and `FleetCohort.select` raise.
         """
         from fleet_slip.api.training import LearnReport, Training
         from fleet_slip.errors import InputError
+        from fleet_slip.models.manifest import require_model_name
 
-        begun = time.monotonic()
-        plan = self._chosen_mapping(mapping)
-        training = Training.on_mapping(require_model_name(name), plan)
+        start = time.monotonic()
+        mapping = self._load_mapping(mapping)
+        training = Training.on_mapping(require_model_name(name), mapping)
         reports: list[IngestReport] = []
         failure = None
-        with self._alone("learn", name), open_workers(self.root, workers) as executor:
+        with self._exclusive("learn", name), open_workers(self.root, workers) as executor:
             try:
                 self.ingest(
                     logs,
-                    plan,
+                    mapping,
                     replace="corrected",
                     workers=executor,
-                    each=reports.append,
-                    progress=of_step(progress, "ingest"),
+                    on_report=reports.append,
+                    progress=step_progress(progress, "ingest"),
                 )
             except InputError as error:
                 if not reports:
@@ -410,62 +561,118 @@ class Fleet(HealthAndUpkeep):
                 failure = error
             grams = training.gram(self, executor, progress)
             examined = self.cohort(training.cohort).examine()
-            training = replace(training, cohort=examined.cohort)
+            training = changed(training, cohort=examined.cohort)
             with examined.explaining():
                 selection, publication, refusal = training.publish(self)
         return LearnReport(
             model=name,
-            mapping=plan.name,
+            mapping=mapping.name,
             ingested=tuple(reports),
             failure=failure,
             grams=grams,
-            selection=selection and replace(selection, examined=str(examined)),
+            selection=selection and changed(selection, examined=str(examined)),
             publication=publication,
             refusal=refusal,
-            seconds=round(time.monotonic() - begun, 3),
+            seconds=round(time.monotonic() - start, 3),
         )
 
     @record_call
-    @takes(NightRequest)
-    def nightly(self, request: NightRequest) -> "NightReport":
-        """Do all that a night with real cars asks for, and tell how each step went.
+    def nightly(
+        self,
+        inbox: Path | str,
+        mapping: str,
+        name: str,
+        *,
+        cohort: str = TRAINING_DRIVES,
+        models: str | None = None,
+        tolerance: str | None = None,
+        candidate: bool = False,
+        retention: str | None = None,
+        night: date | str | None = None,
+        workers: Workers = None,
+        progress: ShowStep | None = None,
+    ) -> "NightReport":
+        """Run the nightly job of a fleet of real cars.
 
-        Ingest what is new, forget what is too old, update Gram rows, examine sensors, chart the
-        champion's error, train again without the faulty drives, and verify some log files, the next
-        ones on the next night. The winner becomes champion if it is not worse, else a candidate. A
-        night that was killed and is given again ends where it would have ended. A second one of the
-        model on this machine waits for the first, and says so.
+        It ingests new logs, erases drives older than the retention period, updates Gram rows,
+        checks sensors, charts the champion's error, trains again without faulty drives, and
+        verifies a sample of log files. The winner becomes champion if it is not worse, else a
+        candidate. A night that was killed and is repeated ends where it would have ended. A second
+        night of the model on this machine waits for the first.
 
-        What goes wrong in a step is in the report, whose `problem` is what a command fails with;
-        later steps go on where they can. Raises `UsageError` for an invalid name or tolerance, and
-        `StorageError` if the night cannot be recorded.
+        Parameters
+        ----------
+        inbox
+            Folder of logs. New logs in it are ingested.
+        mapping
+            Name of a mapping of `configs/mappings`, or the path of a TOML file.
+        name
+            Name of the model.
+        cohort
+            SQL predicate on the view `drives`: the drives that train the model.
+        models
+            A model list of `configs/models`, or a TOML file. Default: `estimator`.
+        tolerance
+            As in `FleetCohort.select`.
+        candidate
+            Publish the winner as a candidate even if it is not worse.
+        retention
+            Path of a retention file. Default: `retention.toml` of the configs.
+        night
+            Date of the night. Default: today.
+        workers, progress
+            As in `run`.
+
+        Returns
+        -------
+        NightReport
+            How each step went. Its `problem` is the first failure, else what needs attention.
+
+        Raises
+        ------
+        UsageError
+            If the name, the tolerance or the date is invalid.
+        StorageError
+            If the night cannot be recorded.
         """
-        from fleet_slip.api.nightly import Night
-        from fleet_slip.models.request import parse_tolerance
+        from fleet_slip.api.nightly import NightlyPipeline
+        from fleet_slip.api.training import Training
+        from fleet_slip.models.manifest import require_model_name
+        from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
 
-        parse_tolerance(request.tolerance)
-        require_model_name(request.name)
-        with self._alone("nightly", request.name):
-            return Night(self, request).run()
+        parse_tolerance(tolerance)
+        require_model_name(name)
+        with self._exclusive("nightly", name):
+            return NightlyPipeline(
+                fleet=self,
+                inbox=Path(inbox),
+                mapping=mapping,
+                training=Training(name, cohort, models or DEFAULT_MODELS, tolerance),
+                candidate=candidate,
+                retention=retention,
+                night=date_of(night, "night") or date.today(),
+                workers=workers,
+                progress=progress,
+            ).run()
 
-    def _alone(self, job: str, name: str) -> AbstractContextManager[None]:
-        """Wait while another process of this machine does the same, and say so."""
+    def _exclusive(self, job: str, name: str) -> AbstractContextManager[None]:
+        """Wait while another process of this machine does the same job, with a remark."""
         waiting = partial(LOGGER.info, "%s: waiting for another fleet-slip %s", name, job)
         return self.root.exclusive(f".{job}-{name}.lock", waiting)
 
-    def _chosen_mapping(self, mapping: "str | Mapping") -> "Mapping":
+    def _load_mapping(self, mapping: "str | Mapping") -> "Mapping":
         from fleet_slip.ingest.mapping import load_mapping
 
         if isinstance(mapping, str):
             return load_mapping(mapping, self.warehouse.catalog)
         return mapping
 
-    def _chosen_logs(
+    def _find_logs(
         self, files: Iterable[Path | str] | Path | str, mapping: "str | Mapping"
     ) -> "tuple[Mapping, list[Path], bool]":
-        """Return a mapping, the chosen logs, and whether these are in folders or patterns."""
+        """Return the mapping, the log files, and True if any is from a folder or pattern."""
         from fleet_slip.ingest.log_files import find_logs, names_several
 
-        plan = self._chosen_mapping(mapping)
+        mapping = self._load_mapping(mapping)
         paths = [files] if isinstance(files, Path | str) else list(files)
-        return plan, find_logs(paths), any(map(names_several, paths))
+        return mapping, find_logs(paths), any(map(names_several, paths))

@@ -1,4 +1,4 @@
-"""A night with real cars: what is new comes in, is examined, and trains the model again."""
+"""The nightly job: new logs are ingested and checked, and the model is trained again."""
 
 import time
 from collections.abc import Callable
@@ -8,13 +8,13 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import NightRequest, of_step
+from fleet_slip.api.calls import ShowStep, Workers, step_progress
 from fleet_slip.api.training import Training
-from fleet_slip.base import date_of, pluralize
+from fleet_slip.base import pluralize
 from fleet_slip.errors import DataError, FleetSlipError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import find_logs
-from fleet_slip.models.registry import CANDIDATE, ModelVersion
-from fleet_slip.operations.night import Beginning, NightReport, Nights, NightStep, State
+from fleet_slip.models.registry import CANDIDATE
+from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, NightStep, State
 from fleet_slip.storage.runs import step
 from fleet_slip.warehouse.predicate import hash_drive
 from fleet_slip.warehouse.warehouse import connect_tables, gram_snapshots
@@ -26,48 +26,50 @@ if TYPE_CHECKING:
     from fleet_slip.operations.quality_report import SensorFault
 
 SAMPLE_FILES = 4
-"""Log files that a night verifies; the next night takes the next ones."""
+"""Log files that a night verifies. The next night verifies the next ones."""
 
-NEEDS = {
+REQUIRED_STEPS = {
     "quality": ("gram",),
     "monitor": ("gram", "quality"),
     "publish": ("gram", "quality"),
     "verify": ("gram",),
 }
-"""Steps that ask for what others make. No model is trained on drives that were not examined."""
+"""Steps that must succeed before a step. No model is trained on drives that were not checked."""
 
-TIMED = {"ingest", "retain", "gram"}
-"""Steps whose calls put themselves into the history of runs."""
+RECORDED_STEPS = {"ingest", "retain", "gram"}
+"""Steps whose calls add themselves to the run record."""
 
-Told = tuple[State, str]
+StepResult = tuple[State, str]
+"""The state of a step, and a sentence for the summary."""
 
 
 @dataclass
-class Night:
-    """One night of a model. `run` does the steps in their order, and goes on where it can.
+class NightlyPipeline:
+    """One night of a model. `run` executes the steps in order, and continues after a failure.
 
-    A step that needs one that failed is left out.
+    A step is skipped if a step that it requires failed.
     """
 
     fleet: "Fleet"
-    asked: NightRequest
-    training: Training = field(init=False)
-    before: Beginning = field(init=False)
+    inbox: Path
+    mapping: str
+    training: Training
+    candidate: bool
+    retention: str | None
+    night: date
+    workers: Workers = None
+    progress: ShowStep | None = None
+    baseline: Baseline = field(init=False)
     steps: list[NightStep] = field(default_factory=list)
     faults: "tuple[SensorFault, ...]" = ()
     chart: "Chart | None" = None
-    counted: dict[tuple[int | None, int | None], int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        one = self.asked
-        self.training = Training(one.name, one.cohort, one.models, one.tolerance)
-        self.night = date_of(one.night, "night") or date.today()
+    drive_counts: dict[tuple[int | None, int | None], int] = field(default_factory=dict)
 
     def run(self) -> NightReport:
-        """Do the night and record it."""
-        began = time.monotonic()
-        nights = Nights(self.fleet.root, self.training.name)
-        self.before = nights.begin(self.night, self._now())
+        """Execute and record the night."""
+        start = time.monotonic()
+        log = NightlyLog(self.fleet.root, self.training.name)
+        self.baseline = log.begin(self.night, self._state())
         for name, work in {
             "ingest": self._ingest,
             "retain": self._retain,
@@ -77,180 +79,182 @@ class Night:
             "publish": self._publish,
             "verify": self._verify,
         }.items():
-            self._do(name, work)
-        now = self._now()
+            self._execute(name, work)
+        state = self._state()
         report = NightReport(
             model=self.training.name,
             night=self.night,
             root=str(self.fleet.root),
             steps=tuple(self.steps),
-            before=self.before,
-            drives=now.drives,
-            rows=now.rows,
-            quarantined=now.quarantined,
-            champion=now.champion,
-            candidate=now.candidate,
+            before=self.baseline,
+            drives=state.drives,
+            rows=state.rows,
+            quarantined=state.quarantined,
+            champion=state.champion,
+            candidate=state.candidate,
             faults=self.faults,
             chart=self.chart,
-            seconds=round(time.monotonic() - began, 3),
+            seconds=round(time.monotonic() - start, 3),
         )
-        nights.end(report.as_past())
+        log.end(report.as_past())
         return report
 
-    def _do(self, name: str, work: Callable[[], Told]) -> None:
-        began = time.monotonic()
-        if reason := self._hindrance(name):
+    def _execute(self, name: str, work: Callable[[], StepResult]) -> None:
+        start = time.monotonic()
+        if reason := self._blocked_by(name):
             self.steps.append(NightStep(name, "left out", reason, 0.0))
             return
         error = None
         try:
-            with nullcontext() if name in TIMED else step(name):
-                state, told = work()
+            with nullcontext() if name in RECORDED_STEPS else step(name):
+                state, summary = work()
         except FleetSlipError as failure:
-            state, told, error = "failed", str(failure), failure
-        seconds = round(time.monotonic() - began, 3)
-        self.steps.append(NightStep(name, state, told, seconds, error))
+            state, summary, error = "failed", str(failure), failure
+        seconds = round(time.monotonic() - start, 3)
+        self.steps.append(NightStep(name, state, summary, seconds, error))
 
-    def _hindrance(self, name: str) -> str:
-        """Return why a step cannot be done."""
+    def _blocked_by(self, name: str) -> str:
+        """Return the reason why a step cannot run, empty if it can."""
         warehouse = self.fleet.warehouse
         logs = warehouse.logs.snapshot().rows
         if name != "ingest" and not (logs or warehouse.grams.snapshot().rows):
             return "No drive is in the logs yet."
         if name == "verify" and not logs:
             return "There are no logs to verify."
-        undone = [one.name for one in self.steps if one.state in ("failed", "left out")]
-        missing = [one for one in NEEDS.get(name, ()) if one in undone]
+        undone = [step.name for step in self.steps if step.state in ("failed", "left out")]
+        missing = [step for step in REQUIRED_STEPS.get(name, ()) if step in undone]
         return f"{missing[0]} was not done." if missing else ""
 
-    def _now(self) -> Beginning:
+    def _state(self) -> Baseline:
+        """Return the present state of the data root."""
         warehouse, champion = self.fleet.warehouse, None
         if self.fleet.root.exists():
-            champion = self.fleet.registry().champion(self.training.name)
-        return Beginning(
+            champion = self.fleet.models.registry.champion(self.training.name)
+        return Baseline(
             champion=champion.reference if champion else None,
             drives=self._count_drives(),
             rows=warehouse.logs.snapshot().rows,
             quarantined=warehouse.quarantine.snapshot().rows,
-            candidate=self._candidate() if self.fleet.root.exists() else None,
+            candidate=self._waiting_candidate() if self.fleet.root.exists() else None,
         )
 
     def _count_drives(self) -> int:
-        """Return the number of drives, counted again only where Gram rows or logs changed."""
+        """Count the drives, again only if Gram rows or logs changed."""
         grams, logs = gram_snapshots(self.fleet.warehouse)
         state, query = (grams.version, logs.version), "SELECT count(DISTINCT drive_id) FROM grams"
         if not grams.rows:
             return 0
-        if state not in self.counted:
+        if state not in self.drive_counts:
             with connect_tables(self.fleet.warehouse, query) as database:
-                self.counted = {state: int(database.sql(query).fetchall()[0][0])}
-        return self.counted[state]
+                self.drive_counts = {state: int(database.sql(query).fetchall()[0][0])}
+        return self.drive_counts[state]
 
-    def _candidate(self) -> str | None:
-        registry, name = self.fleet.registry(), self.training.name
-        pointed, champion = registry.history(name).pointed_at(CANDIDATE), registry.champion(name)
-        waits = pointed and (champion is None or pointed > champion.version)
-        return f"{name}@{pointed}" if waits else None
+    def _waiting_candidate(self) -> str | None:
+        registry, name = self.fleet.models.registry, self.training.name
+        candidate, champion = registry.history(name).pointed_at(CANDIDATE), registry.champion(name)
+        is_newer = candidate and (champion is None or candidate > champion.version)
+        return f"{name}@{candidate}" if is_newer else None
 
-    def _ingest(self) -> Told:
+    def _ingest(self) -> StepResult:
         from fleet_slip.ingest.mapping import load_mapping
 
-        mapping = load_mapping(self.asked.mapping, self.fleet.warehouse.catalog)
-        landing = self.asked.landing
-        if not Path(landing).is_dir():
+        mapping = load_mapping(self.mapping, self.fleet.warehouse.catalog)
+        if not self.inbox.is_dir():
             raise InputError(
-                f"{landing}: no such folder. Name the inbox folder for logs, or mount it."
+                f"{self.inbox}: no such folder. Name the inbox folder for logs, or mount it."
             )
         try:
-            find_logs([self.asked.landing])
-        except InputError:  # a night in which no car came home is no fault
-            never = not self.before.drives
-            return ("attention" if never else "done"), "No log is in the folder."
+            find_logs([self.inbox])
+        except InputError:  # a night without new logs is normal
+            state: State = "done" if self.baseline.drives else "attention"
+            return state, "No log is in the folder."
         reports: list[IngestReport] = []
-        again = ""
+        repeated = ""
         try:
             self.fleet.ingest(
-                self.asked.landing,
+                self.inbox,
                 mapping,
                 replace="corrected",
-                workers=self.asked.workers,
-                each=reports.append,
-                progress=of_step(self.asked.progress, "ingest"),
+                workers=self.workers,
+                on_report=reports.append,
+                progress=step_progress(self.progress, "ingest"),
             )
-        except RepeatedError as error:  # all others are in
-            again = str(error)
-        rows = self.fleet.warehouse.logs.snapshot().rows - self.before.rows
-        told = f"{pluralize(max(rows, 0), 'new row')}."
-        if replaced := sum(one.drives_replaced for one in reports):
+        except RepeatedError as error:  # all other files are ingested
+            repeated = str(error)
+        rows = self.fleet.warehouse.logs.snapshot().rows - self.baseline.rows
+        summary = f"{pluralize(max(rows, 0), 'new row')}."
+        if replaced := sum(report.drives_replaced for report in reports):
             drives = pluralize(replaced, "drive")
-            told = f"{told} The mapping was corrected: {drives} replaced."
-        if again:
-            return "attention", f"{told} Left out: {again}"
-        if wrong := {str(found): one.file for one in reports for found in one.alarms}:
-            found, file = next(iter(wrong.items()))
-            return "attention", f"{told} {file}: looks wrong: {found}"
-        return "done", told
+            summary = f"{summary} The mapping was corrected: {drives} replaced."
+        if repeated:
+            return "attention", f"{summary} Left out: {repeated}"
+        for report in reports:
+            for alarm in report.alarms:
+                return "attention", f"{summary} {report.file}: looks wrong: {alarm}"
+        return "done", summary
 
-    def _gram(self) -> Told:
-        self.training.gram(self.fleet, self.asked.workers, self.asked.progress)
-        return "done", f"Of {pluralize(self._now().drives, 'drive')}."
+    def _gram(self) -> StepResult:
+        self.training.gram(self.fleet, self.workers, self.progress)
+        return "done", f"Of {pluralize(self._state().drives, 'drive')}."
 
-    def _quality(self) -> Told:
-        found = self.fleet.cohort(self.training.cohort).examine()
-        self.faults = found.findings(self.fleet.warehouse)
-        self.training = replace(self.training, cohort=found.cohort)
-        hashes = {hash_drive(self.training.name, one.drive_id) for one in self.faults}
-        new = len(hashes - self.before.known)
-        told = (
-            f"{pluralize(found.drives, 'drive')} checked: {new} newly faulty, {len(hashes)} "
+    def _quality(self) -> StepResult:
+        examined = self.fleet.cohort(self.training.cohort).examine()
+        self.faults = examined.findings(self.fleet.warehouse)
+        self.training = replace(self.training, cohort=examined.cohort)
+        hashes = {hash_drive(self.training.name, fault.drive_id) for fault in self.faults}
+        new = len(hashes - self.baseline.known_faults)
+        summary = (
+            f"{pluralize(examined.drives, 'drive')} checked: {new} newly faulty, {len(hashes)} "
             "faulty in all, left out of training."
         )
-        return "attention" if new else "done", told
+        return "attention" if new else "done", summary
 
-    def _monitor(self) -> Told:
-        champion = self.before.champion
+    def _monitor(self) -> StepResult:
+        champion = self.baseline.champion
         if champion is None:
             return "left out", "There was no champion yet."
-        version: ModelVersion = self.fleet.model(champion)
         try:
-            self.chart = self.fleet.monitor(version, self.training.cohort)
+            self.chart = self.fleet.maintenance.monitor(champion, self.training.cohort)
         except DataError as error:
             return "left out", str(error)
-        new = [day for day in self.chart.days if not day.training]
+        new_days = [day for day in self.chart.days if not day.training]
         drives = self.chart.drives_left_out
         left_out = f" {pluralize(drives, 'drive')} without a log left out." if drives else ""
-        told = f"{champion} on {pluralize(len(new), 'new day')}: "
+        summary = f"{champion} on {pluralize(len(new_days), 'new day')}: "
         if self.chart.alarms:
-            return "attention", f"{told}beyond its limits on {self.chart.alarm}.{left_out}"
-        return "done", f"{told}within its limits.{left_out}"
+            return "attention", f"{summary}beyond its limits on {self.chart.alarm}.{left_out}"
+        return "done", f"{summary}within its limits.{left_out}"
 
-    def _publish(self) -> Told:
-        if made := self.training.current_champion(self.fleet):
-            return "done", f"{made.version.reference} is up to date."
+    def _publish(self) -> StepResult:
+        if current := self.training.current_champion(self.fleet):
+            return "done", f"{current.version.reference} is up to date."
         selection = self.training.select(self.fleet)
-        name = self.training.name
         publication, refusal = None, ""
-        if not self.asked.candidate:
+        if not self.candidate:
             publication, refusal = self.training.publish_if_not_worse(
                 self.fleet, selection, replace_marked=False
             )
         if publication is None:
-            publication = self.fleet.publish(name, selection, candidate=True)
-        told = f"{publication.version.reference}: {publication.reason}"
-        said = publication.version.reference == self.before.candidate  # by an earlier night
-        return "attention" if refusal and not said else "done", told
+            name = self.training.name
+            publication = self.fleet.models.publish(name, selection, candidate=True)
+        reference = publication.version.reference
+        is_new = reference != self.baseline.candidate
+        state: State = "attention" if refusal and is_new else "done"
+        return state, f"{reference}: {publication.reason}"
 
-    def _verify(self) -> Told:
-        told = of_step(self.asked.progress, "verify")
-        checked = self.fleet.check(SAMPLE_FILES, begin=self.night.toordinal(), progress=told)
+    def _verify(self) -> StepResult:
+        progress = step_progress(self.progress, "verify")
+        report = self.fleet.maintenance.check_grams(
+            SAMPLE_FILES, begin=self.night.toordinal(), progress=progress
+        )
         return "done", (
-            f"{pluralize(checked.rows, 'row')} of {pluralize(checked.files, 'file')} and their "
+            f"{pluralize(report.rows, 'row')} of {pluralize(report.files, 'file')} and their "
             "Gram rows verified."
         )
 
-    def _retain(self) -> Told:
-        told = of_step(self.asked.progress, "retain")
-        report = self.fleet.retain(self.asked.retention, progress=told)
+    def _retain(self) -> StepResult:
+        progress = step_progress(self.progress, "retain")
+        report = self.fleet.maintenance.apply_retention(self.retention, progress=progress)
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
         return "done", (
             f"{pluralize(forgotten, 'drive')} before {report.before} forgotten, "

@@ -1,10 +1,10 @@
-"""What trains a model, as runs, `learn` and nights do, and what `Fleet.run` and `learn` came to."""
+"""The training of a model in the pipelines `run`, `learn` and `nightly`, and their reports."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.api.calls import ShowStep, Workers, of_step
+from fleet_slip.api.calls import ShowStep, Workers, step_progress
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.course import COURSE
 from fleet_slip.catalog.features import PLAIN
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Training:
-    """What trains a model every night: cohort, model list, `tolerance` of a signal."""
+    """How a pipeline trains a model: its name, cohort, model list, tolerance and label."""
 
     name: str
     cohort: str
@@ -35,7 +35,7 @@ class Training:
 
     @classmethod
     def on_mapping(cls, name: str, mapping: "Mapping") -> "Training":
-        """Return what trains on a mapping's drives: its side-slip angle, else its course.
+        """Train on the side-slip angle of a mapping's drives, else on their course.
 
         Raises `ConfigError` for a mapping without either.
         """
@@ -53,10 +53,10 @@ class Training:
     def gram(
         self, fleet: "Fleet", workers: "Workers", progress: "ShowStep | None" = None
     ) -> "tuple[GramReport, ...]":
-        """Make the Gram rows that the list needs: of the signals, its feature set, and others."""
+        """Update the Gram rows that the model list needs: signals, its features and auxiliaries."""
         catalog = fleet.warehouse.catalog
         models = load_model_list(catalog, self.models)
-        if models.line:  # from what its rows tell, select makes those of the list
+        if models.line:  # select computes the rows of the stacked list from those of this one
             models = load_model_list(catalog, models.line)
         auxiliary = catalog.auxiliary_sets(models.features)
         names = dict.fromkeys((PLAIN, models.features, *auxiliary))
@@ -65,17 +65,17 @@ class Training:
                 name,
                 cohort=None if name == PLAIN else self.cohort,
                 workers=workers,
-                progress=of_step(progress, f"gram {name}"),
+                progress=step_progress(progress, f"gram {name}"),
             )
             for name in names
         )
 
     def current_champion(self, fleet: "Fleet") -> "Publication | None":
-        """Return the champion if a selection would come to it again, whatever it looks at."""
+        """Return the champion if it was selected from the same data, list and program."""
         from fleet_slip.models.publish import Publication, is_current
         from fleet_slip.operations.marked_models import marked_models
 
-        champion = fleet.registry().champion(self.name)
+        champion = fleet.models.registry.champion(self.name)
         if champion is None or champion.reference in marked_models(fleet.warehouse):
             return None
         manifest = champion.manifest
@@ -84,19 +84,19 @@ class Training:
         return Publication(champion, False, "The champion was made from the same data and list.")
 
     def select(self, fleet: "Fleet") -> "Selection":
-        """Compare the models of the list on the cohort, which a night has examined."""
+        """Compare the models of the list on the cohort, whose drives are checked already."""
         cohort = fleet.cohort(self.cohort, include_faulty=True)
         return cohort.select(models=self.models, tolerance=self.tolerance, label=self.label)
 
     def publish(
         self, fleet: "Fleet", *, replace_marked: bool = False
     ) -> "tuple[Selection | None, Publication | None, str]":
-        """Select and publish; return the selection, the publication, or why there is none.
+        """Select and publish; return the selection, the publication and the refusal.
 
         There is no selection if the champion is up to date.
         """
-        if made := self.current_champion(fleet):
-            return None, made, ""
+        if current := self.current_champion(fleet):
+            return None, current, ""
         with step("select"):
             selection = self.select(fleet)
         with step("publish"):
@@ -107,34 +107,33 @@ class Training:
     def publish_if_not_worse(
         self, fleet: "Fleet", selection: "Selection", *, replace_marked: bool
     ) -> "tuple[Publication | None, str]":
-        """Return the publication, or None and why it was refused.
+        """Return the publication, or None and the reason of the refusal.
 
-        With `replace_marked`, what was trained on forgotten drives is replaced even by a worse one.
+        With `replace_marked`, a champion that was trained on erased drives is always replaced.
         """
         from fleet_slip.operations.marked_models import marked_models
 
-        champion = fleet.registry().champion(self.name)
+        champion = fleet.models.registry.champion(self.name)
         force = (
             replace_marked
             and champion is not None
             and champion.reference in marked_models(fleet.warehouse)
         )
         try:
-            published = fleet.publish(self.name, selection, force=force)
+            return fleet.models.publish(self.name, selection, force=force), ""
         except RefusedError as error:
             return None, str(error)
-        return published, ""
 
 
 @dataclass(frozen=True)
 class Trained(Answer):
-    """What training came to.
+    """The result of a training.
 
-    There is no selection where the champion is up to date, and no publication after a `refusal`.
+    `selection` is None if the champion is up to date, `publication` is None after a `refusal`.
     """
 
     grams: "tuple[GramReport, ...]"
-    """Of the logged signals first, then of the list's feature set, and what that needs."""
+    """Reports of the logged signals, the feature set of the list, and auxiliary sets."""
     selection: "Selection | None"
     publication: "Publication | None"
     refusal: str
@@ -142,22 +141,22 @@ class Trained(Answer):
 
     @property
     def new(self) -> bool:
-        """Whether rows were read or a version was published."""
-        published = self.publication is not None and self.publication.new
-        return published or any(one.changed for one in self.grams)
+        """True if rows were read or a version was published."""
+        is_published = self.publication is not None and self.publication.new
+        return is_published or any(report.changed for report in self.grams)
 
     @property
     def publish(self) -> "Publication | dict[str, Any]":
-        """The publication, or why there is none."""
+        """The publication, or the reason of the refusal."""
         return self.publication or {"new": False, "reason": self.refusal}
 
     def training_parts(self, everything: bool) -> Iterator[Part]:
-        """Return what each step did."""
+        """Render the result of each step."""
         for gram in self.grams:
             name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set}"
-            read, made = pluralize(gram.rows_read, "row"), pluralize(gram.gram_rows, "Gram row")
+            rows, new = pluralize(gram.rows_read, "row"), pluralize(gram.gram_rows, "Gram row")
             if gram.changed or gram in self.grams[:2]:
-                yield Remark(f"{name}: {read} read, {made}")
+                yield Remark(f"{name}: {rows} read, {new}")
         if self.selection:
             yield from self.selection.parts(everything)
         if self.publication:
@@ -166,15 +165,15 @@ class Trained(Answer):
             yield Remark(self.refusal)
         yield Remark(f"done in {self.seconds:.1f} s")
 
-    def nothing_done(self, what: str) -> Remark:
-        """Return the sentence of a call that found nothing new."""
-        kept = self.publication.version.reference if self.publication else self.refusal
-        return Remark(f"{what}: nothing to do, {kept} is up to date ({self.seconds:.1f} s)")
+    def nothing_done(self, subject: str) -> Remark:
+        """Render the sentence for a call without new data."""
+        champion = self.publication.version.reference if self.publication else self.refusal
+        return Remark(f"{subject}: nothing to do, {champion} is up to date ({self.seconds:.1f} s)")
 
 
 @dataclass(frozen=True)
 class RunReport(Trained):
-    """What `Fleet.run` did; `gram_features` is the report of the list's feature set."""
+    """The report of `Fleet.run`; `gram_features` is the report of the list's feature set."""
 
     DOCUMENT = (
         "campaign changed simulate=simulation gram gram_features? select=selection publish seconds"
@@ -184,7 +183,7 @@ class RunReport(Trained):
     simulation: "SimulationReport"
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
-        """Return what each step did."""
+        """Render the result of each step."""
         if not self.changed:
             yield self.nothing_done(self.campaign)
             return
@@ -198,18 +197,18 @@ class RunReport(Trained):
 
     @property
     def gram_features(self) -> "GramReport | None":
-        """The report of the list's feature set, unless that is the logged signals."""
+        """The report of the list's feature set, None if that is the logged signals."""
         return self.grams[1] if len(self.grams) > 1 else None
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """True if there was anything to do."""
         return self.new or self.simulation.changed
 
 
 @dataclass(frozen=True)
 class LearnReport(Trained):
-    """What `Fleet.learn` did."""
+    """The report of `Fleet.learn`."""
 
     DOCUMENT = (
         "model mapping changed ingest=ingested gram=grams select=selection publish assumed seconds"
@@ -219,37 +218,38 @@ class LearnReport(Trained):
     mapping: str
     ingested: "tuple[IngestReport, ...]"
     failure: "InputError | None"
-    """What was wrong with files that could not be read; all others are in."""
+    """The error of files that could not be read; all other files are ingested."""
 
     @property
     def assumed(self) -> tuple[str, ...]:
-        """Which values stand for what nobody said."""
+        """The values that were assumed because the mapping does not give them."""
         return self.publication.version.manifest.assumed if self.publication else ()
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
-        return self.new or any(one.new for one in self.ingested)
+        """True if there was anything to do."""
+        return self.new or any(report.new for report in self.ingested)
 
     @property
     def problem(self) -> FleetSlipError | None:
-        """What was wrong with a file, why nothing was published, or what looks wrong."""
+        """The error of a file, the refusal, or the first alarm of a file."""
         if self.failure or self.refusal:
             return self.failure or RefusedError(self.refusal)
-        alarms = (f"{one.file}: {found}" for one in self.ingested for found in one.alarms)
+        alarms = (f"{log.file}: {alarm}" for log in self.ingested for alarm in log.alarms)
         return next((AlarmError(alarm) for alarm in alarms), None)
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
-        """Return what each step did, and what was assumed."""
-        looks = {str(found): one.file for one in self.ingested for found in one.suspicions}
+        """Render the result of each step, and what was assumed."""
+        suspicions = {str(text): log.file for log in self.ingested for text in log.suspicions}
         if self.changed:
-            new = [one for one in self.ingested if one.new]
-            drives, rows = (sum(getattr(o.counts, n) for o in new) for n in ("drives", "ticks"))
+            counts = [log.counts for log in self.ingested if log.new]
+            drives, rows = sum(c.drives for c in counts), sum(c.ticks for c in counts)
             yield Remark(f"ingested {pluralize(drives, 'drive')}, {pluralize(rows, 'row')}")
-            yield from (Remark(f"{file}: looks wrong: {found}") for found, file in looks.items())
+            for text, file in suspicions.items():
+                yield Remark(f"{file}: looks wrong: {text}")
             yield from self.training_parts(everything)
         else:
             yield self.nothing_done(self.model)
         if self.assumed:
             yield Remark(f"assumed, since {self.mapping} does not say otherwise:")
-            yield from (Remark(f"  {one}") for one in self.assumed)
+            yield from (Remark(f"  {value}") for value in self.assumed)

@@ -34,104 +34,108 @@ if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
 
 
-# All commands: which module has each. A module is imported when one of its commands is called.
-#
-# So `--help` and shell completion wait for none of them, and a command waits for what it needs
-# itself. What the list of commands says of one is its docstring's, which Python finds in the
-# module's compiled code without running it. Help is plain text: boxes and colours took longer than
-# all else.
+# A module is imported when one of its commands runs: --help and shell completion import none. The
+# list of commands takes their docstrings from the module's compiled code. Help is plain text: boxes
+# and colours took longer than everything else.
 
 GROUPS = {
     "Start here": {
-        "run": "begin",
-        "mapping": "data",
-        "ingest": "data",
-        "learn": "begin",
-        "sql": "sql",
-        "show": "models",
-        "evaluate": "accuracy",
-        "export": "models",
+        "run": "pipeline_commands",
+        "mapping": "data_commands",
+        "ingest": "data_commands",
+        "learn": "pipeline_commands",
+        "sql": "sql_command",
+        "show": "model_commands",
+        "evaluate": "accuracy_commands",
+        "export": "model_commands",
     },
     "Data": {
-        "simulate": "data",
-        "gram": "grams",
-        "features": "grams",
+        "simulate": "data_commands",
+        "gram": "data_commands",
+        "features": "feature_commands",
     },
     "Models": {
-        "select": "begin",
-        "publish": "begin",
-        "models": "models",
-        "promote": "models",
-        "pin": "models",
-        "diff": "models",
+        "select": "selection_commands",
+        "publish": "selection_commands",
+        "models": "model_commands",
+        "promote": "model_commands",
+        "rollback": "model_commands",
+        "pin": "model_commands",
+        "unpin": "model_commands",
+        "diff": "model_commands",
     },
     "Accuracy": {
-        "score": "accuracy",
-        "identify": "accuracy",
-        "report": "accuracy",
-        "watch": "accuracy",
-        "explore": "accuracy",
-        "diagnose": "accuracy",
+        "score": "accuracy_commands",
+        "identify": "accuracy_commands",
+        "report": "accuracy_commands",
+        "watch": "accuracy_commands",
+        "explore": "accuracy_commands",
+        "diagnose": "selection_commands",
     },
     "Operations": {
-        "nightly": "operations",
-        "status": "operations",
-        "quality": "operations",
-        "calibrate": "operations",
-        "monitor": "operations",
-        "verify": "operations",
-        "compact": "operations",
-        "forget": "operations",
-        "migrate": "operations",
+        "nightly": "pipeline_commands",
+        "status": "operation_commands",
+        "quality": "operation_commands",
+        "calibrate": "operation_commands",
+        "monitor": "operation_commands",
+        "verify": "operation_commands",
+        "compact": "operation_commands",
+        "forget": "operation_commands",
+        "migrate": "operation_commands",
     },
 }
-"""The commands in the groups and the order of `--help`, and the module of `fleet_slip.cli` that has
+"""The commands by group, in the order of `--help`, with the module of `fleet_slip.cli` that defines
 each as a function."""
 
 COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
 
 
 class CommandGroup(TyperGroup):
-    """The commands, listed from their docstrings; the one that is called is loaded."""
+    """The commands, listed by their docstrings; a command is loaded when it runs."""
 
     def __init__(self, **settings: Any) -> None:
-        """Add a command that has nothing but its docstring for each of `COMMANDS`."""
+        """Add a command without options for each of `COMMANDS`."""
         super().__init__(**settings)
         for name, module in COMMANDS.items():
             self.add_command(TyperCommand(name, help=docstrings(module)[name]))
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ARG002 - of the base
         """Write the commands, group by group."""
-        wide = max(map(len, COMMANDS))
-        left = formatter.width - wide - 6
+        width = max(map(len, COMMANDS))
+        text_width = formatter.width - width - 6
         for group, names in GROUPS.items():
             with formatter.section(group):
-                rows = [(name, self.commands[name].get_short_help_str(2 * left)) for name in names]
-                formatter.write_dl([(f"{name:<{wide}}", text) for name, text in rows])
+                helps = {
+                    name: self.commands[name].get_short_help_str(2 * text_width) for name in names
+                }
+                formatter.write_dl([(f"{name:<{width}}", text) for name, text in helps.items()])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Put the command that is called in the place of its docstring."""
+        """Load the command that runs."""
         if args[0] in COMMANDS:
             self.commands[args[0]] = load_command(args[0])
         return super().resolve_command(ctx, args)
 
 
 def load_command(name: str) -> Any:
-    """Return a command, with its options."""
+    """Return a command with its options, or a group of commands."""
     module = import_module(f"fleet_slip.cli.{COMMANDS[name]}")
     app = typer.Typer(rich_markup_mode=None)
-    app.command(name)(getattr(module, name))
+    if group := getattr(module, f"{name}_app", None):
+        app.add_typer(group, name=name)
+    else:
+        app.command(name)(getattr(module, name))
     return get_group(app).commands[name]
 
 
 @cache
 def docstrings(module: str) -> Mapping[str, str]:
-    """Return the docstrings of a module's functions by name; the module is not imported."""
+    """Return the docstrings of a module's functions by name, without importing the module."""
     name = f"fleet_slip.cli.{module}"
     spec = find_spec(name)
     loader = spec.loader if spec else None
     compiled = loader.get_code(name) if isinstance(loader, InspectLoader) else None
-    codes = [one for one in compiled.co_consts if isinstance(one, CodeType)] if compiled else []
+    codes = [code for code in compiled.co_consts if isinstance(code, CodeType)] if compiled else []
     return {
         code.co_name: inspect.cleandoc(FunctionType(code, {}).__doc__ or "")
         for code in codes
@@ -139,35 +143,50 @@ def docstrings(module: str) -> Mapping[str, str]:
     }
 
 
+EXIT_CODES = {
+    0: "done",
+    1: "a bug",
+    2: "wrong usage",
+    3: "a config file",
+    4: "input data",
+    5: "the data cannot answer",
+    6: "storage",
+    7: "refused",
+    8: "a conflict with another process",
+    9: "damage",
+    10: "something needs attention",
+    11: "a cluster",
+    12: "not finished yet",
+    13: "a package of an extra is missing",
+    15: "a recording is in the logs already",
+    16: "sensors are not checked",
+    INTERRUPTED: "interrupted",
+}
+"""The exit codes of the classes of `errors.py`, as `--help` lists them."""
+
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=(
-        "Exit codes: 0 done, 1 a bug, 2 wrong usage, 3 a config file, 4 input data, 5 the data "
-        "cannot answer, 6 storage, 7 refused, 8 a conflict with another process, 9 damage "
-        "found, 10 something calls for attention, 11 a cluster, 12 not all done yet, 13 a "
-        "package of an extra is missing, 14 too few cars for an answer, 15 a recording that is in "
-        "already, 16 not examined, 130 interrupted."
-    ),
+    epilog=f"Exit codes: {', '.join(f'{code} {text}' for code, text in EXIT_CODES.items())}.",
 )
 
 
 def _open(root: str | None, config: str | None) -> "Fleet":
-    """Return the fleet of a command, when it runs: its help waits for no table."""
+    """Return the fleet of a command when it runs: its help needs no tables."""
     fleet = fleet_slip.open(root, config)
-    _leave_pandas()
+    _hide_pandas()
     return fleet
 
 
-def _leave_pandas() -> None:
-    """Let pyarrow find no pandas when it looks for it, at its first array of Python's values.
+def _hide_pandas() -> None:
+    """Prevent pyarrow from importing pandas with its first array of Python values.
 
-    Importing it takes a quarter of a small command. What asks for a data frame still gets one.
+    The import takes a quarter of a short command. Data frames still work.
     """
-    import pyarrow as pa  # noqa: PLC0415 - help needs no table
+    import pyarrow as pa
 
     sys.meta_path.insert(0, _WithoutPandas)
     pa.array([])
@@ -181,9 +200,9 @@ class _WithoutPandas:
             raise ModuleNotFoundError(name, name=name)
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version  # noqa: PLC0415 - every start would wait for it
+def _print_version(requested: bool) -> None:
+    if requested:
+        from importlib.metadata import version
 
         typer.echo(f"fleet-slip {version('fleet-slip')}")
         raise typer.Exit
@@ -195,7 +214,7 @@ def options(
     root: Annotated[
         str | None,
         typer.Option(
-            help="Data root: a folder, or the URL of an object store such as s3://BUCKET/PATH. "
+            help="Data root: a folder, or the URL of an object store, such as s3://BUCKET/PATH. "
             "Default: $FLEET_SLIP_ROOT, else ./data.",
             show_default=False,
         ),
@@ -203,13 +222,16 @@ def options(
     config: Annotated[
         str | None,
         typer.Option(
-            help="A folder of configs laid over the shipped ones (docs/configuration.md). "
+            help="Folder of configs that override the shipped ones (docs/configuration.md). "
             "Default: $FLEET_SLIP_CONFIG.",
             show_default=False,
         ),
     ] = None,
     _version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print it.")
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
     """Side-slip angle estimation from fleet logs.
@@ -222,11 +244,11 @@ def options(
     With logs of your own: fleet-slip mapping suggest LOG, then fleet-slip learn
     """
     configure_remarks()
-    context.obj = partial(_open, root, config)
+    context.obj = cache(partial(_open, root, config))
 
 
 def run_app() -> int:
-    """Run the command line; an expected error becomes one line on stderr and the exit code."""
+    """Run the command line; return its exit code. An expected error is one line on stderr."""
     streams = Streams()
     configure_remarks()
     _choose_font_folder()
@@ -243,7 +265,7 @@ def run_app() -> int:
 
 def _exit_code_of_app() -> int:
     try:
-        if callable(signal.getsignal(signal.SIGINT)):  # not that of the start any more
+        if callable(signal.getsignal(signal.SIGINT)):  # replace the handler of the imports
             signal.signal(signal.SIGINT, signal.default_int_handler)
         app()
     except FleetSlipError as error:
@@ -261,26 +283,26 @@ def _exit_code_of_app() -> int:
         return StorageError.exit_code
     except KeyboardInterrupt as error:
         return _end_interrupted(error)
-    except SystemExit as ended:
-        if ended.code == INTERRUPTED:  # typer makes it of a KeyboardInterrupt
-            return _end_interrupted(ended)
-        _explain_late_options(sys.argv[1:], ended.code)
-        return ended.code if isinstance(ended.code, int) else 0
+    except SystemExit as end:
+        if end.code == INTERRUPTED:  # typer converts a KeyboardInterrupt
+            return _end_interrupted(end)
+        _explain_late_options(sys.argv[1:], end.code)
+        return end.code if isinstance(end.code, int) else 0
     return 0
 
 
-def _explain_late_options(given: list[str], code: object) -> None:
-    """Say where the options of all commands stand, if a command did not know them."""
+def _explain_late_options(arguments: list[str], code: object) -> None:
+    """Explain the place of --root and --config if they follow the command."""
     early = "--root", "--config"
-    while given and given[0] in early:
-        given = given[2:]
-    late = [option for option in early if option in given]
+    while arguments and arguments[0] in early:
+        arguments = arguments[2:]
+    late = [option for option in early if option in arguments]
     if late and code == UsageError.exit_code:
-        say(f"{late[0]} stands before the command: fleet-slip {late[0]} … {given[0]} …")
+        say(f"{late[0]} stands before the command: fleet-slip {late[0]} … {arguments[0]} …")
 
 
 def _end_interrupted(error: BaseException | None) -> int:
-    """Say that Ctrl-C was pressed; end the process at once if a query cannot be stopped."""
+    """Report the interrupt; end the process at once if a query cannot be stopped."""
     say(
         "interrupted: committed work is kept, nothing is half written. Repeat the command to "
         "continue.",
@@ -289,13 +311,13 @@ def _end_interrupted(error: BaseException | None) -> int:
     while error is not None:
         if isinstance(error, QueryGoesOnError):
             sys.stdout.flush()
-            os._exit(INTERRUPTED)  # the usual end would wait for the query
+            os._exit(INTERRUPTED)  # a normal exit would wait for the query
         error = error.__cause__ or error.__context__
     return INTERRUPTED
 
 
 def _choose_font_folder() -> None:
-    """Keep what matplotlib knows of fonts in the cache folder of a service, which has no home."""
+    """Set the font cache of matplotlib to the cache folder of a service, which has no home."""
     folder = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     if folder:
         os.environ.setdefault("MPLCONFIGDIR", folder)

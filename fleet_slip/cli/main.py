@@ -22,7 +22,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, _leave)
     try:
         spare_data()
-        from fleet_slip.cli.app import run_app  # noqa: PLC0415 - see above
+        from fleet_slip.cli.app import run_app
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
             raise

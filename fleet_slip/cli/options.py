@@ -1,231 +1,265 @@
-"""Options of commands: those of a request as one parameter, and some that several share."""
+"""Options and arguments that several commands share, and what runs a command."""
 
 import functools
-import inspect
-import re
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
-from typing import Annotated, Any, get_args
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, cast
 
 import typer
 
-from fleet_slip.api.calls import doc_of, open_workers, type_of
-from fleet_slip.base import date_of, document_of, last_day
-from fleet_slip.cli.output import Json, print_json, print_parts
 from fleet_slip.storage.runs import recording
 
-DETAILS: dict[str, dict[str, Any]] = {
-    "days": {"min": 1},
-    "folds": {"metavar": "NUMBER|each"},
-    "max_age_hours": {"min": 0},
-    "max_features": {"min": 1, "max": 200},
-    "retention_hours": {"min": 1, "max": 168},
-    "target_rows": {"min": 1},
-    "what": {"metavar": "SCENARIO|DRIVE"},
-}
-"""What options need on the command line beside what is said of them in the API."""
+if TYPE_CHECKING:
+    from fleet_slip.api.fleet import Fleet
 
-NAMES = {
-    "predicate": "--cohort",
-    "everything": "--all",
-    "front_drive_share": "--front-drive",
-    "rolling_radius_m": "--radius",
-}
-"""Parameters that every command calls otherwise than the API; units are in the help of an option,
-not in its name."""
-
-READ: dict[str, tuple[Any, Callable[[Any], Any]]] = {
-    "campaign": (str, str),
-    "folds": (str | None, lambda folds: folds),
-    "landing": (str, str),
-    "logs": (list[str], list),
-    "mapping": (str, lambda mapping: mapping),
-    "model": (str | None, lambda model: model),
-    "night": (str | None, lambda night: date_of(night, "--night")),
-    "one": (str, str),
-    "other": (str, str),
-    "others": (list[str] | None, lambda names: names or ()),
-    "over": (str | None, lambda over: [one.strip() for one in over.split(",")] if over else ()),
-    "scenarios": (list[str] | None, lambda names: names or ()),
-    "accept_loss": (list[str] | None, lambda paths: paths or ()),
-    "since": (str | None, lambda since: date_of(since, "--since")),
-    "through": (str | None, last_day),
-}
-"""Parameters of other types on the command line, and what reads them."""
-
-_NAMED = re.compile("`([a-z_]+)`")
-_UNIT = re.compile("_(kg|m|s)$")
+P = ParamSpec("P")
 
 
-def command(
-    *calls: Callable[..., Any],
-    arguments: Collection[str] = (),
-    without: Collection[str] = (),
-    progress: str | None = None,
-    echo: Collection[str] = (),
-    **names: str,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a function that prints an answer the command that asks for it.
-
-    The answer is that of `calls`, methods of a `Fleet` and then of the answer before. Their
-    parameters with a `Doc` are options of the command, or `arguments`, but for those `without`;
-    `names` says which are called otherwise. Where their tasks run, are options if calls ask for it.
-    With `--json` the document of the answer is printed, with the options of `echo` beside it,
-    instead of calling the function, unless that has a parameter `json`. Its other parameters are
-    options of its own, values of options, or `fleet`. While calls work their `progress` is shown:
-    what is done, with options in braces, or "" where calls name their steps. What changes the
-    warehouse leaves a record. The `problem` of an answer is raised when all is printed.
-
-    A function whose first parameter is `fleet` makes the calls, or others, and prints JSON, too.
-    One without a parameter that is no option has nothing to add to the parts of an `Answer`.
-    """
-    names = NAMES | names
-    asked = {
-        name: one
-        for call in calls
-        for name, one in _parameters_of(call).items()
-        if name not in without
-    }
-    given = {
-        name: _parameter(one, name in arguments, names.get(name))
-        for name, one in asked.items()
-        if doc_of(one.annotation)
-    }
-    if "workers" in asked or "threads" in asked:
-        given["threads"] = _plain("threads", Threads)
-    if "workers" in asked:
-        given["cluster"] = _plain("cluster", Cluster)
-
-    def expand(show: Callable[..., None]) -> Callable[..., None]:
-        others = [*inspect.signature(show).parameters.values()]
-        renders = not others or others[0].default is not inspect.Parameter.empty
-        first = None if renders else others.pop(0).name
-        rest = {one.name for one in others if one.kind is inspect.Parameter.VAR_KEYWORD}
-        own = {one.name for one in others} - rest
-        beside = {
-            one.name: one.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-            for one in others
-            if one.name not in {"fleet", "json", *rest, *given}
-        }
-        context = _plain("context", typer.Context, inspect.Parameter.empty)
-        parameters = [context, *given.values(), *beside.values()]
-        if "json" not in without:
-            parameters.append(_plain("json", Json, False))
-
-        @functools.wraps(show)
-        def run(context: typer.Context, *, json: bool = False, **typed: Any) -> None:
-            fleet = context.obj()
-            values = {
-                name: READ[name][1](one) if name in READ and name in asked else one
-                for name, one in typed.items()
-            }
-            dry_run = {**values, **typed}.get("dry_run")
-            recorded = not dry_run and any(hasattr(call, "recorded") for call in calls)
-            record = recording(fleet.root, show.__name__, sys.argv[1:]) if recorded else None
-            known = {**values, "fleet": fleet, "json": json}
-            known = {name: one for name, one in known.items() if name in own or rest}
-            with record or nullcontext():
-                if first == "fleet":
-                    return show(**known | {"fleet": fleet})
-                with _doing(fleet, asked, typed, progress) as working:
-                    answer = fleet
-                    for call in calls:
-                        taken = _parameters_of(call)
-                        options = {**values, **working}
-                        answer = getattr(answer, call.__name__)(
-                            **{name: one for name, one in options.items() if name in taken}
-                        )
-                if json and "json" not in own:
-                    echoed = {names.get(one, one).strip("-"): values[one] for one in echo}
-                    print_json(echoed | document_of(answer) if echo else answer)
-                elif renders:
-                    print_parts(answer.parts(**known))
-                else:
-                    show(answer, **known)
-                if problem := getattr(answer, "problem", None):
-                    raise problem
-
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
-        return run
-
-    return expand
+def fleet_of(context: typer.Context) -> "Fleet":
+    """Return the fleet that --root and --config name."""
+    fleet: Fleet = context.obj()
+    return fleet
 
 
-@contextmanager
-def _doing(
-    fleet: Any, asked: Collection[str], typed: Mapping[str, Any], doing: str | None
-) -> Iterator[dict[str, Any]]:
-    """Yield what calls need while they work: where tasks run, what shows how far they are."""
-    found: dict[str, Any] = {}
-    with ExitStack() as stack:
-        if "workers" in asked:
-            where = typed.get("cluster") or typed.get("threads")
-            found["workers"] = stack.enter_context(open_workers(fleet.root, where))
-        if doing is not None:
-            from fleet_slip.cli import progress as bars  # noqa: PLC0415 - others wait for no bar
+def recorded(command: Callable[P, None]) -> Callable[P, None]:
+    """Record each run of a command in the view `runs`, but for dry runs."""
 
-            named = doing.format(**typed)
-            bar = bars.progress(named) if named else bars.progress_of_steps()
-            found["progress"] = stack.enter_context(bar)
-        yield found
+    @functools.wraps(command)
+    def run(*arguments: P.args, **options: P.kwargs) -> None:
+        if options.get("dry_run"):
+            return command(*arguments, **options)
+        root = fleet_of(cast(typer.Context, options["context"])).root
+        with recording(root, command.__name__, sys.argv[1:]):
+            return command(*arguments, **options)
+
+    return run
 
 
-def _parameters_of(call: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """Return what a call takes by name; instead of `**` the keys of its `TypedDict`."""
-    found = dict(inspect.signature(call).parameters)
-    for name, one in [*found.items()]:
-        if one.kind is inspect.Parameter.VAR_KEYWORD:
-            del found[name]
-            [keys] = get_args(one.annotation)  # of `Unpack`
-            found |= {key: _plain(key, kind) for key, kind in keys.__annotations__.items()}
-    return found
-
-
-def _parameter(one: inspect.Parameter, argument: bool, name: str | None) -> inspect.Parameter:
-    """Return a parameter of the API as the command line has it."""
-    text = _NAMED.sub(lambda found: "--" + found[1].replace("_", "-"), doc_of(one.annotation) or "")
-    details: dict[str, Any] = {"help": text, **DETAILS.get(one.name, {})}
-    if one.default is None or one.default is inspect.Parameter.empty:
-        details["show_default"] = False
-    if argument:
-        if one.name == "model":
-            details["metavar"] = "MODEL"
-        said: Any = typer.Argument(**details)
-    else:
-        flag = _UNIT.sub("", one.name).replace("_", "-")
-        off = f"/--no-{flag}" if one.default is True else ""
-        said = typer.Option(name or f"--{flag}{off}", **details)
-    kind = READ[one.name][0] if one.name in READ else type_of(one.annotation)
-    left_out = one.default is inspect.Parameter.empty and type(None) in get_args(kind)
-    default = None if left_out or one.default == () else one.default
-    return _plain(one.name, Annotated[kind, said], default)
-
-
-def _plain(name: str, annotation: Any, default: Any = None) -> inspect.Parameter:
-    return inspect.Parameter(
-        name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation
-    )
-
-
-# Where a command's tasks run: threads of this process, or the workers of a Dask cluster.
-
-CLUSTER_VARIABLE = "DASK_SCHEDULER_ADDRESS"
+Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
+All = Annotated[bool, typer.Option("--all", help="Print all rows and columns.")]
 
 Threads = Annotated[
     int | None,
-    typer.Option(
-        min=1, help="Threads of this machine. The result is the same. Default: all cores."
-    ),
+    typer.Option(min=1, help="Threads on this machine. Default: one per core."),
 ]
 Cluster = Annotated[
     str | None,
     typer.Option(
-        envvar=CLUSTER_VARIABLE,
+        envvar="DASK_SCHEDULER_ADDRESS",
         metavar="ADDRESS",
-        help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers do the work; "
-        "they must share the data root. Default: threads of this machine.",
+        help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers share the "
+        "data root. Default: threads on this machine.",
         show_default=False,
+    ),
+]
+
+Model = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="MODEL",
+        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
+        "Default: the only published model.",
+        show_default=False,
+    ),
+]
+ModelName = Annotated[str, typer.Argument(help="Name of the model.", show_default=False)]
+Alias = Annotated[str, typer.Option(help="Alias.")]
+Version = Annotated[
+    str,
+    typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion."),
+]
+
+Cohort = Annotated[str, typer.Option(help="SQL predicate on the view drives.")]
+IncludeFaulty = Annotated[
+    bool,
+    typer.Option("--include-faulty", help="Include drives with faulty sensors."),
+]
+Mapping = Annotated[
+    str,
+    typer.Option(help="Mapping of configs/mappings, or a TOML file.", show_default=False),
+]
+CampaignDays = Annotated[
+    int | None,
+    typer.Option(min=1, help="Simulate only the first N days. Default: all.", show_default=False),
+]
+Through = Annotated[
+    str | None,
+    typer.Option(
+        help="Last day to simulate, YYYY-MM-DD or today. Default: all days.", show_default=False
+    ),
+]
+
+# How models are selected.
+
+ModelList = Annotated[
+    str | None,
+    typer.Option(
+        help="Model list of configs/models, or a TOML file. Default: estimator, or table1 with "
+        "--features or without the Gram rows of estimator.",
+        show_default=False,
+    ),
+]
+OneModel = Annotated[
+    str | None,
+    typer.Option(
+        help='Inputs of one model, separated by commas, such as "ax, ay, yaw_rate", instead of a '
+        "list.",
+        show_default=False,
+    ),
+]
+Order = Annotated[
+    str | None,
+    typer.Option(
+        help="Inputs, separated by commas, whose first 1, 2, ... form nested models; 'catalogue' "
+        "is all inputs, a family of windows or gates its columns.",
+        show_default=False,
+    ),
+]
+Features = Annotated[
+    str | None,
+    typer.Option(
+        help="Feature set of configs/features.toml, computed by: fleet-slip gram --features NAME. "
+        "Default: the list's, else the logged signals.",
+        show_default=False,
+    ),
+]
+Label = Annotated[
+    Literal["course"] | None,
+    typer.Option(
+        help="Train without a reference sensor, on changes of the course over ground. Default "
+        "feature set and model list are then those called course.",
+        show_default=False,
+    ),
+]
+FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
+GroupBy = Annotated[
+    FoldKey | None,
+    typer.Option(
+        "--group-by", help="Groups that form the folds. Default: the list's.", show_default=False
+    ),
+]
+Folds = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NUMBER|each",
+        help="Number of folds, or each for one fold per group. Default: the list's.",
+        show_default=False,
+    ),
+]
+Ranking = Annotated[
+    str | None,
+    typer.Option(
+        help="Ranking of the inputs of --order: declared, correlation, t, forward or backward. "
+        "Default: declared.",
+        show_default=False,
+    ),
+]
+Criterion = Annotated[
+    str | None,
+    typer.Option(
+        help="Criterion for the number of ranked inputs: cv (the smallest model within --tolerance "
+        "of the best), cp, aic, aic-likelihood, bic, bic-likelihood, ric or adjusted-r2. Default: "
+        "cv.",
+        show_default=False,
+    ),
+]
+Tolerance = Annotated[
+    str | None,
+    typer.Option(
+        help="Smallest gain that justifies another signal: an angle such as 0.025deg (root of the "
+        "difference of the mean squared errors), or a share of the RMSE such as 2%. Models within "
+        "it, or within one standard error of the difference, count as equal. Default: 0.025deg, or "
+        "the list's.",
+        show_default=False,
+    ),
+]
+AllSubsets = Annotated[
+    bool, typer.Option("--all-subsets", help="Search all subsets of the inputs of --order.")
+]
+Robust = Annotated[
+    bool,
+    typer.Option(
+        "--robust",
+        help="Down-weight outlier drives (error above three times the median). Lists them; see "
+        "diagnose.",
+    ),
+]
+ClusterUnit = Annotated[
+    Literal["drive", "vehicle"] | None,
+    typer.Option(
+        help="Unit of independent evidence. Default: vehicle if there are several, else drive.",
+        show_default=False,
+    ),
+]
+Intercept = Annotated[
+    bool,
+    typer.Option(
+        "--intercept/--no-intercept", help="Fit an intercept, or force models through the origin."
+    ),
+]
+Search = Annotated[
+    str | None,
+    typer.Option(
+        help="Search method among the inputs of --order, or all: forward, backward or exchange. "
+        "The search is repeated in every fold.",
+        show_default=False,
+    ),
+]
+MaxFeatures = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        max=200,
+        help="Maximum number of columns that --search may add. Default: 24.",
+        show_default=False,
+    ),
+]
+HalfLife = Annotated[
+    int | None,
+    typer.Option(
+        help="Days, counted back from the cohort's newest day, after which a drive counts half as "
+        "much.",
+        show_default=False,
+    ),
+]
+Prior = Annotated[
+    str | None,
+    typer.Option(
+        help="Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
+        "training with the weight that serves the held-out drives best. See: fleet-slip identify "
+        "--campaign.",
+        show_default=False,
+    ),
+]
+
+# Measured data of a car.
+
+Mass = Annotated[
+    float | None,
+    typer.Option(help="Mass of the car with its driver, kg.", show_default=False),
+]
+FrontAxle = Annotated[
+    float | None,
+    typer.Option(help="Distance from centre of gravity to front axle, m.", show_default=False),
+]
+RearAxle = Annotated[
+    float | None,
+    typer.Option(help="Distance from centre of gravity to rear axle, m.", show_default=False),
+]
+TrackWidth = Annotated[
+    float | None, typer.Option(help="Track width, m. Default: 1.55.", show_default=False)
+]
+Height = Annotated[
+    float | None,
+    typer.Option(help="Height of the centre of gravity, m. Default: 0.55.", show_default=False),
+]
+Radius = Annotated[
+    float | None,
+    typer.Option(help="Rolling radius of the wheels, m. Default: 0.315.", show_default=False),
+]
+FrontDrive = Annotated[
+    float | None,
+    typer.Option(
+        help="Share of the drive torque on the front axle. Default: 1.", show_default=False
     ),
 ]

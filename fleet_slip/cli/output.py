@@ -5,18 +5,16 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Iterable
-from typing import Annotated, Any
-
-import typer
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 from fleet_slip.base import document_of
+from fleet_slip.cli.streams import drawing_on, stderr
 from fleet_slip.errors import printable
 from fleet_slip.rendering import FILE_WIDTH, Answer, Part, Remark, TextTable, wrap_lines
 from fleet_slip.storage.runs import LOGGER
-
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
-All = Annotated[bool, typer.Option("--all", help="Print all of it, not a screen alone.")]
 
 
 def say(text: str, level: int = logging.INFO) -> None:
@@ -59,13 +57,63 @@ def printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
-def print_answer(answer: Answer, json: bool, **chosen: Any) -> None:
-    """Print an answer to a command, with `chosen` options of its parts."""
+def print_answer(answer: Answer, json: bool, **options: Any) -> None:
+    """Print the answer to a command, with options of its parts; then raise its problem."""
     if json:
         print_json(answer)
     else:
-        print_parts(answer.parts(**chosen))
+        print_parts(answer.parts(**options))
+    if answer.problem:
+        raise answer.problem
 
 
 def _print(text: str) -> None:
     print(text, flush=True)  # noqa: T201 - this is the one place that prints
+
+
+# Progress of long work on stderr.
+
+
+@contextmanager
+def progress(task: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar for one task; see `progress_of_steps`."""
+    with progress_of_steps() as show:
+        show(task, 0, None)
+        yield partial(show, task)
+
+
+@contextmanager
+def progress_of_steps() -> Iterator[Callable[[str, int, int | None], None]]:
+    """Show bars with the remaining time on stderr, if it is a terminal.
+
+    Yields the callback. Its arguments are the task, the units done and, if known, their total.
+    """
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    console = stderr()
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_terminal or bool(os.environ.get("CI")),
+    )
+    tasks: dict[str, TaskID] = {}
+
+    def show(task: str, done: int, total: int | None) -> None:
+        if task not in tasks:
+            tasks[task] = bar.add_task(task, total=None)
+        bar.update(tasks[task], completed=done, total=total)
+
+    with drawing_on(console), bar:
+        yield show

@@ -87,7 +87,7 @@ def stderr() -> "Console":
     """Return a console for progress and remarks: that on which a bar is drawn, if there is one."""
     if _drawn_on:
         return _drawn_on[-1]
-    from rich.console import Console  # noqa: PLC0415 - a command without a remark waits for none
+    from rich.console import Console
 
     return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
 

@@ -569,7 +569,7 @@ def evaluate_claim(claim: Claim, data: ReportData) -> Verdict:
         try:
             holds, figure, why = claim.find(ReportContext(data))
         except NotEvaluatedError as error:
-            command = f"fleet-slip evaluate {data.evaluated.group} --fleet NAME"
+            command = f"fleet-slip evaluate {data.evaluated.group} --compare NAME"
             why = f"The evaluation has no {error}. Run: {command}"
     status = {True: Status.REPRODUCED, False: Status.NOT_REPRODUCED, None: Status.NOT_TESTABLE}
     return Verdict(claim, status[holds], figure, why)

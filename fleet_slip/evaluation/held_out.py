@@ -181,13 +181,13 @@ class Learner:
         if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
         workspace = Workspace(ColumnPlan.of_set(catalog, name))
-        parts = DriveBlocks.of_set(feature_set)
+        blocks = DriveBlocks.of_set(feature_set)
         attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
         rows = [
             row
             for drive in self.drives
             for quarter in range(QUARTERS)
-            for row in _gram_rows(label, workspace, parts, drive, quarter, attributes[drive.name])
+            for row in _gram_rows(label, workspace, blocks, drive, quarter, attributes[drive.name])
         ]
         schema = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
         return with_gram_rows(self.cohort, pa.Table.from_pylist(rows, schema=schema))
@@ -227,7 +227,7 @@ def _quarter_name(drive_id: str, quarter: int) -> str:
 def _gram_rows(
     label: str,
     workspace: Workspace,
-    parts: DriveBlocks,
+    blocks: DriveBlocks,
     drive: HeldOutDrive,
     quarter: int,
     attributes: Mapping[str, Any],
@@ -239,8 +239,8 @@ def _gram_rows(
     name = _quarter_name(drive.name, quarter)
     (number,) = hash_names(pa.array([name])).tolist()
     identity = {"drive_id": name, "trip": name, "drive_hash": number, "trip_hash": number}
-    sums = drive_sums(workspace, parts, replace(counts, present=present))
-    rows = gram_rows(sums, workspace.plan.names, parts, {**attributes, **identity})
+    sums = drive_sums(workspace, blocks, replace(counts, present=present))
+    rows = gram_rows(sums, workspace.plan.names, blocks, {**attributes, **identity})
     return [row for row in rows if label in row["signals"].split(",")]
 
 

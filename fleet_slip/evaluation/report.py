@@ -274,7 +274,7 @@ def _commands(data: ReportData) -> list[str]:
             f"{measured if source == MEASURED else 'fleet-slip run --campaign'} {name}"
             for source, name in sorted({*pairs})
         ),
-        f"fleet-slip evaluate {reference}{''.join(f' --fleet {name}' for name in fleets)}",
+        f"fleet-slip evaluate {reference}{''.join(f' --compare {name}' for name in fleets)}",
         f"fleet-slip report {reference}",
     ]
 

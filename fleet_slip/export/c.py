@@ -1,6 +1,7 @@
-"""A program in C99, in integers alone, without allocation or recursion, and what goes with it.
+"""C99 of a program: integers only, no allocation, no recursion. The templates are in `templates/`.
 
-The C stands in `templates/`.
+A step is a constant of 32 or 64 bits, depending on its range, and 0 where it is missing. Steps that
+can be missing by themselves have a bool. State words have the value `MISSING` instead.
 """
 
 import re
@@ -12,9 +13,9 @@ from fleet_slip.columns.lowering import operation_of, plain_of, size_of
 from fleet_slip.export.program import Program, Steps
 from fleet_slip.export.templating import (
     INDENT,
-    LARGEST_32,
+    MAX_32,
     c_prefix,
-    different,
+    distinct,
     field_names,
     fill_in_version,
     integer_type,
@@ -23,157 +24,155 @@ from fleet_slip.export.templating import (
 )
 from fleet_slip.models.registry import ModelVersion
 
-# The steps of a program as statements of C.
-#
-# A step is a constant of 32 or 64 bits, whichever its range needs, and 0 where it is missing.
-# Whether it is there is told by a bool of each step that can be missing by itself. What is kept
-# from tick to tick has the value `MISSING` instead.
-
-LARGEST_UNSIGNED = 2**32 - 1
+MAX_UNSIGNED = 2**32 - 1
 
 
 class StepWriter:
-    """Writes the statements of what is asked for, each once, and counts what they do.
+    """Writes the statements of requested steps, each once, and counts their operations.
 
-    Attributes:
-        lines: the statements.
-        done: how often each helper is called and each operation is done; `//64` is a division
-            that needs 64 bits.
+    Attributes
+    ----------
+    lines
+        The statements.
+    counts
+        Number of calls of each helper and of each operation; `//64` is a division of 64 bits.
     """
 
     def __init__(self, program: Steps) -> None:
-        """Take a program."""
         self.program = program
         self.lines: list[str] = []
-        self.done: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
         self._roots = program.roots
         self._values: dict[int, str] = {}
-        self._there: dict[int, str] = {}
+        self._presence: dict[int, str] = {}
         self._words: dict[int, str] = {}
-        self._slid: set[str] = set()
+        self._updated_sums: set[str] = set()
         fields = field_names(program)
-        within = zip(program.signals, fields["signals"], strict=True)
-        self._given = {
+        signals = zip(program.signals, fields["signals"], strict=True)
+        self._inputs = {
             "signal": [
-                f"within(sample->{field}, {literal(one.min_count)}, {literal(one.max_count)})"
-                for one, field in within
+                f"within(sample->{field}, {literal(signal.min_count)}, {literal(signal.max_count)})"
+                for signal, field in signals
             ],
             "fact": [f"state->{field}" for field in fields["facts"]],
             "number": [f"state->{field}" for field in fields["numbers"]],
         }
 
     def value(self, step: int) -> str:
-        """Return what a step is in C, after what computes it."""
+        """Return the value of a step in C; its statements are written first."""
         if step not in self._values:
             name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
-            self._values[step] = _COMPUTED.get(name, StepWriter._arithmetic)(self, step, *plain)
+            self._values[step] = _WRITERS.get(name, StepWriter._arithmetic)(self, step, *plain)
         return self._values[step]
 
-    def there(self, *steps: int) -> str:
-        """Return the condition that all of some steps are there."""
+    def is_present(self, *steps: int) -> str:
+        """Return the condition that none of these steps is missing."""
         roots = dict.fromkeys(root for step in steps for root in self._roots[step])
-        return " && ".join(self._present(root) for root in roots) or "true"
+        return " && ".join(self._is_root_present(root) for root in roots) or "true"
 
-    def kept(self, step: int) -> str:
-        """Return a step as it is kept: `MISSING` where it is."""
-        if operation_of(self.program.steps[step]) in _TAKEN:
-            return self._word(step)
+    def word(self, step: int) -> str:
+        """Return a step as a state word: `MISSING` if it is missing."""
+        if operation_of(self.program.steps[step]) in _INPUTS:
+            return self._input_word(step)
         value = self.value(step)
-        return f"(({self.there(step)}) ? {value} : MISSING)"
+        return f"(({self.is_present(step)}) ? {value} : MISSING)"
 
     def size(self, step: int) -> int:
-        """Return the largest size of a step."""
+        """Return the largest absolute value of a step."""
         return size_of(self.program.ranges[step])
 
-    def _present(self, root: int) -> str:
-        """Return the bool that tells whether a step is there by itself."""
-        if root not in self._there:
+    def _is_root_present(self, root: int) -> str:
+        """Return the bool that is false where a step is missing by itself."""
+        if root not in self._presence:
             name = operation_of(self.program.steps[root])
-            taken = name in _TAKEN
-            present = f"({self._word(root)} != MISSING)" if taken else _PRESENT[name](self, root)
-            self._there[root] = self._declare("bool", "has", root, present)
-        return self._there[root]
+            is_input = name in _INPUTS
+            present = (
+                f"({self._input_word(root)} != MISSING)" if is_input else _PRESENT[name](self, root)
+            )
+            self._presence[root] = self._declare("bool", "has", root, present)
+        return self._presence[root]
 
-    def _arithmetic(self, step: int, *of: int) -> str:
-        name, values = operation_of(self.program.steps[step]), [self.value(one) for one in of]
+    def _arithmetic(self, step: int, *operands: int) -> str:
+        name = operation_of(self.program.steps[step])
+        values = [self.value(operand) for operand in operands]
         if name == "*" and "1" in values:
             return values[values[0] == "1"]
-        if name == "max" and self.size(step) > LARGEST_32:
+        if name == "max" and self.size(step) > MAX_32:
             name = "max_64"
-        self.done[name] += 1
-        if name in "+-*" and self.size(step) > LARGEST_32 >= max(map(self.size, of)):
+        self.counts[name] += 1
+        if name in "+-*" and self.size(step) > MAX_32 >= max(map(self.size, operands)):
             values[0] = f"(int64_t){values[0]}"
-        return self._set(step, _WRITTEN[name].format(*values))
+        return self._set(step, _OPERATIONS[name].format(*values))
 
-    def _clipped(self, step: int, of: int, limit: int) -> str:
-        value, most = self.value(of), self.size(limit)
-        if self.size(of) <= most:
+    def _clip(self, step: int, source: int, bound: int) -> str:
+        value, limit = self.value(source), self.size(bound)
+        if self.size(source) <= limit:
             return value
-        self.done["clip"] += 1
-        return self._set(step, f"clip({value}, {most})")
+        self.counts["clip"] += 1
+        return self._set(step, f"clip({value}, {limit})")
 
-    def _chosen(self, step: int, one: int, other: int) -> str:
-        first, second = self.value(one), self.value(other)
-        return self._set(step, f"({self.there(one)}) ? {first} : {second}")
+    def _else(self, step: int, a: int, b: int) -> str:
+        first, second = self.value(a), self.value(b)
+        return self._set(step, f"({self.is_present(a)}) ? {first} : {second}")
 
-    def _truncated(self, step: int, a: int, b: int) -> str:
-        wide = max(self.size(a), self.size(b)) > LARGEST_32
+    def _truncate(self, step: int, a: int, b: int) -> str:
+        wide = max(self.size(a), self.size(b)) > MAX_32
         quotient = f"{self.value(a)} / {self._divisor(step, b)}"
-        self.done["//64" if wide else "//"] += 1
+        self.counts["//64" if wide else "//"] += 1
         return self._set(step, f"(int32_t)({quotient})" if self._narrows(step, wide) else quotient)
 
     def _nearest(self, step: int, a: int, b: int) -> str:
         value = self.value(a)
         if self.program.ranges[b] == (1, 1):
             return value
-        divisor, wide = self._divisor(step, b), 2 * self.size(a) + self.size(b) > LARGEST_UNSIGNED
-        self.done["nearest_64" if wide else "nearest_32"] += 1
+        divisor, wide = self._divisor(step, b), 2 * self.size(a) + self.size(b) > MAX_UNSIGNED
+        self.counts["nearest_64" if wide else "nearest_32"] += 1
         if not wide:
             divisor = f"{divisor}U" if divisor.isdigit() else f"(uint32_t){divisor}"
         call = f"nearest_{64 if wide else 32}({value}, {divisor})"
         return self._set(step, f"(int32_t){call}" if self._narrows(step, wide) else call)
 
-    def _divisor(self, step: int, of: int) -> str:
-        """Return what may be divided by: 1 where the quotient is missing."""
-        divisor = self.value(of)
-        if self.program.ranges[of][0] > 0:
+    def _divisor(self, step: int, source: int) -> str:
+        """Return a divisor; 1 where the quotient is missing."""
+        divisor = self.value(source)
+        if self.program.ranges[source][0] > 0:
             return divisor
-        return f"({self._present(step)} ? {divisor} : 1)"
+        return f"({self._is_root_present(step)} ? {divisor} : 1)"
 
-    def _given_or_past(self, step: int, *_: int) -> str:
-        return self._set(step, f"{self._present(step)} ? {self._word(step)} : 0")
+    def _input(self, step: int, *_: int) -> str:
+        return self._set(step, f"{self._is_root_present(step)} ? {self._input_word(step)} : 0")
 
     def _narrows(self, step: int, wide: bool) -> bool:
-        return wide and self.size(step) <= LARGEST_32
+        return wide and self.size(step) <= MAX_32
 
-    def _word(self, step: int) -> str:
-        """Return what is given, or was, as a word that may be `MISSING`."""
+    def _input_word(self, step: int) -> str:
+        """Return an input, or a value of an earlier tick, as a word that can be `MISSING`."""
         if step not in self._words:
             name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
-            self.done["within"] += name == "signal"
-            taken = self._ago(*plain) if name == "ago" else self._given[name][plain[0]]
-            self._words[step] = self._declare("int32_t", "in", step, taken)
+            self.counts["within"] += name == "signal"
+            word = self._ago(*plain) if name == "ago" else self._inputs[name][plain[0]]
+            self._words[step] = self._declare("int32_t", "in", step, word)
         return self._words[step]
 
-    def _ago(self, of: int, ticks: int) -> str:
-        """Return the call that reads a step so many ticks ago."""
-        width, length = ring_width(self.program, of), self.program.rings[of]
-        self.done[f"ago_{width}"] += 1
-        return f"ago_{width}(state->ring_{of}, state->at_{of}, {length}U, {ticks}U)"
+    def _ago(self, source: int, ticks: int) -> str:
+        """Return the call that reads a step a number of ticks ago."""
+        width, length = ring_width(self.program, source), self.program.rings[source]
+        self.counts[f"ago_{width}"] += 1
+        return f"ago_{width}(state->ring_{source}, state->at_{source}, {length}U, {ticks}U)"
 
-    def _slide(self, step: int, of: int, ticks: int, most: int) -> str:
-        """Write what brings a sum and its number of values to this tick, once."""
-        key = sum_key(of, ticks, most)
-        if key not in self._slid:
-            self._slid.add(key)
-            both, newest = f"&state->sum_{key}, &state->values_{key}", self.kept(of)
+    def _sum(self, step: int, source: int, ticks: int, limit: int) -> str:
+        """Write the update of a sum and its number of values to this tick, once."""
+        key = sum_key(source, ticks, limit)
+        if key not in self._updated_sums:
+            self._updated_sums.add(key)
+            both, newest = f"&state->sum_{key}, &state->values_{key}", self.word(source)
             if ticks:
-                width = sum_type(self.program, of, most).removeprefix("int").removesuffix("_t")
-                self.done[f"slide_{width}"] += 1
-                self.lines.append(f"slide_{width}({both}, {self._ago(of, ticks)}, {newest});")
+                width = sum_type(self.program, source, limit).removeprefix("int").removesuffix("_t")
+                self.counts[f"slide_{width}"] += 1
+                self.lines.append(f"slide_{width}({both}, {self._ago(source, ticks)}, {newest});")
             else:
-                self.done["gather"] += 1
-                self.lines.append(f"gather({both}, {most}U, {newest});")
+                self.counts["gather"] += 1
+                self.lines.append(f"gather({both}, {limit}U, {newest});")
         counts = operation_of(self.program.steps[step]) == "values"
         return f"(int32_t)state->values_{key}" if counts else f"state->sum_{key}"
 
@@ -185,23 +184,23 @@ class StepWriter:
         return f"{name}_{step}"
 
 
-_TAKEN = ("signal", "fact", "number", "ago")
+_INPUTS = ("signal", "fact", "number", "ago")
 
-_COMPUTED: Mapping[str, Callable[..., str]] = {
-    **dict.fromkeys(_TAKEN, StepWriter._given_or_past),
+_WRITERS: Mapping[str, Callable[..., str]] = {
+    **dict.fromkeys(_INPUTS, StepWriter._input),
     "constant": lambda _writer, _step, value: literal(value),
-    "where": lambda writer, _step, of, _condition: writer.value(of),
-    "at_least": lambda writer, _step, of, _least: writer.value(of),
-    "clip": StepWriter._clipped,
-    "else": StepWriter._chosen,
-    "//": StepWriter._truncated,
+    "where": lambda writer, _step, source, _condition: writer.value(source),
+    "at_least": lambda writer, _step, source, _bound: writer.value(source),
+    "clip": StepWriter._clip,
+    "else": StepWriter._else,
+    "//": StepWriter._truncate,
     "nearest": StepWriter._nearest,
-    "sum": StepWriter._slide,
-    "values": StepWriter._slide,
+    "sum": StepWriter._sum,
+    "values": StepWriter._sum,
 }
-"""What computes an operation that is more than a text of what it works on."""
+"""Writers of the operations that are not in `_OPERATIONS`."""
 
-_WRITTEN = {
+_OPERATIONS = {
     "+": "{0} + {1}",
     "-": "{0} - {1}",
     "*": "{0} * {1}",
@@ -213,7 +212,7 @@ _WRITTEN = {
     "abs": "({0} < 0) ? -{0} : {0}",
     "sign": "sign({0})",
 }
-"""What an operation is in C, of what it works on."""
+"""Operations of C, as texts of their operands."""
 
 
 def _positive(writer: StepWriter, step: int) -> str:
@@ -228,7 +227,7 @@ def _enough(writer: StepWriter, step: int) -> str:
 
 def _either(writer: StepWriter, step: int) -> str:
     a, b = plain_of(writer.program.steps[step])
-    return f"({writer.there(a)}) || ({writer.there(b)})"
+    return f"({writer.is_present(a)}) || ({writer.is_present(b)})"
 
 
 _PRESENT: Mapping[str, Callable[[StepWriter, int], str]] = {
@@ -237,27 +236,27 @@ _PRESENT: Mapping[str, Callable[[StepWriter, int], str]] = {
     "at_least": _enough,
     "else": _either,
 }
-"""Whether a step is there by itself."""
+"""Conditions that a step is not missing by itself, by operation."""
 
 
-def sum_key(of: int, ticks: int, most: int) -> str:
-    """Return what a sum is called: of which step, over so many ticks, or of so many values."""
-    return f"{of}_over_{ticks}" if ticks else f"{of}_of_{most}"
+def sum_key(source: int, ticks: int, limit: int) -> str:
+    """Return the name of a sum: its step, and its ticks or its maximum number of values."""
+    return f"{source}_over_{ticks}" if ticks else f"{source}_of_{limit}"
 
 
-def sum_type(program: Steps, of: int, most: int) -> str:
-    """Return the type of a sum of so many values."""
-    return integer_type(size_of(program.ranges[of]) * most)
+def sum_type(program: Steps, source: int, limit: int) -> str:
+    """Return the type of a sum of at most `limit` values."""
+    return integer_type(size_of(program.ranges[source]) * limit)
 
 
-def ring_width(program: Steps, of: int) -> int:
-    """Return the bits of a word of a ring: of its largest value, and one that is missing."""
-    return 16 if size_of(program.ranges[of]) < 2**15 else 32
+def ring_width(program: Steps, source: int) -> int:
+    """Return the bits of a ring's word, which holds the largest value and a missing one."""
+    return 16 if size_of(program.ranges[source]) < 2**15 else 32
 
 
 @dataclass(frozen=True)
 class StateField:
-    """A field of a struct: words of a type such as `int16_t`; an array if there are several."""
+    """A field of a struct: one word of a type such as `int16_t`, or an array."""
 
     type: str
     name: str
@@ -267,50 +266,50 @@ class StateField:
 
     @property
     def word_bytes(self) -> int:
-        """Bytes of a word, and what its address is a multiple of."""
+        """Size and alignment of a word, in bytes."""
         return int("".join(c for c in self.type if c.isdigit())) // 8
 
     @property
     def declared(self) -> str:
-        """The field as it stands in C."""
+        """Declaration in C."""
         size = f"[{self.words}]" if self.array else ""
         comment = f" /* {self.comment} */" if self.comment else ""
         return f"{self.type} {self.name}{size};{comment}"
 
 
 def state_fields(program: Steps) -> list[StateField]:
-    """Return the fields of the state: rings of steps, sums, what the car knows."""
-    names, found = field_names(program), []
-    for of, ticks in program.rings.items():
+    """Return the fields of the state: rings of steps, sums, and properties of the car."""
+    names, fields = field_names(program), []
+    for source, ticks in program.rings.items():
         if ticks:
-            kind = f"int{ring_width(program, of)}_t"
-            found += [
-                StateField(kind, f"ring_{of}", ticks, array=True, comment=f"step {of}"),
-                StateField("uint32_t", f"at_{of}"),
+            kind = f"int{ring_width(program, source)}_t"
+            fields += [
+                StateField(kind, f"ring_{source}", ticks, array=True, comment=f"step {source}"),
+                StateField("uint32_t", f"at_{source}"),
             ]
-    for of, ticks, most in program.sums:
-        key, kind = sum_key(of, ticks, most), sum_type(program, of, most)
-        found += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}")]
-    found += [StateField("int32_t", name) for name in (*names["facts"], *names["numbers"])]
-    nothing = StateField("uint8_t", "nothing", comment="this model looks back on nothing")
-    return found or [nothing]
+    for source, ticks, limit in program.sums:
+        key, kind = sum_key(source, ticks, limit), sum_type(program, source, limit)
+        fields += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}")]
+    fields += [StateField("int32_t", name) for name in (*names["facts"], *names["numbers"])]
+    return fields or [StateField("uint8_t", "nothing", comment="this model has no state")]
 
 
 def state_bytes(program: Steps) -> int:
-    """Return the size of the state where a word of n bytes lies at a multiple of n, as on ARM."""
-    fields, at = state_fields(program), 0
-    for one in fields:
-        at += -at % one.word_bytes + one.words * one.word_bytes
-    return at + -at % max(one.word_bytes for one in fields)
+    """Return the size of the state if a word of n bytes is aligned to n bytes, as on ARM."""
+    fields, size = state_fields(program), 0
+    for field in fields:
+        size += -size % field.word_bytes + field.words * field.word_bytes
+    return size + -size % max(field.word_bytes for field in fields)
 
 
-LONGEST_NAME = 31
+MAX_NAME_CHARACTERS = 31
+"""Significant characters of a name in C99."""
 _HELPER = re.compile(r"^//: (\w+)\n", re.MULTILINE)
-"""What stands before each function in `helpers.c`: what writes it, if it was done."""
+"""Heading of a function in `helpers.c`: the counted operation that needs it."""
 
 
 def c_header(version: ModelVersion, program: Program) -> str:
-    """Return the header: what is given, what is kept from tick to tick, and two functions."""
+    """Return the header: inputs, state, and functions."""
     return fill_in_version(
         "templates/estimator.h",
         version,
@@ -322,30 +321,32 @@ def c_header(version: ModelVersion, program: Program) -> str:
 
 
 def _scale_names(upper: str, program: Program) -> Sequence[str]:
-    """Return macros of what a count is worth, which the source does not use.
+    """Return the macros of the signals' scales, which the source does not use.
 
-    They differ in their first 31 characters (MISRA C:2012, rule 5.4).
+    Their first 31 characters differ (MISRA C:2012, rule 5.4).
     """
-    names = [f"{upper}_{one.name.upper()}_SCALE" for one in program.signals]
-    cut = len({name[:LONGEST_NAME] for name in names}) < len(names)
-    return different(names, LONGEST_NAME) if cut else names
+    names = [f"{upper}_{signal.name.upper()}_SCALE" for signal in program.signals]
+    is_cut = len({name[:MAX_NAME_CHARACTERS] for name in names}) < len(names)
+    return distinct(names, MAX_NAME_CHARACTERS) if is_cut else names
 
 
 def _outside(program: Program) -> Mapping[str, str]:
-    """Return what tells that a field of a sample is beyond its range, unless nothing can be.
+    """Return the conditions that fields of a sample are outside their ranges, if possible.
 
-    No comparison that a count of 16 bits cannot fail: compilers warn of it.
+    Comparisons that are always true for 16 bits are left out: compilers warn of them.
     """
-    found = {}
-    for field, one in zip(field_names(program)["signals"], program.signals, strict=True):
-        low = [f"(sample->{field} < {one.min_count})"] if one.min_count > -(2**15) + 1 else []
-        high = [f"(sample->{field} > {one.max_count})"] if one.max_count < 2**15 - 1 else []
-        found[field] = " || ".join(low + high)
-    return {field: beyond for field, beyond in found.items() if beyond}
+    conditions = {}
+    for field, signal in zip(field_names(program)["signals"], program.signals, strict=True):
+        low, high = signal.min_count, signal.max_count
+        tests = [f"(sample->{field} < {low})"] if low > -(2**15) + 1 else []
+        tests += [f"(sample->{field} > {high})"] if high < 2**15 - 1 else []
+        if tests:
+            conditions[field] = " || ".join(tests)
+    return conditions
 
 
 def c_source(version: ModelVersion, program: Program) -> str:
-    """Return the source that goes with the header."""
+    """Return the source of the header."""
     writer, angle = StepWriter(program), program.angle
     start = start_lines(program, writer) or ["state->nothing = 0U;"]
     terms, valid, lines = step_lines(program, writer)
@@ -355,7 +356,7 @@ def c_source(version: ModelVersion, program: Program) -> str:
         program,
         helpers=helper_texts(writer),
         start=start,
-        learned=[sum_key(*one) for one in program.learned],
+        learned=[sum_key(*window) for window in program.learned],
         lines=lines,
         looks_back=any("state->" in line for line in lines),
         kind=integer_type(max(writer.size(place) for place, _ in angle.terms)),
@@ -366,53 +367,53 @@ def c_source(version: ModelVersion, program: Program) -> str:
 
 
 def helper_texts(writer: StepWriter) -> list[str]:
-    """Return the functions that what was written calls."""
+    """Return the functions that the written statements call."""
     _, *named = _HELPER.split(read_source("templates/helpers.c"))
     texts = zip(named[::2], named[1::2], strict=True)
-    return [text.strip("\n") + "\n" for name, text in texts if writer.done[name]]
+    return [text.strip("\n") + "\n" for name, text in texts if writer.counts[name]]
 
 
 def start_lines(program: Steps, writer: StepWriter) -> list[str]:
-    """Return the statements that begin a drive."""
+    """Return the statements at the start of a drive."""
     fields, lines = field_names(program), []
-    for of, ticks in program.rings.items():
+    for source, ticks in program.rings.items():
         if ticks:
-            empty = "INT16_MIN" if ring_width(program, of) == 16 else "MISSING"
+            empty = "INT16_MIN" if ring_width(program, source) == 16 else "MISSING"
             lines += [
                 f"for (uint32_t i = 0U; i < {ticks}U; i++) {{",
-                f"{INDENT}state->ring_{of}[i] = {empty};",
+                f"{INDENT}state->ring_{source}[i] = {empty};",
                 "}",
-                f"state->at_{of} = 0U;",
+                f"state->at_{source} = 0U;",
             ]
-    for one in program.sums:
-        key = sum_key(*one)
+    for window in program.sums:
+        key = sum_key(*window)
         lines += [f"state->sum_{key} = 0;", f"state->values_{key} = 0U;"]
-    ranges = [*program.given["fact"], *program.given["number"]]
-    for field, (least, most) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
-        writer.done["within"] += 1
-        lines.append(f"state->{field} = within(car->{field}, {literal(least)}, {most});")
+    ranges = [*program.input_ranges["fact"], *program.input_ranges["number"]]
+    for field, (low, high) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
+        writer.counts["within"] += 1
+        lines.append(f"state->{field} = within(car->{field}, {literal(low)}, {high});")
     return lines
 
 
 def step_lines(program: Program, writer: StepWriter) -> tuple[list[str], str, list[str]]:
-    """Return the columns of a tick, whether all are there, and the statements before these.
+    """Return the columns of a tick, the condition that none is missing, and the statements.
 
-    The writer counts what they do, and what adds up the angle, as `fixed_point` proves.
+    The writer counts the operations of the statements and of the dot product.
     """
     places = [place for place, _ in program.angle.terms]
-    terms, valid = [writer.value(place) for place in places], writer.there(*places)
+    terms, valid = [writer.value(place) for place in places], writer.is_present(*places)
     keeps = keep_lines(program, writer)
-    writer.done.update({"floor_shift": 2, "clip": 1, "term": len(terms)})
+    writer.counts.update({"floor_shift": 2, "clip": 1, "term": len(terms)})
     return terms, valid, [*writer.lines, *keeps]
 
 
 def keep_lines(program: Steps, writer: StepWriter) -> list[str]:
-    """Return the statements that write this tick into the rings, after all that is computed."""
-    kept = {of: writer.kept(of) for of, ticks in program.rings.items() if ticks}
-    found = []
-    for of, value in kept.items():
-        width = ring_width(program, of)
-        writer.done[f"keep_{width}"] += 1
-        ring = f"state->ring_{of}, &state->at_{of}, {program.rings[of]}U"
-        found.append(f"keep_{width}({ring}, {value});")
-    return found
+    """Return the statements that write this tick into the rings, after all steps are computed."""
+    words = {source: writer.word(source) for source, ticks in program.rings.items() if ticks}
+    lines = []
+    for source, word in words.items():
+        width = ring_width(program, source)
+        writer.counts[f"keep_{width}"] += 1
+        ring = f"state->ring_{source}, &state->at_{source}, {program.rings[source]}U"
+        lines.append(f"keep_{width}({ring}, {word});")
+    return lines

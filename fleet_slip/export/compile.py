@@ -1,4 +1,4 @@
-"""Makes the integer program of a published manifest, and checks that travel with it."""
+"""Compiles a published manifest to an integer program, and makes its test vectors (checks)."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,21 +20,18 @@ from fleet_slip.models.predict import Predictor
 
 
 def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
-    """Return what a published version computes.
+    """Return the program of a published version.
 
     Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
     contradict each other.
     """
-    # Raises for what the kernel could not compute.
+    # The kernel compiles the same definitions, and raises for those that it cannot compute.
     _ = Predictor.of(catalog.signals, manifest).plan.program
     return write_program(catalog, manifest)
 
 
-# Checks of a program that travel with it: ticks of made-up drives, and the angles.
-#
-# No tick is of a drive of the warehouse: an export goes to people who may not see the logs.
-# The angles come from the columns as the warehouse's kernel computes them, which knows nothing of
-# programs, and from exact integers.
+# Checks are ticks of synthetic drives, with the angle at each. An export contains no logged data.
+# The angles come from the kernel of the warehouse, which does not use programs, in exact integers.
 
 SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200
@@ -45,26 +42,23 @@ Sample = tuple[int | None, ...]
 
 @dataclass(frozen=True)
 class Check:
-    """A drive, tick by tick from the first, and the angle at each; None where there is none.
-
-    Attributes:
-        name: what it is.
-        known: facts of the car as logs have them.
-        facts, numbers: what the car knows, in the order of the program; None where unknown.
-        samples: of each tick.
-        angles: counts of the program's angle.
-    """
+    """A synthetic drive, and the angle at each tick."""
 
     name: str
-    known: Mapping[str, object]
+    car: Mapping[str, object]
+    """Facts of the car, as in logs."""
     facts: tuple[int | None, ...]
+    """Facts as whole numbers, in the order of the program; None: unknown."""
     numbers: tuple[int | None, ...]
+    """Numbers in counts, in the order of the program; None: unknown."""
     samples: tuple[Sample, ...]
+    """Counts at each tick."""
     angles: tuple[int | None, ...]
+    """Counts of the program's angle at each tick; None: no angle."""
 
 
 def make_checks(signals: SignalCatalog, manifest: Manifest, program: Program) -> tuple[Check, ...]:
-    """Return a smooth drive and hostile ones, each with the angle at every tick."""
+    """Return a smooth drive and adversarial ones, with the angle at every tick."""
     hostile = _hostile_car(program)
     drives: dict[str, tuple[Car, Iterable[Sample]]] = {
         "smooth": (UNKNOWN_CAR, _smooth(program)),
@@ -85,7 +79,7 @@ def angles_by_kernel(
     car: Car,
     samples: Sequence[Sample],
 ) -> list[int | None]:
-    """Return the angle of each tick, by the columns of the kernel and exact integers."""
+    """Compute the angle of each tick from the columns of the kernel, in exact integers."""
     predictor = Predictor.of(signals, manifest)
     drive = drive_counts(program, predictor, car, samples)
     return angles_of_columns(program, compute_columns(predictor.plan, drive))
@@ -94,8 +88,8 @@ def angles_by_kernel(
 def drive_counts(
     program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
 ) -> DriveCounts:
-    """Return samples of consecutive ticks as a drive of the warehouse."""
-    names = [one.name for one in program.signals]
+    """Convert samples of consecutive ticks to a drive of the warehouse."""
+    names = [signal.name for signal in program.signals]
     valid = [_valid(sample, program.signals) for sample in samples]
     counts = {
         name: pa.array(values, pa.int16())
@@ -107,22 +101,22 @@ def drive_counts(
 
 
 def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
-    """Return the angle of each row, given the columns of the terms, shape (terms, rows)."""
+    """Compute the angle of each row from the columns of the terms, shape (terms, rows)."""
     angle = program.angle
     missing: BoolArray = np.any(np.isnan(columns), axis=0)
-    whole = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
+    counts = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
     total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
-    for (_, coefficient), column in zip(angle.terms, whole, strict=True):
+    for (_, coefficient), column in zip(angle.terms, counts, strict=True):
         total += coefficient * column
-    rounded = [max(-angle.limit, min(angle.limit, int(one >> angle.bits))) for one in total]
-    return [None if gone else one for one, gone in zip(rounded, missing, strict=True)]
+    rounded = [max(-angle.limit, min(angle.limit, int(value >> angle.bits))) for value in total]
+    return [None if lacks else value for value, lacks in zip(rounded, missing, strict=True)]
 
 
 def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
-    """Return a sample in which counts beyond the valid range are missing."""
+    """Replace counts outside the valid range by None."""
     return tuple(
-        count if count is not None and one.min_count <= count <= one.max_count else None
-        for count, one in zip(sample, signals, strict=True)
+        count if count is not None and signal.min_count <= count <= signal.max_count else None
+        for count, signal in zip(sample, signals, strict=True)
     )
 
 
@@ -141,13 +135,13 @@ def _check(
 
 
 def _smooth(program: Program) -> Iterable[Sample]:
-    """Yield a drive of whole counts without holes: every signal swings with a period of its own."""
+    """Yield a drive without missing counts: every signal oscillates with its own period."""
     for tick in range(SMOOTH_TICKS):
-        yield tuple(_swing(one, tick, 60 + 14 * i) for i, one in enumerate(program.signals))
+        yield tuple(_swing(signal, tick, 60 + 14 * i) for i, signal in enumerate(program.signals))
 
 
 def _swing(signal: Input, tick: int, period: int) -> int:
-    """Return a count at a tick of a triangle that is an eighth of the range high."""
+    """Return a count of a triangular wave with the height of an eighth of the range."""
     height = (signal.max_count - signal.min_count) // 8
     middle = (signal.min_count + signal.max_count) // (4 if signal.min_count >= 0 else 2)
     distance = abs(2 * (tick % period) - period)  # from the middle of the period, 0 to `period`
@@ -155,81 +149,78 @@ def _swing(signal: Input, tick: int, period: int) -> int:
 
 
 def _hostile_car(program: Program) -> Car:
-    """Return a car whose facts and numbers are far from usual."""
-    facts = {one.name: 2**16 if one.equals is None else one.equals for one in program.facts}
+    """Return a car with extreme facts and numbers."""
+    facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
     numbers = {
-        one.name: COUNT_MAX if place % 2 else -COUNT_MAX
-        for place, one in enumerate(program.numbers)
+        number.name: COUNT_MAX if i % 2 else -COUNT_MAX for i, number in enumerate(program.numbers)
     }
     return Car(facts, numbers)
 
 
 def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
-    """Yield ends of the ranges, all at once and one by one, and what is just beyond them."""
+    """Yield the ends of the ranges, together and separately, and counts just beyond them."""
     for tick in range(HOSTILE_TICKS):
         if tick % 40 < 10:
             high = tick % 80 < 40
-            yield tuple(one.max_count if high else one.min_count for one in program.signals)
+            yield tuple(s.max_count if high else s.min_count for s in program.signals)
         else:
-            yield tuple(_extreme(one, random) for one in program.signals)
+            yield tuple(_extreme(signal, random) for signal in program.signals)
 
 
-def _extreme(one: Input, random: np.random.Generator) -> int | None:
-    within = (one.min_count, one.max_count, -1, 0, 1, one.max_count // 2)
-    beyond = (one.min_count - 1, one.max_count + 1, None)
+def _extreme(signal: Input, random: np.random.Generator) -> int | None:
+    within = (signal.min_count, signal.max_count, -1, 0, 1, signal.max_count // 2)
+    beyond = (signal.min_count - 1, signal.max_count + 1, None)
     if random.random() < 0.98:
         return within[random.integers(len(within))]
     return beyond[random.integers(len(beyond))]
 
 
 def _holes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
-    """Yield a drive that lacks ticks, long and short, and single values."""
-    gone = 0
+    """Yield a drive with gaps, long and short, and missing single values."""
+    gap = 0
     for _ in range(HOSTILE_TICKS):
-        begins = random.random() < 0.05
-        gone = gone - 1 if gone else (1, 2, 30)[random.integers(3)] if begins else 0
+        starts = random.random() < 0.05
+        gap = gap - 1 if gap else (1, 2, 30)[random.integers(3)] if starts else 0
         yield tuple(
             None
-            if gone or random.random() < 0.01
-            else int(random.integers(0, one.max_count // 4 + 1))
-            for one in program.signals
+            if gap or random.random() < 0.01
+            else int(random.integers(0, signal.max_count // 4 + 1))
+            for signal in program.signals
         )
 
 
 def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sample]:
-    """Yield a start from standstill: no feature that divides by speed has a value at first."""
+    """Yield a start from standstill: features that divide by speed have no value at first."""
     for tick in range(HOSTILE_TICKS):
         yield tuple(
-            int(random.integers(-2, 3)) + one.max_count * tick // (8 * HOSTILE_TICKS)
-            for one in program.signals
+            int(random.integers(-2, 3)) + signal.max_count * tick // (8 * HOSTILE_TICKS)
+            for signal in program.signals
         )
 
 
 def checks_csv(program: Program, checks: Sequence[Check]) -> str:
-    """Return CSV with a row a tick: columns as the statement of SQL reads them, and the angle.
+    """Return a CSV file with a row for each tick: the columns of the SQL statement, and the angle.
 
     An empty cell is a missing value, or no angle.
     """
-    facts = tuple(dict.fromkeys(one.name for one in program.facts))
+    facts = tuple(dict.fromkeys(fact.name for fact in program.facts))
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    columns = [one.column for one in program.signals]
-    numbers = [one.name for one in program.numbers]
+    columns = [signal.column for signal in program.signals]
+    numbers = [number.name for number in program.numbers]
     writer.writerow(["drive_id", "tick", *columns, *facts, *numbers, "expected_angle"])
+    signal_scales = [signal.scale for signal in program.signals]
+    number_scales = [number.grain for number in program.numbers]
     for check in checks:
-        known = [check.known.get(name) for name in facts]
-        known += [
-            _physical(count, one.grain)
-            for count, one in zip(check.numbers, program.numbers, strict=True)
-        ]
+        car = [*(check.car.get(name) for name in facts), *_physical(check.numbers, number_scales)]
         for tick, (sample, angle) in enumerate(zip(check.samples, check.angles, strict=True)):
-            values = [
-                _physical(count, one.scale)
-                for count, one in zip(sample, program.signals, strict=True)
-            ]
-            writer.writerow([check.name, tick, *values, *known, angle])
+            values = _physical(sample, signal_scales)
+            writer.writerow([check.name, tick, *values, *car, angle])
     return text.getvalue()
 
 
-def _physical(count: int | None, scale: Decimal) -> str | None:
-    return None if count is None else f"{count * scale:f}"
+def _physical(counts: Sequence[int | None], scales: Sequence[Decimal]) -> list[str | None]:
+    return [
+        None if count is None else f"{count * scale:f}"
+        for count, scale in zip(counts, scales, strict=True)
+    ]

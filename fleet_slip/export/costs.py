@@ -1,8 +1,8 @@
-"""What an estimator costs in a car, counted from the integer program that every export writes.
+"""Costs of an estimator in a car, counted from its integer program.
 
-Counted is what the C export does at a tick at which nothing is missing: the most that a tick can
-take. Of the size of its code and the instructions of a step, which a compiler decides, there is an
-estimate for a Cortex-M4; `python -m benchmarks.on_board` measures both.
+The counts are those of the C export at a tick without missing values, which is the maximum. Size of
+the code and instructions depend on the compiler: they are estimates for a Cortex-M4, which
+`python -m benchmarks.on_board` compares with measurements.
 """
 
 from collections import Counter
@@ -19,22 +19,26 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 
 COEFFICIENT_BYTES = 8
-"""Two words of 32 bits."""
+"""Size of a coefficient: two words of 32 bits."""
 
 
 @dataclass(frozen=True)
 class Costs(Record):
-    """What one estimate takes.
+    """Costs of one estimate.
 
-    Attributes:
-        columns: terms of the dot product.
-        coefficient_bytes: of the table of coefficients.
-        memory_bytes: of the state: ring buffers, running sums, numbers of values.
-        multiplications, additions, divisions: of a tick, at most. Subtractions count as additions;
-            comparisons, shifts, absolute values and signs do not count.
-        divisions_64: those of the divisions that need 64 bits, which small processors lack.
-        estimated_code_bytes, estimated_instructions: on a Cortex-M4, of code and constants with the
-            compiler's divisions of 64 bits, and of a tick; at or above what was measured.
+    Attributes
+    ----------
+    columns
+        Terms of the dot product.
+    coefficient_bytes, memory_bytes
+        Size of the coefficients, and of the state: ring buffers, sums, numbers of values.
+    multiplications, additions, divisions
+        Operations of a tick, at most. Subtractions count as additions. Comparisons, shifts,
+        absolute values and signs do not count.
+    divisions_64
+        Divisions that need 64 bits, which small processors lack.
+    estimated_code_bytes, estimated_instructions
+        Code and constants, and instructions of a tick, on a Cortex-M4; at or above measurements.
     """
 
     DOCUMENT = "... operations"
@@ -51,11 +55,11 @@ class Costs(Record):
 
     @property
     def operations(self) -> int:
-        """All of them."""
+        """Multiplications, additions and divisions."""
         return self.multiplications + self.additions + self.divisions
 
     def __str__(self) -> str:
-        """Return it as `show` prints it."""
+        """Return the text that `show` prints."""
         return (
             f"{pluralize(self.columns, 'column')}: {self.coefficient_bytes:,} bytes of "
             f"coefficients, {pluralize(self.memory_bytes, 'byte')} of memory; "
@@ -65,33 +69,33 @@ class Costs(Record):
 
 
 def cost_on_board(catalog: Catalog, manifest: Manifest) -> Costs:
-    """Count what a published version costs. Raises what `write_program` raises."""
+    """Count the costs of a published version. Raises as `write_program`."""
     return count_costs(write_program(catalog, manifest))
 
 
 def count_costs(program: Program) -> Costs:
-    """Count what a program costs at a tick."""
-    done, terms = count_steps(program), len(program.angle.terms)
-    parts = {
-        kind: sum(number * _PARTS.get(one, {}).get(kind, 0) for one, number in done.items())
+    """Count the costs of a program at a tick."""
+    counts, terms = count_steps(program), len(program.angle.terms)
+    total = {
+        kind: sum(n * _OPERATIONS.get(name, {}).get(kind, 0) for name, n in counts.items())
         for kind in ("*", "+", "//", "//64")
     }
     return Costs(
         columns=terms,
         coefficient_bytes=COEFFICIENT_BYTES * terms,
         memory_bytes=state_bytes(program),
-        multiplications=parts["*"],
-        additions=parts["+"],
-        divisions=parts["//"],
-        divisions_64=parts["//64"],
-        estimated_code_bytes=_estimate(_CODE_BYTES, done)
-        + (_DIVISION_BYTES if parts["//64"] else 0),
-        estimated_instructions=_estimate(_INSTRUCTIONS, done),
+        multiplications=total["*"],
+        additions=total["+"],
+        divisions=total["//"],
+        divisions_64=total["//64"],
+        estimated_code_bytes=_estimate(_CODE_BYTES, counts)
+        + (_DIVISION_BYTES if total["//64"] else 0),
+        estimated_instructions=_estimate(_INSTRUCTIONS, counts),
     )
 
 
 def describe_costs(version: ModelVersion) -> str:
-    """Return what a version costs in words; or why it cannot run on board."""
+    """Describe the costs of a version, or the reason why it cannot run on board."""
     try:
         return str(cost_on_board(version.catalog, version.manifest))
     except FleetSlipError as error:
@@ -99,7 +103,7 @@ def describe_costs(version: ModelVersion) -> str:
 
 
 def costs_content(version: ModelVersion) -> dict[str, Any]:
-    """Return the same for a JSON document: what it costs, or `error`."""
+    """Return the costs of a version for a JSON document, or its `error`."""
     try:
         return cost_on_board(version.catalog, version.manifest).as_dict()
     except FleetSlipError as error:
@@ -107,13 +111,13 @@ def costs_content(version: ModelVersion) -> dict[str, Any]:
 
 
 def count_steps(program: Program) -> Counter[str]:
-    """Return how often the C of a tick calls each helper and does each operation of a feature."""
+    """Count the calls of helpers and the operations in the C of a tick."""
     writer = StepWriter(program)
     step_lines(program, writer)
-    return writer.done
+    return writer.counts
 
 
-_PARTS: Mapping[str, Mapping[str, int]] = {
+_OPERATIONS: Mapping[str, Mapping[str, int]] = {
     "*": {"*": 1},
     "+": {"+": 1},
     "-": {"+": 1},
@@ -132,7 +136,7 @@ _PARTS: Mapping[str, Mapping[str, int]] = {
     "term": {"*": 2, "+": 2},
     "floor_shift": {"+": 1},
 }
-"""What each of them is made of, at most."""
+"""Multiplications, additions and divisions of each helper and operation, at most."""
 
 _ARITHMETIC = ("+", "-", "*", "//", "negative", "abs", "sign", "min", "max", "max_64", "clip")
 _WINDOWS = ("ago_16", "ago_32", "slide_32", "slide_64", "keep_16", "keep_32", "gather")
@@ -150,10 +154,11 @@ _INSTRUCTIONS: tuple[int, _Weights] = (
         (33, ("term",)),
     ),
 )
-"""Of a tick, and of each of these parts.
+"""Instructions of a tick, and of each operation.
 
-The least that are some 5 % above what qemu counted, in ticks of the self-test, for code of
-arm-none-eabi-gcc 12 with -Os, of 21 models: of each kind of column alone, and of 2 to 24 columns.
+The smallest weights that are about 5 % above the counts of qemu in ticks of the self-test. The code
+was compiled by arm-none-eabi-gcc 12 with -Os, for 21 models: one of each kind of column, and models
+of 2 to 24 columns.
 """
 
 _CODE_BYTES: tuple[int, _Weights] = (
@@ -167,9 +172,9 @@ _CODE_BYTES: tuple[int, _Weights] = (
     ),
 )
 _DIVISION_BYTES = 920
-"""Of the compiler's own division of 64 bits, which is there once."""
+"""Size of the compiler's division of 64 bits, which is linked once."""
 
 
-def _estimate(weights: tuple[int, _Weights], done: Counter[str]) -> int:
-    least, parts = weights
-    return least + sum(weight * done[name] for weight, names in parts for name in names)
+def _estimate(weights: tuple[int, _Weights], counts: Counter[str]) -> int:
+    constant, terms = weights
+    return constant + sum(weight * counts[name] for weight, names in terms for name in names)

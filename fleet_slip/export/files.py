@@ -1,4 +1,4 @@
-"""The files that an export of a published version consists of."""
+"""The files of an export: JSON document, C, SQL, DBC, ONNX, FMU; a README and a manifest."""
 
 import base64
 import hashlib
@@ -10,49 +10,45 @@ from typing import Any, get_args
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
-from fleet_slip.columns.lowering import VehicleAttribute
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
 from fleet_slip.export.compile import Check, checks_csv, compile_program, make_checks
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.fmu import fmu
-from fleet_slip.export.program import Angle, Input, Program, Target
+from fleet_slip.export.program import Program, Target
 from fleet_slip.export.sql_statement import sql_macro, sql_statement
-from fleet_slip.export.templating import c_prefix, different, file_prefix, fill_in_version
+from fleet_slip.export.templating import c_prefix, distinct, file_prefix, fill_in_version
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# A program as a JSON document, from which an implementation can be written: docs/export.md.
-#
-# Whole numbers that may need more than 53 bits are texts.
+# The JSON document is specified in docs/export.md. Integers that can need more than 53 bits are
+# strings.
 
 FORMAT = "fleet-slip estimator"
 SCHEMA = 2
-"""Number of the schema: it changes if an implementation of before would compute something else."""
+"""Version of the schema. It changes if an older implementation would compute other angles."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A version that is exported, its program, and checks of it.
-
-    `drives` is the content of the file about the drives that trained it; None if it is not known.
-    """
+    """A version to export, with its program and its checks."""
 
     version: ModelVersion
     program: Program
     checks: tuple[Check, ...]
     drives: bytes | None
+    """Content of the file with the training drives' hashes; None: unknown."""
     with_gram: bool = False
 
     @property
     def table(self) -> str:
-        """The checks as CSV."""
+        """The checks as a CSV file."""
         return checks_csv(self.program, self.checks)
 
 
 def document_of(subject: Subject) -> dict[str, Any]:
-    """Return the document of a published version; `sha256` is of everything else in it."""
+    """Return the JSON document of a version; `sha256` covers all other keys."""
     version, drives = subject.version, subject.drives
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -67,67 +63,62 @@ def document_of(subject: Subject) -> dict[str, Any]:
         "program": program_content(subject.program),
         "costs": count_costs(subject.program).as_dict(),
         "checks": [
-            {name: value for name, value in vars(one).items() if name != "known"}
-            for one in subject.checks
+            {name: value for name, value in vars(check).items() if name != "car"}
+            for check in subject.checks
         ],
     }
     return {**content, "sha256": sha256_of(canonical_json(content))}
 
 
 def program_content(program: Program) -> dict[str, Any]:
-    """Return the program alone."""
+    """Return the key `program` of the JSON document."""
+    angle = program.angle
     return {
         "tick_s": str(float(SAMPLE_TIME_S)),
-        "signals": [_signal(one) for one in program.signals],
-        "facts": [_fact(one) for one in program.facts],
+        "signals": [
+            {
+                "name": signal.name,
+                "column": signal.column,
+                "unit": signal.unit,
+                "scale": f"{signal.scale:f}",
+                "min": signal.min_count,
+                "max": signal.max_count,
+            }
+            for signal in program.signals
+        ],
+        "facts": [
+            {"name": fact.name, "largest": MAX_ATTRIBUTE}
+            if fact.equals is None
+            else {"name": fact.name, "equals": fact.equals}
+            for fact in program.facts
+        ],
         "numbers": [
-            {"name": one.name, "unit": one.unit, "grain": f"{one.grain:f}"}
-            for one in program.numbers
+            {"name": number.name, "unit": number.unit, "grain": f"{number.grain:f}"}
+            for number in program.numbers
         ],
         "steps": [list(step) for step in program.steps],
-        "angle": _angle(program.angle),
-    }
-
-
-def _signal(one: Input) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "column": one.column,
-        "unit": one.unit,
-        "scale": f"{one.scale:f}",
-        "min": one.min_count,
-        "max": one.max_count,
-    }
-
-
-def _fact(one: VehicleAttribute) -> dict[str, Any]:
-    if one.equals is not None:
-        return {"name": one.name, "equals": one.equals}
-    return {"name": one.name, "largest": MAX_ATTRIBUTE}
-
-
-def _angle(angle: Angle) -> dict[str, Any]:
-    return {
-        "name": angle.name,
-        "column": angle.column,
-        "unit": angle.unit,
-        "scale": f"{angle.scale:f}",
-        "bits": angle.bits,
-        "intercept": str(angle.intercept),
-        "terms": [
-            {"step": step, "coefficient": str(coefficient)} for step, coefficient in angle.terms
-        ],
-        "error": f"{angle.error.numerator}/{angle.error.denominator}",
-        "largest": angle.largest,
-        "limit": angle.limit,
+        "angle": {
+            "name": angle.name,
+            "column": angle.column,
+            "unit": angle.unit,
+            "scale": f"{angle.scale:f}",
+            "bits": angle.bits,
+            "intercept": str(angle.intercept),
+            "terms": [
+                {"step": step, "coefficient": str(coefficient)} for step, coefficient in angle.terms
+            ],
+            "error": f"{angle.error.numerator}/{angle.error.denominator}",
+            "largest": angle.largest,
+            "limit": angle.limit,
+        },
     }
 
 
 def manifest_of(
     version: ModelVersion, program: Program, to: str, files: Mapping[str, bytes]
 ) -> dict[str, Any]:
-    """Return what is said of the files of an export: of which version, the error and the costs."""
-    angle = program.angle
+    """Return the manifest of an export: version, error, costs, and hashes of the files."""
+    angle = program_content(program)["angle"]
     return {
         "format": "fleet-slip export",
         "to": to,
@@ -135,12 +126,7 @@ def manifest_of(
         "sha256": version.sha256,
         "drives_sha256": version.manifest.trained_on.drives_sha256,
         **({"assumed": version.manifest.assumed} if version.manifest.assumed else {}),
-        "angle": {
-            "column": angle.column,
-            "unit": angle.unit,
-            "scale": f"{angle.scale:f}",
-            "error": f"{angle.error.numerator}/{angle.error.denominator}",
-        },
+        "angle": {key: angle[key] for key in ("column", "unit", "scale", "error")},
         "costs": count_costs(program).as_dict(),
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }
@@ -149,24 +135,24 @@ def manifest_of(
 def export_files(
     version: ModelVersion, warehouse: Warehouse | None, to: str, *, with_gram: bool = False
 ) -> dict[str, bytes]:
-    """Return the contents of an export by the names of their files.
+    """Return the files of an export by name.
 
-    `with_gram` adds to C what counts Gram rows in the car.
-
-    Nothing in it is of a drive of the warehouse. Raises `UsageError` for an unknown target, what
-    `compile_program` raises, and `StorageError` if the hashes of its drives are gone. `ConfigError`
-    says that a library is not installed.
+    `with_gram` adds C code that counts Gram rows in the car. The files contain no logged data.
+    Raises `UsageError` for an unknown format, `ConfigError` without a required package or compiler,
+    `StorageError` if the hashes of the training drives are missing, and as `compile_program`.
     """
     if to not in _WRITERS:
-        raise UsageError(f"{to!r}: export to one of {', '.join(get_args(Target))}.")
+        raise UsageError(f"--to {to!r} is unknown. Choose from: {', '.join(get_args(Target))}.")
     if with_gram and to != "c":
-        raise UsageError("only C has Gram rows. Run: fleet-slip export NAME --to c --with-gram")
+        raise UsageError(
+            "--with-gram needs the format C. Run: fleet-slip export NAME --to c --with-gram"
+        )
     subject = _subject(version, warehouse, with_gram=with_gram)
     files = {
         name: content.encode("utf-8") if isinstance(content, str) else content
         for name, content in _WRITERS[to](subject).items()
     }
-    if to != "json":  # that says all of it itself
+    if to != "json":  # which contains all of this
         prefix = c_prefix(version) if to == "c" else file_prefix(version)
         last = f"{prefix}_{to}_manifest.json"  # a folder may hold several formats
         words = {"target": to, "stem": prefix, "names": [*files, last]}
@@ -189,12 +175,12 @@ def _subject(
 
 
 def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
-    """Log a version to an MLflow server and register it; return the number that it has there.
+    """Log a version to an MLflow server and register it; return its number there.
 
-    Raises `ConfigError` without the library, `UsageError` for a URI with a password, `StorageError`
-    if the server does not take it, and what `export_files` raises.
+    Raises `ConfigError` without the package, `UsageError` for a URI with a password, `StorageError`
+    if the server rejects it, and as `export_files`.
     """
-    from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - it renders documents
+    from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - mlflow imports this module
 
     aliases = Registry.of(warehouse).history(version.manifest.name).aliases()
     return log_to_mlflow(uri, _subject(version, warehouse), aliases)
@@ -208,26 +194,21 @@ def _json(subject: Subject) -> dict[str, str]:
 def _c(subject: Subject) -> dict[str, str]:
     version, program = subject.version, subject.program
     prefix = c_prefix(version)
-    sets = sets_on_board(version.catalog, version.manifest) if subject.with_gram else ()
-    gram = (
-        {
-            f"{prefix}_gram.h": c_gram_header(version.catalog, prefix, sets),
-            f"{prefix}_gram.c": c_gram_source(version.catalog, prefix, sets),
-        }
-        if sets
-        else {}
-    )
     total = sum(len(check.angles) for check in subject.checks)
-    tested = {"checks": subject.checks, "total": total}
-    return {
+    words = {"checks": subject.checks, "total": total}
+    files = {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
-        f"{prefix}_test.c": fill_in_version("templates/self_test.c", version, program, **tested),
+        f"{prefix}_test.c": fill_in_version("templates/self_test.c", version, program, **words),
         f"{prefix}_fuzz.c": fill_in_version("templates/fuzz.c", version, program),  # for libFuzzer
-        # ASAM MCD-2 MC: symbols instead of addresses, which the tool takes from the linked program.
+        # ASAM MCD-2 MC, with symbols: tools read the addresses from the linked program.
         f"{prefix}.a2l": fill_in_version("templates/estimator.a2l", version, program),
-        **gram,
     }
+    if subject.with_gram:
+        sets = sets_on_board(version.catalog, version.manifest)
+        files[f"{prefix}_gram.h"] = c_gram_header(version.catalog, prefix, sets)
+        files[f"{prefix}_gram.c"] = c_gram_source(version.catalog, prefix, sets)
+    return files
 
 
 def _sql(subject: Subject) -> dict[str, str]:
@@ -241,12 +222,12 @@ def _sql(subject: Subject) -> dict[str, str]:
 
 
 FIRST_ID = 0x100
-"""Identifier of the first CAN message; whose bus it is decides."""
+"""Identifier of the first CAN message, an example: the bus defines the real ones."""
 
-PER_MESSAGE = 4
+SIGNALS_PER_MESSAGE = 4
 """Signals of 16 bits in a message of 8 bytes."""
 
-LONGEST_DBC_NAME = 32
+MAX_DBC_NAME_CHARACTERS = 32
 
 
 def _dbc(subject: Subject) -> dict[str, str]:
@@ -255,11 +236,11 @@ def _dbc(subject: Subject) -> dict[str, str]:
     prefix = file_prefix(version)
     words = {
         "node": "fleet_slip",
-        "names": different([one.name for one in program.signals], LONGEST_DBC_NAME),
-        "longest_name": LONGEST_DBC_NAME,
+        "names": distinct([signal.name for signal in program.signals], MAX_DBC_NAME_CHARACTERS),
+        "longest_name": MAX_DBC_NAME_CHARACTERS,
         "first_id": FIRST_ID,
-        "last_id": FIRST_ID + -(-len(program.signals) // PER_MESSAGE),
-        "per_message": PER_MESSAGE,
+        "last_id": FIRST_ID + -(-len(program.signals) // SIGNALS_PER_MESSAGE),
+        "per_message": SIGNALS_PER_MESSAGE,
         "missing": -(2**15),
         "tick_ms": round(1000 * SAMPLE_TIME_S),
     }
@@ -271,10 +252,10 @@ def _dbc(subject: Subject) -> dict[str, str]:
 
 def _onnx(subject: Subject) -> dict[str, str | bytes]:
     try:
-        from fleet_slip.export.onnx import onnx_model  # noqa: PLC0415 - it is optional
+        from fleet_slip.export.onnx import onnx_model  # noqa: PLC0415 - optional package
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
+            f"the format ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
         ) from None
     version, program = subject.version, subject.program
     prefix = file_prefix(version)
@@ -291,24 +272,24 @@ def _fmu(subject: Subject) -> dict[str, bytes]:
 
 
 def render(content: Mapping[str, Any]) -> str:
-    """Return a JSON document with a line for each of its parts, and for each tick."""
+    """Return the text of a JSON document, with one line for each tick."""
     return _rendered(content, 0) + "\n"
 
 
 def _rendered(value: Any, depth: int) -> str:
-    """Return JSON text; what is made of numbers and texts alone stands on one line."""
-    items = value.values() if isinstance(value, Mapping) else value
+    """Return JSON text; containers of numbers and texts are written on one line."""
+    is_mapping = isinstance(value, Mapping)
+    items = value.values() if is_mapping else value
     if not isinstance(value, Mapping | list | tuple) or not any(
-        isinstance(one, Mapping | list | tuple) for one in items
+        isinstance(item, Mapping | list | tuple) for item in items
     ):
         return json.dumps(value, ensure_ascii=False, allow_nan=False)
-    indent, close = "\n" + " " * (depth + 1), "\n" + " " * depth
-    if isinstance(value, Mapping):
-        parts = [f"{json.dumps(key)}: {_rendered(one, depth + 1)}" for key, one in value.items()]
-        return "{" + indent + f",{indent}".join(parts) + close + "}"
-    return (
-        "[" + indent + f",{indent}".join(_rendered(one, depth + 1) for one in value) + close + "]"
-    )
+    lines = [_rendered(item, depth + 1) for item in items]
+    if is_mapping:
+        lines = [f"{json.dumps(key)}: {line}" for key, line in zip(value, lines, strict=True)]
+    start, end = "{}" if is_mapping else "[]"
+    indent = "\n" + " " * (depth + 1)
+    return start + indent + f",{indent}".join(lines) + "\n" + " " * depth + end
 
 
 _WRITERS: dict[str, Callable[[Subject], Mapping[str, str | bytes]]] = {

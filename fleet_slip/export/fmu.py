@@ -1,7 +1,7 @@
-"""A program as an FMU for co-simulation, FMI 2.0: sources, and a binary for Linux inside.
+"""A program as an FMU for co-simulation (FMI 2.0), with sources and a binary for Linux.
 
-https://fmi-standard.org. Inputs are the signals and the output is the angle, in SI units; one tick
-is 10 ms. Parameters are what the car knows of itself, as whole numbers.
+Inputs are the signals and the output is the angle, in SI units. One tick is 10 ms. Parameters are
+the properties of the car, as whole numbers. Standard: https://fmi-standard.org.
 """
 
 import subprocess
@@ -17,19 +17,19 @@ from tempfile import TemporaryDirectory
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.program import Program
-from fleet_slip.export.templating import c_prefix, different, fill_in_version, read_source
+from fleet_slip.export.templating import c_prefix, distinct, fill_in_version, read_source
 from fleet_slip.models.registry import ModelVersion
 
 COMPILER = "cc"
-LONGEST_COMPILATION_S = 120
-FIRST_MOMENT = (1980, 1, 1, 0, 0, 0)
-"""Of all files in the archive, so that an export is the same again."""
+COMPILE_TIMEOUT_S = 120
+FILE_TIME = (1980, 1, 1, 0, 0, 0)
+"""Time of all files in the archive, so that an export is reproducible."""
 
 
 def fmu(version: ModelVersion, program: Program, checks: str) -> bytes:
-    """Return the archive; `checks` is a table that comes along.
+    """Return the archive; `checks` is the content of a resource.
 
-    Raises `ConfigError` without a C compiler, or on a machine that is no x86-64.
+    Raises `ConfigError` without a C compiler, or on a machine other than x86-64.
     """
     prefix = c_prefix(version)
     words = {
@@ -38,7 +38,7 @@ def fmu(version: ModelVersion, program: Program, checks: str) -> bytes:
         f"{version.manifest.trained_on.drives_sha256}",
         "parameters": _parameters(program),
         "units": _units(program),
-        "valid": "whether there is an angle; where there is none, the angle is 0",
+        "valid": "true if there is an angle; otherwise the angle is 0",
     }
 
     def filled(file: str) -> str:
@@ -64,33 +64,32 @@ def _archive(content: Mapping[str, str | bytes]) -> bytes:
     file = BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in content.items():
-            archive.writestr(zipfile.ZipInfo(name, FIRST_MOMENT), data, zipfile.ZIP_DEFLATED)
+            archive.writestr(zipfile.ZipInfo(name, FILE_TIME), data, zipfile.ZIP_DEFLATED)
     return file.getvalue()
 
 
 def _compile(sources: Mapping[str, str]) -> bytes:
-    """Return the shared library for this machine."""
+    """Compile the shared library for this machine."""
     if which(COMPILER) is None or machine() != "x86_64":
         raise ConfigError(
-            "an FMU contains a binary for Linux on x86-64: export it on such a machine, with the C "
-            f"compiler {COMPILER}: apt-get install gcc libc6-dev"
+            "an FMU contains a binary for Linux on x86-64. Export it on such a machine with the C "
+            f"compiler {COMPILER}. Run: apt-get install gcc libc6-dev"
         )
     with TemporaryDirectory() as folder:
         for name, text in sources.items():
             (Path(folder) / name).write_text(text, "utf-8")
-        units = [name for name in sources if name.endswith(".c")]
+        files = [name for name in sources if name.endswith(".c")]
         options = ["-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden"]
-        words = [COMPILER, *options, *units, "-o", "library.so", "-lm"]
-        done = subprocess.run(  # noqa: S603 - our own words
-            words,
+        result = subprocess.run(  # noqa: S603 - fixed arguments
+            [COMPILER, *options, *files, "-o", "library.so", "-lm"],
             cwd=folder,
             capture_output=True,
             text=True,
             check=False,
-            timeout=LONGEST_COMPILATION_S,
+            timeout=COMPILE_TIMEOUT_S,
         )
-        if done.returncode:
-            raise ConfigError(f"{COMPILER} cannot compile the FMU: {done.stderr[-500:]}")
+        if result.returncode:
+            raise ConfigError(f"{COMPILER} cannot compile the FMU: {result.stderr[-500:]}")
         return (Path(folder) / "library.so").read_bytes()
 
 
@@ -101,20 +100,20 @@ def _token(version: ModelVersion) -> str:
 
 
 def _parameters(program: Program) -> list[tuple[str, str]]:
-    """Return names and descriptions of the parameters."""
+    """Return the names and descriptions of the parameters."""
     descriptions = [
         "whole number" if fact.equals is None else f"1 if it is {fact.equals}, else 0"
         for fact in program.facts
     ] + [f"in counts of {number.grain:f} {number.unit}" for number in program.numbers]
     names = [fact.field for fact in program.facts] + [number.name for number in program.numbers]
     return [
-        (name, f"{description}; -2147483648 where it is not known")
-        for name, description in zip(different(names), descriptions, strict=True)
+        (name, f"{description}; -2147483648 if unknown")
+        for name, description in zip(distinct(names), descriptions, strict=True)
     ]
 
 
 def _units(program: Program) -> dict[str, str]:
-    """Return all units, each in powers of the SI's base units."""
+    """Return all units, each as powers of SI base units."""
     units = {}
     for unit in (*(signal.unit for signal in program.signals), program.angle.unit):
         powers: dict[str, int] = {}

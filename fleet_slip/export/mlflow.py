@@ -1,6 +1,6 @@
-"""Logs a version to an MLflow server and registers it, as a pyfunc model that computes `predict`.
+"""Logs a version to an MLflow server and registers it as a pyfunc model with `predict`.
 
-MLflow and pandas are the extra `fleet-slip[mlflow]`; they are imported when they are used.
+MLflow and pandas are the extra `fleet-slip[mlflow]`, imported on use.
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,24 +27,24 @@ LOADER = "fleet_slip.export.mlflow_model"
 DOCUMENT = "estimator.json"
 EXAMPLE_ROWS = 50
 ANSWER_S = 10.0
-"""So long a server may take to say that it is there."""
-LONGEST_PARAMETER = 500
-"""Characters; newer versions of MLflow take 6,000."""
+"""Timeout of the request that checks that the server answers, in s."""
+MAX_PARAMETER_CHARACTERS = 500
+"""Maximum length of a parameter. Newer versions of MLflow accept 6,000 characters."""
 SHA256_TAG = "fleet_slip.sha256"
 
 _TEXTS = ("vehicle_id", "vehicle_model", "campaign", "track", "source")
 
 
 def log_to_mlflow(uri: str, subject: Subject, aliases: Mapping[str, int]) -> str:
-    """Register a version under its model's name; return the number that MLflow gave it.
+    """Register a version under the name of its model; return its number in MLflow.
 
-    One that is registered already, by its checksum, is not registered again; `aliases` that point
-    at it here point at it there. Raises `UsageError`
-    for a URI with a password, and `StorageError` if the server does not take it.
+    A version with the same checksum is not registered again. The `aliases` of the version are
+    copied. Raises `UsageError` for a URI with a password, and `StorageError` if the server rejects
+    it.
     """
     if urlsplit(uri).username is not None or urlsplit(uri).password is not None:
         raise UsageError(
-            "the URI of MLflow has a name or password in it, which logs would keep. Set "
+            "the URI of MLflow contains a name or password, which logs would store. Set "
             "MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD instead."
         )
     mlflow, version = _library(), subject.version
@@ -55,20 +55,20 @@ def log_to_mlflow(uri: str, subject: Subject, aliases: Mapping[str, int]) -> str
             describe(mlflow.MlflowClient(), version, number, aliases)
             return number
     except mlflow.exceptions.MlflowException as error:
-        told = shorten(str(error), 300, placeholder=" …")
-        raise _not_taken(version.reference, told) from None
+        reason = shorten(str(error), 300, placeholder=" …")
+        raise _rejected(version.reference, reason) from None
 
 
-def require_answer(uri: str, reference: str, patience_s: float = ANSWER_S) -> None:
-    """Raise `StorageError` if no server answers at a URI of HTTP, whatever its answer.
+def require_answer(uri: str, reference: str, timeout_s: float = ANSWER_S) -> None:
+    """Raise `StorageError` if no server answers at an HTTP URI; any answer is accepted.
 
-    MLflow itself asks again for minutes. What is wrong with a certificate is left to it, since it
-    may know another authority.
+    MLflow itself retries for minutes. It also checks certificates, as it may trust other
+    authorities.
     """
     if urlsplit(uri).scheme not in {"http", "https"}:
         return
     try:
-        with urlopen(f"{uri.rstrip('/')}/health", timeout=patience_s):  # noqa: S310 - see above
+        with urlopen(f"{uri.rstrip('/')}/health", timeout=timeout_s):  # noqa: S310 - see above
             return
     except HTTPError:
         return
@@ -76,23 +76,23 @@ def require_answer(uri: str, reference: str, patience_s: float = ANSWER_S) -> No
         reason = getattr(error, "reason", error)
         if isinstance(reason, SSLError):
             return
-        told = "no answer" if isinstance(reason, TimeoutError) else str(reason)
-        raise _not_taken(
-            reference, f"nothing answers at {uri} within {patience_s:g} s ({told})."
+        text = "no answer" if isinstance(reason, TimeoutError) else str(reason)
+        raise _rejected(
+            reference, f"nothing answers at {uri} within {timeout_s:g} s ({text})."
         ) from None
 
 
-def _not_taken(reference: str, why: str) -> StorageError:
+def _rejected(reference: str, reason: str) -> StorageError:
     return StorageError(
-        f"{reference} is published here, but MLflow rejected it: {why} Publish it again when "
+        f"{reference} is published here, but MLflow rejected it: {reason} Publish it again when "
         "the server answers."
     )
 
 
 def _library() -> Any:
-    """Return MLflow. Raises `ConfigError` without it."""
+    """Import MLflow. Raises `ConfigError` if it is not installed."""
     try:
-        import mlflow  # noqa: PLC0415 - the library is optional
+        import mlflow  # noqa: PLC0415 - optional package
         import pandas as pd  # noqa: F401, PLC0415
     except ModuleNotFoundError as error:
         raise ConfigError(
@@ -103,23 +103,23 @@ def _library() -> Any:
 
 @contextmanager
 def _tracking(mlflow: Any, uri: str) -> Iterator[None]:
-    before = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    tracking, registry = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
     mlflow.set_tracking_uri(uri)
     mlflow.set_registry_uri(uri)
     try:
         yield
     finally:
-        mlflow.set_tracking_uri(before[0])
-        mlflow.set_registry_uri(before[1])
+        mlflow.set_tracking_uri(tracking)
+        mlflow.set_registry_uri(registry)
 
 
 def _registered(mlflow: Any, version: ModelVersion) -> str | None:
-    """Return the number of a version that is registered already."""
+    """Return the number of a registered version; None if it is not registered."""
     client = mlflow.MlflowClient()
     name = version.manifest.name
-    for one in client.search_model_versions(f"name = '{name}'"):
-        if one.tags.get(SHA256_TAG) == version.sha256:
-            return str(one.version)
+    for registered in client.search_model_versions(f"name = '{name}'"):
+        if registered.tags.get(SHA256_TAG) == version.sha256:
+            return str(registered.version)
     return None
 
 
@@ -149,21 +149,21 @@ def _log(mlflow: Any, subject: Subject, folder: Path) -> str:
 
 
 def describe(client: Any, version: ModelVersion, number: str, aliases: Mapping[str, int]) -> None:
-    """Give a registered version a description, and the aliases that it has here."""
+    """Set the description of a registered version, and copy its aliases."""
     name, trained = version.manifest.name, version.manifest.trained_on
-    told = (
+    description = (
         f"{version.reference} of fleet_slip, trained on {pluralize(trained.drives, 'drive')} where "
         f"{trained.cohort}. {version.manifest.selected_by.reason}"
     )
-    client.update_model_version(name, number, description=told)
-    for alias in sorted(one for one, which in aliases.items() if which == version.version):
+    client.update_model_version(name, number, description=description)
+    for alias in sorted(a for a, target in aliases.items() if target == version.version):
         client.set_registered_model_alias(name, alias, number)
 
 
 def parameters(version: ModelVersion) -> dict[str, str]:
-    """Return what the version was made with, by name, as short as every MLflow takes it."""
+    """Return the training parameters of a version, cut to the length that MLflow accepts."""
     trained, chosen = version.manifest.trained_on, version.manifest.selected_by
-    told = {
+    values = {
         "cohort": trained.cohort,
         "feature_set": trained.feature_set,
         "drives": trained.drives,
@@ -173,7 +173,7 @@ def parameters(version: ModelVersion) -> dict[str, str]:
         "signals": ",".join(version.manifest.signals),
         **(chosen.asked or {}),
     }
-    return {key: str(value)[:LONGEST_PARAMETER] for key, value in told.items()}
+    return {key: str(value)[:MAX_PARAMETER_CHARACTERS] for key, value in values.items()}
 
 
 def _tags(version: ModelVersion) -> dict[str, str]:
@@ -194,32 +194,33 @@ def _metrics(version: ModelVersion) -> dict[str, float]:
 
 
 def _columns(program: Program) -> dict[str, str]:
-    """Return what a row must have, and of which type."""
-    facts = {one.name: "string" if one.name in _TEXTS else "double" for one in program.facts}
-    numbers = {one.name: "double" for one in program.numbers}
-    return {one.column: "double" for one in program.signals} | facts | numbers
+    """Return the columns of a row, and their types."""
+    facts = {f.name: "string" if f.name in _TEXTS else "double" for f in program.facts}
+    numbers = {number.name: "double" for number in program.numbers}
+    return {signal.column: "double" for signal in program.signals} | facts | numbers
 
 
 def _signature(mlflow: Any, program: Program) -> Any:
     types = mlflow.types
-    given = [types.ColSpec(kind, name) for name, kind in _columns(program).items()]
+    inputs = [types.ColSpec(kind, name) for name, kind in _columns(program).items()]
     if program.rings:
-        given += [
+        inputs += [
             types.ColSpec("string", "drive_id", required=False),
             types.ColSpec("long", "tick", required=False),
         ]
     angle = types.Schema([types.ColSpec("double", program.angle.column)])
-    return mlflow.models.ModelSignature(inputs=types.Schema(given), outputs=angle)
+    return mlflow.models.ModelSignature(inputs=types.Schema(inputs), outputs=angle)
 
 
 def _example(program: Program, check: Check) -> Any:
-    """Return the first ticks of a check in SI units, as a frame; nothing is known of the car."""
-    import pandas as pd  # noqa: PLC0415 - the library is optional
+    """Return the first ticks of a check in SI units as a frame, for an unknown car."""
+    import pandas as pd  # noqa: PLC0415 - optional package
 
     samples = check.samples[:EXAMPLE_ROWS]
     columns: dict[str, Any] = {}
-    for one, counts in zip(program.signals, zip(*samples, strict=True), strict=True):
-        columns[one.column] = [None if n is None else n * float(one.scale) for n in counts]
+    for signal, counts in zip(program.signals, zip(*samples, strict=True), strict=True):
+        scale = float(signal.scale)
+        columns[signal.column] = [None if n is None else n * scale for n in counts]
     kinds = _columns(program)
     frame = pd.DataFrame({name: columns.get(name, [None] * len(samples)) for name in kinds})
     return frame.astype({n: "float64" for n, kind in kinds.items() if kind == "double"})

@@ -1,4 +1,4 @@
-"""What MLflow loads of a version that was logged: its `predict` is that of the version."""
+"""The pyfunc model that MLflow loads; its `predict` is that of the version."""
 
 import json
 from pathlib import Path
@@ -14,24 +14,26 @@ from fleet_slip.warehouse.warehouse import open_warehouse
 class LoggedVersion:
     """A version as a pyfunc model.
 
-    Attributes:
-        signals: of the configs that the environment names, else the shipped ones.
-        manifest: of the version.
+    Parameters
+    ----------
+    signals
+        Signals of the configs that the environment names, or the shipped ones.
+    manifest
+        Manifest of the version.
     """
 
     def __init__(self, signals: SignalCatalog, manifest: Manifest) -> None:
-        """Take the signals and a manifest."""
         self.signals = signals
         self.manifest = manifest
 
     def predict(self, model_input: Any, params: Any = None) -> Any:  # noqa: ARG002 - MLflow passes it
-        """Return a frame with the angle in rad of each row; raises what `predict` raises."""
+        """Return a frame with the angle of each row in rad. Raises as `predict`."""
         angles = predict(self.signals, self.manifest, model_input)
         return angles.to_frame()
 
 
 def _load_pyfunc(path: str) -> LoggedVersion:
-    """Return the model of an exported document; MLflow calls it."""
+    """Load the model of an exported document, for MLflow."""
     content = json.loads(Path(path).read_text("utf-8"))
     signals = open_warehouse().catalog.signals
     manifest = content["model"]["manifest"]

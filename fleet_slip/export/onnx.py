@@ -1,13 +1,13 @@
-"""A program as an ONNX graph of one tick, in opset 17: inputs in SI units, state in and state out.
+"""A program as an ONNX graph of one tick, in opset 17: SI units and state in, angle and state out.
 
 Everything up to the columns is computed in integers of 64 bits, so that the columns are those of
-the warehouse. The dot product is in the float type that is asked for.
+the warehouse. The dot product has the requested float type.
 
     inputs   signals (cars, signals) float      facts, numbers (cars, ...) int64, if there are any
              ring_I (cars, ticks) int64, sum_K and values_K (cars, 1) int64
-    outputs  angle (cars, 1) float, NaN where there is none; each state as NAME_next
+    outputs  angle (cars, 1) float, NaN without an angle; each state as NAME_next
 
-A ring has the oldest value first. A missing value of a ring, an unknown fact or number is
+The oldest value of a ring is the first. A missing value of a ring, an unknown fact or number is
 `UNKNOWN`, -2^31.
 """
 
@@ -30,38 +30,35 @@ from fleet_slip.columns.lowering import (
 from fleet_slip.export.program import Program
 from fleet_slip.models.registry import ModelVersion
 
-# Nodes of an ONNX graph: how they are written, and what several of them compute together.
-
 
 class Nodes:
-    """The nodes of a graph as they are written, its constants, inputs and outputs."""
+    """Nodes, constants, inputs and outputs of a graph."""
 
     def __init__(self) -> None:
-        """Begin with no node."""
         self.nodes: list[Any] = []
         self.inputs: list[Any] = []
         self.outputs: list[Any] = []
         self.constants: list[Any] = []
-        self._known: dict[tuple[str, bytes], str] = {}
+        self._constant_names: dict[tuple[str, bytes], str] = {}
 
     def do(self, operation: str, *inputs: str | int, out: str = "", **attributes: Any) -> str:
-        """Add a node; whole numbers are constants. Return the name of what it computes."""
-        names = [one if isinstance(one, str) else self.constant(one) for one in inputs]
+        """Add a node; return the name of its result. Whole numbers become constants."""
+        names = [item if isinstance(item, str) else self.constant(item) for item in inputs]
         name = out or f"{operation.lower()}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operation, names, [name], **attributes))
         return name
 
     def constant(self, value: Any, dtype: Any = np.int64) -> str:
-        """Return the name of a constant, which is written once."""
+        """Return the name of a constant; equal ones are written once."""
         array = np.asarray(value, dtype)
         key = (f"{array.dtype}{array.shape}", array.tobytes())
-        if key not in self._known:
-            self._known[key] = f"constant_{len(self._known)}"
-            self.constants.append(numpy_helper.from_array(array, self._known[key]))
-        return self._known[key]
+        if key not in self._constant_names:
+            self._constant_names[key] = f"constant_{len(self._constant_names)}"
+            self.constants.append(numpy_helper.from_array(array, self._constant_names[key]))
+        return self._constant_names[key]
 
     def nearest(self, value: str, divisor: str) -> str:
-        """Return a quotient to the nearest, halves away from zero."""
+        """Divide to the nearest integer, halves away from zero."""
         twice = self.do("Mul", self.do("Abs", value), 2)
         size = self.do("Div", self.do("Add", twice, divisor), self.do("Mul", divisor, 2))
         return self.signed(value, size)
@@ -69,7 +66,7 @@ class Nodes:
     def signed(self, value: str, size: str | int) -> str:
         """Return a size with the sign of a value.
 
-        Not by `Sign`: of vectors of int64, onnxruntime 1.31 takes it from the lower 32 bits.
+        `Sign` of onnxruntime 1.31 uses the lower 32 bits of vectors of int64 only.
         """
         negative = self.do("Less", value, 0)
         return self.do("Where", negative, self.do("Neg", size), size)
@@ -80,16 +77,15 @@ class Nodes:
         return name
 
     def declare_next(self, name: str, width: int) -> str:
-        """Declare an output for a state after the tick; return its name."""
+        """Declare the output of a state after the tick; return its name."""
         declared = helper.make_tensor_value_info(f"{name}_next", TensorProto.INT64, ["cars", width])
         self.outputs.append(declared)
         return f"{name}_next"
 
-    def part(self, name: str, first: int, last: int) -> str:
+    def columns(self, name: str, first: int, last: int) -> str:
         """Return some columns of a tensor."""
-        return self.do(
-            "Slice", name, *(self.constant([one]) for one in (first, last)), self.constant([1])
-        )
+        ends = (self.constant([first]), self.constant([last]))
+        return self.do("Slice", name, *ends, self.constant([1]))
 
 
 OPSET, IR_VERSION = 17, 8
@@ -123,10 +119,14 @@ def onnx_model(version: ModelVersion, program: Program, kind: FloatName) -> byte
 
 
 def error_bound(version: ModelVersion, program: Program, kind: FloatName) -> float:
-    """Return how far the angle can be from the exact model, in its SI unit.
+    """Return a bound of the difference from the exact model, in the SI unit of the angle.
 
-    With u the unit roundoff and k terms, each product of a rounded coefficient and a rounded column
-    meets at most k + 1 additions: (1 + u)^(k + 4) - 1 times the sum of sizes (Higham 2002, 3.1).
+    With unit roundoff u and k terms, each product of a rounded coefficient and a rounded column is
+    part of at most k + 1 additions. The bound is (1 + u)^(k + 4) - 1 times the sum of sizes.
+
+    References
+    ----------
+    N. J. Higham, "Accuracy and Stability of Numerical Algorithms" (2002), section 3.1.
     """
     intercept, *coefficients = _radians(version)
     largest = [size_of(program.ranges[place]) for place, _ in program.angle.terms]
@@ -139,7 +139,7 @@ def _radians(version: ModelVersion) -> list[Fraction]:
     """Return the intercept, and the coefficients of counts, in the unit of the angle."""
     exact = version.manifest.counts_model(version.catalog)
     unit = Fraction(version.catalog.signals[version.manifest.label.signal].scale)
-    return [one * unit for one in (exact.intercept, *exact.coefficients)]
+    return [value * unit for value in (exact.intercept, *exact.coefficients)]
 
 
 def _properties(version: ModelVersion, program: Program, kind: FloatName) -> dict[str, str]:
@@ -147,19 +147,18 @@ def _properties(version: ModelVersion, program: Program, kind: FloatName) -> dic
         "model": version.reference,
         "sha256": version.sha256,
         "drives_sha256": version.manifest.trained_on.drives_sha256,
-        "signals": ",".join(one.column for one in program.signals),
-        "facts": ",".join(one.field for one in program.facts),
-        "numbers": ",".join(f"{one.name} in counts of {one.grain:f}" for one in program.numbers),
+        "signals": ",".join(signal.column for signal in program.signals),
+        "facts": ",".join(fact.field for fact in program.facts),
+        "numbers": ",".join(f"{n.name} in counts of {n.grain:f}" for n in program.numbers),
         "angle": f"{program.angle.column} in {program.angle.unit}",
         "error": f"{error_bound(version, program, kind):.3g} {program.angle.unit}",
     }
 
 
 class _Writer(Nodes):
-    """Writes the nodes of a program, of each step once: its value, and where it is there."""
+    """Writes the value and the presence of each step of a program, once."""
 
     def __init__(self, program: Program, kind: FloatName) -> None:
-        """Begin with no node."""
         super().__init__()
         self.program, self.kind = program, _KINDS[kind]
         self.dtype: Any = np.dtype(kind)
@@ -167,55 +166,58 @@ class _Writer(Nodes):
         self._values: dict[int, str] = {}
         self._present: dict[int, str] = {}
         self._rings: dict[int, str] = {}
-        self._slid: dict[tuple[int, ...], tuple[str, str]] = {}
-        self._given: dict[str, str] = {}
+        self._sums: dict[tuple[int, ...], tuple[str, str]] = {}
+        self._input_names: dict[str, str] = {}
 
     def write(self, exact: Sequence[Fraction]) -> None:
-        """Write all; `exact` is the intercept and the coefficients in the unit of the angle."""
+        """Write the graph; `exact` has intercept and coefficients in the unit of the angle."""
         places = [place for place, _ in self.program.angle.terms]
         program = self.program
-        self._given["signal"] = self.declare("signals", len(program.signals), self.kind)
-        for name, told in (("fact", program.facts), ("number", program.numbers)):
-            if told:
-                self._given[name] = self.declare(f"{name}s", len(told))
-        values, there = [self._value(place) for place in places], self._there(*places)
-        for number, place in enumerate(places):
-            if self._is_constant(place):  # of no car: with a row for each, it can stand by others
-                values[number] = self.do("Where", there, values[number], 0)
-        self._angle(values, there, exact)
+        self._input_names["signal"] = self.declare("signals", len(program.signals), self.kind)
+        for name, properties in (("fact", program.facts), ("number", program.numbers)):
+            if properties:
+                self._input_names[name] = self.declare(f"{name}s", len(properties))
+        values, present = [self._value(place) for place in places], self._is_present(*places)
+        for i, place in enumerate(places):
+            if self._is_constant(place):  # a scalar, which needs a row for each car
+                values[i] = self.do("Where", present, values[i], 0)
+        self._angle(values, present, exact)
 
     def _is_constant(self, step: int) -> bool:
-        """Whether the value of a step is the same wherever it is there."""
-        name, of = operation_of(self.program.steps[step]), operands_of(self.program.steps[step])
-        values = of[:1] if name in ("where", "at_least") else of
-        return name == "constant" or (bool(of) and all(map(self._is_constant, values)))
+        """Return True if a step has the same value at all ticks at which it is not missing."""
+        name = operation_of(self.program.steps[step])
+        operands = operands_of(self.program.steps[step])
+        values = operands[:1] if name in ("where", "at_least") else operands
+        return name == "constant" or (bool(operands) and all(map(self._is_constant, values)))
 
     def _value(self, step: int) -> str:
-        """Return the value of a step: any of its range where it is missing."""
+        """Return the value of a step; any value of its range where it is missing."""
         if step not in self._values:
             name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
             self._values[step] = self._computed(step, name, plain)
         return self._values[step]
 
-    def _there(self, *steps: int) -> str:
-        """Return whether all of some steps are there."""
+    def _is_present(self, *steps: int) -> str:
+        """Return the node that is true where none of these steps is missing."""
         roots = dict.fromkeys(root for step in steps for root in self._roots[step])
-        first, *rest = [self._root(one) for one in roots] or [self.constant([[True]], np.bool_)]
-        for one in rest:
-            first = self.do("And", first, one)
-        return first
+        nodes = [self._is_root_present(root) for root in roots]
+        result = nodes[0] if nodes else self.constant([[True]], np.bool_)
+        for node in nodes[1:]:
+            result = self.do("And", result, node)
+        return result
 
-    def _root(self, step: int) -> str:
-        """Return whether a step is there by itself."""
+    def _is_root_present(self, step: int) -> str:
+        """Return the node that is false where a step is missing by itself."""
         if step not in self._present:
             name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
             if name in ("//", "nearest"):
                 self._present[step] = self.do("Greater", self._value(plain[1]), 0)
             elif name == "at_least":
-                both = (self._value(one) for one in plain)
-                self._present[step] = self.do("GreaterOrEqual", *both)
+                values = [self._value(operand) for operand in plain]
+                self._present[step] = self.do("GreaterOrEqual", *values)
             elif name == "else":
-                self._present[step] = self.do("Or", *(self._there(one) for one in plain))
+                conditions = [self._is_present(operand) for operand in plain]
+                self._present[step] = self.do("Or", *conditions)
             else:
                 self._value(step)
         return self._present[step]
@@ -224,84 +226,87 @@ class _Writer(Nodes):
         if name in ("constant", "where", "at_least"):
             return self.constant(plain[0]) if name == "constant" else self._value(plain[0])
         if name in GIVEN:
-            return self._taken(step, name, plain[0])
+            return self._input(step, name, plain[0])
         if name == "ago":
             length = self.program.rings[plain[0]]
-            past = self.part(self._ring(plain[0]), length - plain[1], length - plain[1] + 1)
-            there = self.do("Not", self.do("Equal", past, UNKNOWN))
-            return self._taken_where(step, there, past)
+            past = self.columns(self._ring(plain[0]), length - plain[1], length - plain[1] + 1)
+            present = self.do("Not", self.do("Equal", past, UNKNOWN))
+            return self._zero_where_missing(step, present, past)
         if name in ("sum", "values"):
-            return self._slide(*plain)[name == "values"]
-        values = [self._value(one) for one in plain]
+            return self._sum(*plain)[name == "values"]
+        values = [self._value(operand) for operand in plain]
         if name == "else":
-            return self.do("Where", self._there(plain[0]), *values)
+            return self.do("Where", self._is_present(plain[0]), *values)
         if name in ("//", "nearest") and self.program.ranges[plain[1]][0] <= 0:
             values[1] = self.do("Max", values[1], 1)
         return _OPERATIONS[name](self, *values)
 
-    def _taken(self, step: int, name: str, place: int) -> str:
-        """Write what is given, which is missing beyond its range: a signal is rounded to counts."""
-        given = self.part(self._given[name], place, place + 1)
+    def _input(self, step: int, name: str, place: int) -> str:
+        """Write an input, which is missing out of range. Signals are rounded to counts."""
+        value = self.columns(self._input_names[name], place, place + 1)
         kind: Any = np.int64
         if name == "signal":
             kind = self.dtype
             scale = self.constant(float(self.program.signals[place].scale), kind)
-            given = self.do("Round", self.do("Div", given, scale))
-        least, most = (self.constant(n, kind) for n in self.program.given[name][place])
-        inside = self.do("LessOrEqual", given, most)
-        inside = self.do("And", inside, self.do("GreaterOrEqual", given, least))
-        return self._taken_where(step, inside, given, kind)
+            value = self.do("Round", self.do("Div", value, scale))
+        low, high = (self.constant(n, kind) for n in self.program.input_ranges[name][place])
+        inside = self.do("LessOrEqual", value, high)
+        inside = self.do("And", inside, self.do("GreaterOrEqual", value, low))
+        return self._zero_where_missing(step, inside, value, kind)
 
-    def _taken_where(self, step: int, there: str, given: str, kind: Any = np.int64) -> str:
-        self._present[step] = there
-        safe = self.do("Where", there, given, self.constant(0, kind))
+    def _zero_where_missing(self, step: int, present: str, value: str, kind: Any = np.int64) -> str:
+        self._present[step] = present
+        safe = self.do("Where", present, value, self.constant(0, kind))
         return safe if kind is np.int64 else self.do("Cast", safe, to=TensorProto.INT64)
 
-    def _ring(self, of: int) -> str:
-        """Return a ring with the value of this tick behind it."""
-        if of not in self._rings:
-            ticks = self.program.rings[of]
-            ring = self.declare(f"ring_{of}", ticks)
-            kept = self.do("Where", self._there(of), self._value(of), UNKNOWN)
-            self._rings[of] = longer = self.do("Concat", ring, kept, axis=1)
-            ends = [self.constant([one]) for one in (1, ticks + 1, 1)]
-            self.do("Slice", longer, *ends, out=self.declare_next(f"ring_{of}", ticks))
-        return self._rings[of]
+    def _ring(self, source: int) -> str:
+        """Return a ring followed by the value of this tick."""
+        if source not in self._rings:
+            ticks = self.program.rings[source]
+            ring = self.declare(f"ring_{source}", ticks)
+            newest = self.do("Where", self._is_present(source), self._value(source), UNKNOWN)
+            self._rings[source] = longer = self.do("Concat", ring, newest, axis=1)
+            ends = [self.constant([i]) for i in (1, ticks + 1, 1)]
+            self.do("Slice", longer, *ends, out=self.declare_next(f"ring_{source}", ticks))
+        return self._rings[source]
 
-    def _slide(self, *window: int) -> tuple[str, str]:
-        """Return the sum and the number of the values of a window."""
-        if window not in self._slid:
-            of, ticks, most = window
-            self._slid[window] = self._last(of, ticks) if ticks else self._ever(of, most)
-        return self._slid[window]
+    def _sum(self, *window: int) -> tuple[str, str]:
+        """Return the sum of a window and its number of values."""
+        if window not in self._sums:
+            source, ticks, limit = window
+            self._sums[window] = (
+                self._window_sum(source, ticks) if ticks else self._total(source, limit)
+            )
+        return self._sums[window]
 
-    def _ever(self, of: int, most: int) -> tuple[str, str]:
-        total, count = (self.declare(f"{one}_{of}_of_{most}", 1) for one in ("sum", "values"))
-        takes = self.do("And", self._there(of), self.do("Less", count, most))
-        more = self.do("Where", takes, self._value(of), 0)
-        one_more = self.do("Cast", takes, to=TensorProto.INT64)
+    def _total(self, source: int, limit: int) -> tuple[str, str]:
+        total, count = (
+            self.declare(f"{name}_{source}_of_{limit}", 1) for name in ("sum", "values")
+        )
+        adds = self.do("And", self._is_present(source), self.do("Less", count, limit))
+        value = self.do("Where", adds, self._value(source), 0)
+        increment = self.do("Cast", adds, to=TensorProto.INT64)
         return (
-            self.do("Add", total, more, out=self.declare_next(total, 1)),
-            self.do("Add", count, one_more, out=self.declare_next(count, 1)),
+            self.do("Add", total, value, out=self.declare_next(total, 1)),
+            self.do("Add", count, increment, out=self.declare_next(count, 1)),
         )
 
-    def _last(self, of: int, ticks: int) -> tuple[str, str]:
-        length = self.program.rings[of] + 1
-        values = self.part(self._ring(of), length - ticks, length)
-        there = self.do("Not", self.do("Equal", values, UNKNOWN))
+    def _window_sum(self, source: int, ticks: int) -> tuple[str, str]:
+        length = self.program.rings[source] + 1
+        values = self.columns(self._ring(source), length - ticks, length)
+        present = self.do("Not", self.do("Equal", values, UNKNOWN))
         axis = self.constant([1])
-        total = self.do("ReduceSum", self.do("Where", there, values, 0), axis, keepdims=1)
-        counted = self.do("Cast", there, to=TensorProto.INT64)
-        return total, self.do("ReduceSum", counted, axis, keepdims=1)
+        total = self.do("ReduceSum", self.do("Where", present, values, 0), axis, keepdims=1)
+        count = self.do("Cast", present, to=TensorProto.INT64)
+        return total, self.do("ReduceSum", count, axis, keepdims=1)
 
-    def _angle(self, terms: Sequence[str], there: str, exact: Sequence[Fraction]) -> None:
-        intercept, *coefficients = (float(one) for one in exact)
+    def _angle(self, terms: Sequence[str], present: str, exact: Sequence[Fraction]) -> None:
+        intercept, *coefficients = (float(value) for value in exact)
         counts = self.do("Concat", *terms, axis=1)
-        weights = self.constant([[one] for one in coefficients], self.dtype)
+        weights = self.constant([[coefficient] for coefficient in coefficients], self.dtype)
         total = self.do("MatMul", self.do("Cast", counts, to=self.kind), weights)
         total = self.do("Add", total, self.constant(intercept, self.dtype))
-        nothing = self.constant(np.nan, self.dtype)
-        self.do("Where", there, total, nothing, out="angle")
+        self.do("Where", present, total, self.constant(np.nan, self.dtype), out="angle")
         self.outputs.insert(0, helper.make_tensor_value_info("angle", self.kind, ["cars", 1]))
 
 
@@ -309,12 +314,12 @@ def _sign(graph: Nodes, a: str) -> str:
     return graph.signed(a, graph.do("Min", graph.do("Abs", a), 1))
 
 
-def _power(graph: Nodes, a: str, most: str) -> str:
-    """Return one more than the sum of the powers of two times which `most` is below a value."""
+def _power(graph: Nodes, a: str, b: str) -> str:
+    """Return 1 plus the sum of all powers of two p with b · p < a: the least p with a ≤ b · p."""
     powers = graph.constant([[1 << bit for bit in range(POWERS)]])
-    below = graph.do("Greater", a, graph.do("Mul", most, powers))
-    some = graph.do("Mul", graph.do("Cast", below, to=TensorProto.INT64), powers)
-    return graph.do("Add", graph.do("ReduceSum", some, graph.constant([1]), keepdims=1), 1)
+    below = graph.do("Greater", a, graph.do("Mul", b, powers))
+    terms = graph.do("Mul", graph.do("Cast", below, to=TensorProto.INT64), powers)
+    return graph.do("Add", graph.do("ReduceSum", terms, graph.constant([1]), keepdims=1), 1)
 
 
 def _node(name: str) -> Callable[..., str]:
@@ -335,7 +340,7 @@ _OPERATIONS: Mapping[str, Callable[..., str]] = {
     "nearest": lambda graph, a, b: graph.nearest(a, b),
     "clip": lambda graph, a, b: graph.do("Max", graph.do("Min", a, b), graph.do("Neg", b)),
 }
-"""What computes an operation of the values that it works on.
+"""Nodes of operations on values.
 
-No `Min` and `Max` of two vectors of int64, of which onnxruntime 1.31 compares the lower 32 bits.
+`Min` and `Max` of onnxruntime 1.31 compare the lower 32 bits of two vectors of int64 only.
 """

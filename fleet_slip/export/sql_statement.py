@@ -1,6 +1,6 @@
-"""A program as one SELECT over rows in SI units, in plain SQL that several engines take as it is.
+"""A program as one SELECT over rows in SI units, in SQL of DuckDB, SQLite and PostgreSQL.
 
-DuckDB, SQLite and PostgreSQL do. What is used more than once is a column of a layer of its own.
+Values that are used more than once are columns of a layer of their own.
 """
 
 from fleet_slip.catalog.signals import COUNT_MAX
@@ -10,57 +10,55 @@ from fleet_slip.export.templating import fill_in_version
 from fleet_slip.models.registry import ModelVersion
 
 ROWS = "log"
-"""The table or view that the plain statement reads: `drive_id`, `tick`, and columns in SI units."""
+"""Table or view of the plain statement: `drive_id`, `tick`, and columns in SI units."""
 
 
 def sql_statement(
     version: ModelVersion, program: Program, rows: str = ROWS, macro: str = ""
 ) -> str:
-    """Return the statement, which gives `drive_id`, `tick`, `angle` in counts, and it in SI units.
+    """Return the statement with the columns `drive_id`, `tick`, `angle` in counts and in SI units.
 
-    `angle` is null where there is none. Rows are the ticks of drives, in any order.
+    `angle` is null if there is none. Rows are the ticks of drives, in any order.
     """
-    layers = [*_given(program), *_layers(program)]
+    layers = [*_input_layers(program), *_layers(program)]
     words = {"layers": layers, "rounded": _rounded(program), "rows": rows, "macro": macro}
     return fill_in_version("templates/statement.sql", version, program, **words)
 
 
 def sql_macro(version: ModelVersion, program: Program) -> str:
-    """Return the statement as a macro of DuckDB, which takes the name of a table."""
+    """Return the statement as a macro of DuckDB with the name of a table as argument."""
     name = f"{program.angle.name}_{version.manifest.name}"
     return sql_statement(version, program, "query_table(source)", name)
 
 
-def _given(program: Program) -> list[list[str]]:
-    """Return layers that round what is given to counts, signals half to even; beyond is null."""
+def _input_layers(program: Program) -> list[list[str]]:
+    """Return layers that round inputs to counts, signals half to even; null is out of range."""
     counts, rounded, valid = [], [], []
-    for place, one in enumerate(program.signals):
+    for place, signal in enumerate(program.signals):
         ratio = f"ratio_{place}"
-        counts.append(f"{one.column} / {one.scale:f} AS {ratio}")
+        counts.append(f"{signal.column} / {signal.scale:f} AS {ratio}")
         half = f"CASE WHEN ABS({ratio} - ROUND({ratio})) = 0.5 THEN 2 * ROUND({ratio} / 2)"
         rounded.append(f"{half} ELSE ROUND({ratio}) END AS rounded_{place}")
-        ends = (one.min_count, one.max_count)
+        ends = (signal.min_count, signal.max_count)
         valid.append(f"{_within(f'rounded_{place}', *ends)} AS signal_{place}")
     for place, number in enumerate(program.numbers):
-        counts.append(f"ROUND({number.name} / {number.grain:f}) AS told_{place}")
-        valid.append(f"{_within(f'told_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
+        counts.append(f"ROUND({number.name} / {number.grain:f}) AS ratio_number_{place}")
+        valid.append(f"{_within(f'ratio_number_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
     facts = [f"{attribute_sql(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
     return [[*counts, *facts], rounded, valid]
 
 
-def _within(value: str, least: int, most: int) -> str:
-    return f"CASE WHEN {value} BETWEEN {least} AND {most} THEN CAST({value} AS BIGINT) END"
+def _within(value: str, low: int, high: int) -> str:
+    return f"CASE WHEN {value} BETWEEN {low} AND {high} THEN CAST({value} AS BIGINT) END"
 
 
 def _layers(program: Program) -> list[list[str]]:
-    """Return the columns of each layer; the last has the parts of the angle."""
-    found = SqlLayers(
-        program.steps, program.ranges, PLAIN_SQL, lambda name, place: f"{name}_{place}"
-    )
-    terms = [found.text(step) for step, _ in program.angle.terms]
+    """Return the columns of each layer; the last layer has the parts of the angle."""
+    sql = SqlLayers(program.steps, program.ranges, PLAIN_SQL, lambda name, place: f"{name}_{place}")
+    terms = [sql.text(step) for step, _ in program.angle.terms]
     last = max(layer for _, layer in terms)
-    found.layers[last + 1] += _parts(program, [text for text, _ in terms])
-    return [found.layers[number] for number in sorted(found.layers)]
+    sql.layers[last + 1] += _parts(program, [text for text, _ in terms])
+    return [sql.layers[number] for number in sorted(sql.layers)]
 
 
 def _parts(program: Program, terms: list[str]) -> list[str]:
@@ -68,9 +66,9 @@ def _parts(program: Program, terms: list[str]) -> list[str]:
     (high, low), *parts = program.angle.parts
     return [
         f"{first} + "
-        + " + ".join(f"({part[which]}) * {t}" for part, t in zip(parts, terms, strict=True))
+        + " + ".join(f"({part[i]}) * {t}" for part, t in zip(parts, terms, strict=True))
         + f" AS {name}"
-        for name, first, which in (("high", high, 0), ("low", low, 1))
+        for i, (name, first) in enumerate((("high", high), ("low", low)))
     ]
 
 
@@ -82,7 +80,7 @@ def _rounded(program: Program) -> str:
 
 
 def _floor(value: str, bits: int) -> str:
-    """Return SQL of a value over 2^bits, rounded down: its remainder is brought above zero."""
+    """Return SQL of a value over 2^bits, rounded down, by its non-negative remainder."""
     size = 2**bits
     remainder = f"(({value} % {size} + {size}) % {size})"
     return f"CAST(ROUND(({value} - {remainder}) / {size}) AS BIGINT)"

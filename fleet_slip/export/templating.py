@@ -1,6 +1,6 @@
-"""The files of an export are templates that are filled in with a version and its program.
+"""Templates of exported files, and names and numbers of a program as C has them.
 
-A template has `${expressions}`, and after `//%` a statement on a line of its own (Jinja).
+A template has `${expressions}`, and statements of Jinja after `//%` on a line of their own.
 """
 
 import re
@@ -19,72 +19,70 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 
-# Names and numbers of a program as C has them.
-
-LARGEST_32 = 2**31 - 1
+MAX_32 = 2**31 - 1
 
 INDENT = "    "
 
-LONGEST_PREFIX = 24
-"""C99 tells external names apart by 31 characters, and so does rule 5.1 of MISRA C:2012. After the
-prefix `_gram_` and one more do."""
+MAX_PREFIX_CHARACTERS = 24
+"""External names differ in their first 31 characters (C99; MISRA C:2012, rule 5.1), which are the
+prefix, `_gram_` and one more."""
 
 
 def file_prefix(version: ModelVersion) -> str:
-    """Return what the names of the files of a version begin with, but for those in C."""
+    """Return the prefix of the names of a version's files, except for those in C."""
     return f"{version.manifest.label.signal}_{version.manifest.name}"
 
 
 def c_prefix(version: ModelVersion) -> str:
-    """Return what all names in C and of its files begin with: shortened, with a hash, if long."""
+    """Return the prefix of all names in C; a long one is shortened and gets a hash."""
     prefix = file_prefix(version)
-    if len(prefix) <= LONGEST_PREFIX:
+    if len(prefix) <= MAX_PREFIX_CHARACTERS:
         return prefix
-    return f"{prefix[: LONGEST_PREFIX - 7]}_{sha256_of(prefix)[:6]}"
+    return f"{prefix[: MAX_PREFIX_CHARACTERS - 7]}_{sha256_of(prefix)[:6]}"
 
 
 def field_names(program: Steps) -> dict[str, tuple[str, ...]]:
-    """Return the fields of a sample and of a car, none of which is a keyword of C."""
+    """Return the fields of a sample and of a car; none is a keyword of C."""
     return {
-        "signals": tuple(f"{one.name}_count" for one in program.signals),
-        "facts": different([f"fact_{one.field}" for one in program.facts]),
-        "numbers": tuple(f"{one.name}_count" for one in program.numbers),
+        "signals": tuple(f"{signal.name}_count" for signal in program.signals),
+        "facts": distinct([f"fact_{fact.field}" for fact in program.facts]),
+        "numbers": tuple(f"{number.name}_count" for number in program.numbers),
     }
 
 
-def different(names: Sequence[str], longest: int | None = None) -> tuple[str, ...]:
-    """Return names of which none stands twice; none is longer than that, if it is given."""
-    found: list[str] = []
+def distinct(names: Sequence[str], max_length: int | None = None) -> tuple[str, ...]:
+    """Number repeated names, so that all are distinct; none is longer than `max_length`."""
+    unique: list[str] = []
     for name in names:
-        number, one = 1, name[:longest]
-        while one in found:
-            number += 1
-            end = f"_{number}"
-            one = name[: longest - len(end)] + end if longest else name + end
-        found.append(one)
-    return tuple(found)
+        count, candidate = 1, name[:max_length]
+        while candidate in unique:
+            count += 1
+            end = f"_{count}"
+            candidate = name[: max_length - len(end)] + end if max_length else name + end
+        unique.append(candidate)
+    return tuple(unique)
 
 
 def integer_type(largest: int) -> str:
-    """Return the type of a word that holds a size and more than one missing value beside it."""
-    return "int32_t" if largest <= LARGEST_32 else "int64_t"
+    """Return the type of a word that holds a size, and values beyond it for missing ones."""
+    return "int32_t" if largest <= MAX_32 else "int64_t"
 
 
 def literal(value: int) -> str:
-    """Return a constant, in parentheses if it is negative."""
-    text = str(value) if abs(value) <= LARGEST_32 else f"INT64_C({abs(value)})"
+    """Return a constant in C, in parentheses if it is negative."""
+    text = str(value) if abs(value) <= MAX_32 else f"INT64_C({abs(value)})"
     if value >= 0:
         return text
-    return f"({value})" if abs(value) <= LARGEST_32 else f"(-{text})"
+    return f"({value})" if abs(value) <= MAX_32 else f"(-{text})"
 
 
 def plain_text(text: str) -> str:
-    """Return a text that may stand in a string and in a comment: it may come from anywhere."""
+    """Replace all characters of a text that are not safe in a string or a comment."""
     return re.sub(r"[^A-Za-z0-9 @_.:,^-]", "_", text)
 
 
 def plain_unit(unit: str) -> str:
-    """Return a unit as it may stand in a comment."""
+    """Return a unit for a comment."""
     return plain_text(unit.replace("/", " per ").replace("*", " "))
 
 
@@ -92,17 +90,17 @@ AXES = "x forward, y left, z up; angles and yaw rate are positive to the left (I
 
 
 def read_source(name: str) -> str:
-    """Return a file of this folder as it is."""
+    """Read a file of this folder."""
     return (files("fleet_slip.export") / name).read_text("utf-8")
 
 
 def fill_template(name: str, **words: Any) -> str:
-    """Return a template of this folder with its words."""
+    """Fill a template of this folder in."""
     return _environment().get_template(name).render(words)
 
 
-def fill_in_version(name: str, version: ModelVersion, program: Program, **more: Any) -> str:
-    """Return a template with a version, its program and `more` words."""
+def fill_in_version(name: str, version: ModelVersion, program: Program, **words: Any) -> str:
+    """Fill a template in with a version, its program and `words`."""
     prefix, angle = c_prefix(version), program.angle
     return fill_template(
         name,
@@ -110,14 +108,14 @@ def fill_in_version(name: str, version: ModelVersion, program: Program, **more: 
         trained=version.manifest.trained_on,
         program=program,
         angle=angle,
-        most_angle=min(angle.largest, angle.limit) * angle.scale,
+        max_angle=min(angle.largest, angle.limit) * angle.scale,
         prefix=prefix,
         upper=prefix.upper(),
         fields=field_names(program),
-        knows=bool(program.facts or program.numbers),
+        has_car=bool(program.facts or program.numbers),
         axes=AXES,
         tick_s=float(SAMPLE_TIME_S),
-        **more,
+        **words,
     )
 
 
@@ -136,7 +134,7 @@ def _environment() -> "Environment":
     environment.globals["zip"] = zip
     environment.filters |= {
         "decimal": lambda value: f"{value:f}",
-        "given": lambda value, missing: missing if value is None else value,
+        "or_missing": lambda value, missing: missing if value is None else value,
         "literal": literal,
         "plain": plain_text,
         "quoted": quoteattr,

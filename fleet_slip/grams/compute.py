@@ -1,5 +1,6 @@
-"""Computes the Gram rows of log files: plain sets by `jobs/gram.sql`, windows by the kernel."""
+"""Gram rows of log files: plain feature sets by `jobs/gram.sql`, windows by the compiled kernel."""
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
@@ -35,29 +36,29 @@ from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# The rows of drives, one drive at a time in the order of time: from log files, or from a query.
+# Rows of drives, one drive at a time in the order of time, from log files or a query.
 
 
 def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[DriveCounts]:
-    """Yield a log file's drives in the order of time, their metadata as facts.
+    """Yield the drives of a log file, with their metadata as facts and rows in the order of time.
 
-    As in SQL, none without a row of tick 0.
+    As in SQL, a drive without a row of tick 0 is skipped.
     """
     drive_columns = tuple(warehouse.catalog.signals.drive)
     present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
-    wanted = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
-    rows = warehouse.logs.read(file.path, wanted)
-    for one in rows_by_drive(rows):
-        ticks = one["tick"].to_numpy()
+    columns = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
+    for drive in rows_by_drive(warehouse.logs.read(file.path, columns)):
+        ticks = drive["tick"].to_numpy()
         if (ticks[1:] < ticks[:-1]).any():
             order = np.argsort(ticks, kind="stable")
-            one, ticks = one.take(order), ticks[order]  # noqa: PLW2901
-        at = int(np.searchsorted(ticks, 0))
-        if at < len(ticks) and ticks[at] == 0:
+            drive, ticks = drive.take(order), ticks[order]  # noqa: PLW2901
+        start = int(np.searchsorted(ticks, 0))
+        if start < len(ticks) and ticks[start] == 0:
             metadata = {
-                name: one[name][at].as_py() if name in wanted else None for name in drive_columns
+                name: drive[name][start].as_py() if name in columns else None
+                for name in drive_columns
             }
-            yield counts_of(one, plan, metadata)
+            yield counts_of(drive, plan, metadata)
 
 
 def counts_of(
@@ -66,9 +67,9 @@ def counts_of(
     facts: Mapping[str, Any] | None = None,
     numbers: Mapping[str, int] | None = None,
 ) -> DriveCounts:
-    """Return a drive's rows, in the order of time, as what a plan is computed from.
+    """Return the rows of a drive in the order of time as the input of a column plan.
 
-    Facts are by default the first row's; `numbers` are what the car's drives determined.
+    `facts` default to those of the first row; `numbers` are the calibration parameters of the car.
     """
     counts, present = {}, {}
     for name in plan.signals:
@@ -81,21 +82,22 @@ def counts_of(
             present[name] = column.is_valid().to_numpy(zero_copy_only=False)
             column = column.fill_null(0)
         counts[name] = column.to_numpy()
-    known = facts if facts is not None else {name: rows[name][0].as_py() for name in plan.facts}
-    return DriveCounts(rows["tick"].to_numpy(), counts, present, known, numbers or {})
+    if facts is None:
+        facts = {name: rows[name][0].as_py() for name in plan.facts}
+    return DriveCounts(rows["tick"].to_numpy(), counts, present, facts, numbers or {})
 
 
 def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
     """Yield the rows of each drive from batches that are sorted by drive."""
-    waiting: list[pa.Table] = []
+    segments: list[pa.Table] = []
     for batch in batches:
-        for part in rows_by_drive(pa.Table.from_batches([batch])):
-            if waiting and waiting[0]["drive_id"][0] != part["drive_id"][0]:
-                yield pa.concat_tables(waiting)
-                waiting = []
-            waiting.append(part)
-    if waiting:
-        yield pa.concat_tables(waiting)
+        for segment in rows_by_drive(pa.Table.from_batches([batch])):
+            if segments and segments[0]["drive_id"][0] != segment["drive_id"][0]:
+                yield pa.concat_tables(segments)
+                segments = []
+            segments.append(segment)
+    if segments:
+        yield pa.concat_tables(segments)
 
 
 def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
@@ -115,45 +117,45 @@ def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
 
 @dataclass(frozen=True)
 class DriveBlocks:
-    """How the rows of a drive are divided: by blocks of time, or by what they change over.
+    """Division of the rows of a drive into blocks of time, or one block per duration of changes.
 
-    Of several `times` that columns change over, each has all rows.
+    With several durations each block contains all rows.
     """
 
     block_ticks: int | None = None
-    times: tuple[str, ...] = ()
+    durations: tuple[str, ...] = ()
 
     @classmethod
-    def of_set(cls, one: FeatureSet) -> "DriveBlocks":
-        """Return what divides the rows of a feature set."""
-        times = tuple(f"{time_s:f} s" for time_s in one.change_s)
-        return cls(one.block_ticks, times if len(times) > 1 else ())
+    def of_set(cls, feature_set: FeatureSet) -> "DriveBlocks":
+        """Return the division of the drives of a feature set."""
+        durations = tuple(f"{time_s:f} s" for time_s in feature_set.change_s)
+        return cls(feature_set.block_ticks, durations if len(durations) > 1 else ())
 
     def numbers(self, ticks: NDArray[Any]) -> IntArray:
-        """Return the block of each row, shape (rows,); 0 where there are none."""
+        """Return the block number of each row, shape (rows,); 0 without blocks of time."""
         if not self.block_ticks:
             return np.zeros(len(ticks), dtype=np.int64)
         return ticks.astype(np.int64) // self.block_ticks
 
     def name(self, number: int) -> str | None:
-        """Return the name of a part, which sorts as numbers do; None where there is one."""
+        """Return the name of a block; names sort as numbers do; None for an undivided drive."""
         if self.block_ticks:
             return f"block {number + 1:04}"
-        return self.times[number] if self.times else None
+        return self.durations[number] if self.durations else None
 
 
-# Fills in `jobs/gram.sql` for a feature set.
+# Statement of a feature set from `jobs/gram.sql`.
 
 LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_partitioning => false)"
 
 _SEPARATOR = ",\n            "
 
 BITS = 63
-"""Bits of a BIGINT that are no sign."""
+"""Bits of a BIGINT without the sign."""
 
 MAX_SUMS = 8_000
-"""Sums of a grouping: DuckDB 2.0.0 ends with SIGFPE where those of a group, 24 bytes each, are
-longer than its block of 262,144 bytes."""
+"""Maximum number of sums in a grouping. DuckDB 2.0.0 ends with SIGFPE if the sums of a group, 24
+bytes each, exceed its block of 262,144 bytes."""
 
 
 def has_statement(catalog: Catalog, feature_set: str) -> bool:
@@ -166,12 +168,17 @@ def has_statement(catalog: Catalog, feature_set: str) -> bool:
 
 
 def gram_statement(
-    catalog: Catalog, feature_set: str = PLAIN, *, whole: bool = False, absent: Sequence[str] = ()
+    catalog: Catalog,
+    feature_set: str = PLAIN,
+    *,
+    complete: bool = False,
+    absent: Sequence[str] = (),
 ) -> str:
     """Return the statement that computes the Gram rows of a feature set.
 
-    `whole`: no file has a column in only some rows; `absent` are later columns, which none has.
-    Raises `QuestionError` for an unknown set, and for one that the kernel alone computes.
+    `complete` states that each column is in all rows of a file or in none; `absent` are newer
+    columns that no file contains. Raises `QuestionError` for an unknown feature set, and for one
+    that only the kernel computes.
     """
     signals = catalog.signals
     resolved = catalog.feature_set(feature_set)
@@ -197,44 +204,45 @@ def gram_statement(
             signals.null_sql(name) if name in absent else name for name in signals.drive
         ),
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
-        absent="0" if whole else _absent(names),
+        absent="0" if complete else _absent_mask(names),
         clipped="sum(clipped)::BIGINT" if used or windows else "0",
         sums=_SEPARATOR.join(sums),
         products=_SEPARATOR.join(products),
         counts=rows,
-        # No constant, lest DuckDB hash a dictionary row by row.
-        group="drive_id" if whole else "drive_id, absent",
+        # Not grouped by a constant: DuckDB would hash a dictionary row by row.
+        group="drive_id" if complete else "drive_id, absent",
         names=", ".join(f"'{name}'" for name in names),
     )
 
 
-def _absent(names: Sequence[str]) -> str:
-    """Return SQL of a number with a bit for each column that a row lacks; of many, a list."""
+def _absent_mask(names: Sequence[str]) -> str:
+    """Return SQL of a bit mask of the columns that a row lacks; a list of masks for many."""
     if len(names) < BITS:
         kind = "INTEGER" if len(names) < 32 else "BIGINT"
         return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
-    parts = [_absent(names[first : first + BITS - 1]) for first in range(0, len(names), BITS - 1)]
-    # The last columns come first, so that lists sort as the one large number would.
-    return f"[{', '.join(f'({part})::BIGINT' for part in reversed(parts))}]"
+    step = BITS - 1
+    masks = [_absent_mask(names[start : start + step]) for start in range(0, len(names), step)]
+    # The last columns come first, so that lists sort as a single large number would.
+    return f"[{', '.join(f'({mask})::BIGINT' for mask in reversed(masks))}]"
 
 
 FILES_PER_QUERY = 16
-"""Planning 77 aggregates costs 20 ms, so that one query takes many files."""
+"""A query reads several files, since planning 77 aggregates takes 20 ms."""
 
-Late = Mapping[str, int] | None
-"""By how many parts of a tick the course of each car is late; in time where it says nothing."""
+CourseDelays = Mapping[str, int] | None
+"""Delay of the course of each car in parts of a tick; 0 for other cars."""
 
 
 def aggregate(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str = PLAIN,
-    late: Late = None,
+    delays: CourseDelays = None,
 ) -> pa.Table:
     """Return the Gram rows of log files, in the schema of `grams`, sorted by file and drive."""
     in_time = warehouse.catalog.feature_set(feature_set).in_time
     empty = warehouse.computed_schema(in_time=in_time).empty_table()
-    rows = compute_grams(warehouse, files, no_progress, feature_set, late=late)
+    rows = compute_grams(warehouse, files, no_progress, feature_set, delays=delays)
     return pa.concat_tables([empty, *rows])
 
 
@@ -244,12 +252,11 @@ def compute_grams(
     progress: Progress = no_progress,
     feature_set: str = PLAIN,
     executor: Executor | None = None,
-    late: Late = None,
+    delays: CourseDelays = None,
 ) -> Iterator[pa.Table]:
-    """Yield the Gram rows of log files, one file after the other, in the schema of `grams`.
+    """Yield the Gram rows of log files in the order of the files, in the schema of `grams`.
 
-    `late` is the delay of each car's course in parts of a tick. The work is done here, on all
-    cores, or by an executor as tasks of some files and one thread each.
+    Runs on all cores of this process, or in an executor as tasks of several files and one thread.
     """
     if not files:
         return
@@ -263,34 +270,32 @@ def compute_grams(
                 progress(sum(file.rows for file in group), total)
         return
     with nullcontext(executor) if executor else LocalThreads(cpu_count() or 1) as workers:
-        many = 1 if wide else ceil(len(files) / in_flight(workers))
-        groups = _groups(files, min(FILES_PER_QUERY, max(1, many)))
-        way = partial(wide_grams, late=late) if wide else partial(by_sql, threads=1)
-        task = partial(way, warehouse, feature_set=feature_set)
-        yield from _by_tasks(workers, task, groups, progress)
+        size = 1 if wide else ceil(len(files) / in_flight(workers))
+        groups = _groups(files, min(FILES_PER_QUERY, max(1, size)))
+        compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=1)
+        task = partial(compute, warehouse, feature_set=feature_set)
+        yield from _run_in_order(workers, task, groups, progress)
 
 
-def _by_tasks(
+def _run_in_order(
     executor: Executor,
     task: Callable[[Sequence[TableFile]], pa.Table],
     groups: list[Sequence[TableFile]],
     progress: Progress,
 ) -> Iterator[pa.Table]:
-    """Yield the results of tasks in the order of their files; those that are early wait."""
+    """Yield the results of tasks in the order of their files."""
     total = sum(file.rows for group in groups for file in group)
 
     def name_of(group: Sequence[TableFile]) -> str:
         return f"the Gram rows of {pluralize(len(group), 'log file')} from {group[0].path}"
 
-    done: dict[str, pa.Table] = {}
-    following = iter(groups)
-    awaited = next(following, None)
+    early: dict[str, pa.Table] = {}
+    pending = deque(group[0].path for group in groups)
     for group, rows in run_tasks(executor, task, groups, name_of):
-        done[group[0].path] = rows
+        early[group[0].path] = rows
         progress(sum(file.rows for file in group), total)
-        while awaited is not None and awaited[0].path in done:
-            yield done.pop(awaited[0].path)
-            awaited = next(following, None)
+        while pending and pending[0] in early:
+            yield early.pop(pending.popleft())
 
 
 def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
@@ -316,17 +321,17 @@ def _query(
 ) -> pa.Table:
     catalog = warehouse.catalog
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
-    # Whether each signal is in all rows of a file or in none, by the Delta log's statistics.
-    whole = feature_set == PLAIN and all(
+    # By the statistics of the Delta log each signal is in all rows of a file or in none.
+    complete = feature_set == PLAIN and all(
         file.null_counts.get(signal, file.rows) in (0, file.rows)
         for file in files
         for signal in catalog.signals.gram_signals
     )
     absent = absent_columns(files, catalog.signals.stored_columns)
-    statement = gram_statement(catalog, feature_set, whole=whole, absent=absent)
+    statement = gram_statement(catalog, feature_set, complete=complete, absent=absent)
     identity = catalog.identity(feature_set)
-    doing = f"the Gram query over {pluralize(len(files), 'log file')} in {warehouse.logs.folder}"
-    with reading_files(database, doing):
+    activity = f"the Gram query over {pluralize(len(files), 'log file')} in {warehouse.logs.folder}"
+    with reading_files(database, activity):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
         rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
@@ -335,10 +340,10 @@ def _query(
     )
 
 
-# Gram rows of any feature set, from the columns of log files: what SQL says, faster.
+# Gram rows of any feature set by the kernel: equal to those by SQL, faster.
 #
-# Drives are gone through once, in time. Columns are integers below 2^19 in binary64, whose products
-# and block sums stay below 2^53: exact in any order. Sums of blocks have 64 bits.
+# Each drive is read once, in the order of time. Columns are integers below 2^19 in binary64. Their
+# products and sums over blocks stay below 2^53, and so are exact in any order. Totals have 64 bits.
 
 _INT64 = 2**63
 
@@ -347,12 +352,12 @@ def wide_grams(
     warehouse: Warehouse,
     files: Sequence[TableFile],
     feature_set: str,
-    late: Mapping[str, int] | None = None,
+    delays: CourseDelays = None,
 ) -> pa.Table:
     """Return the Gram rows of log files for a feature set, sorted as by `jobs/gram.sql`.
 
-    `late` is the course's delay of cars, in parts of a tick. Raises `DataError` for a drive that
-    cannot be looked back on, `StorageError` for sums of more than 64 bits.
+    Raises `DataError` for a drive whose ticks windows cannot use, and `StorageError` for sums of
+    more than 64 bits.
     """
     catalog = warehouse.catalog
     resolved, model = catalog.feature_set(feature_set), catalog.first_stage_model(feature_set)
@@ -363,7 +368,7 @@ def wide_grams(
     identity = catalog.identity(feature_set)
     schema = warehouse.computed_schema(in_time=resolved.in_time)
     rows: list[dict[str, Any]] = []
-    # Files are shared out among threads; a BLAS with threads of its own would be in their way.
+    # Files run in parallel; further threads of the BLAS would compete with them.
     with threadpool_limits(1, user_api="blas"):
         for file in sorted(files, key=lambda file: file.path):
             drives = read_drives(warehouse, file, plan)
@@ -371,7 +376,7 @@ def wide_grams(
                 fold = model.fold_of(str(drive.facts["drive_id"])) if model else None
                 if fold not in workspaces:
                     workspaces[fold] = Workspace(ColumnPlan.of_set(catalog, feature_set, fold))
-                delay = (late or {}).get(drive.facts["vehicle_id"])
+                delay = (delays or {}).get(drive.facts["vehicle_id"])
                 metadata = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
                 metadata |= {"file": file.path, "day": file.day}
                 rows += _rows_of_drive(catalog.signals, workspaces[fold], resolved, drive, metadata)
@@ -385,31 +390,31 @@ def _rows_of_drive(
     drive: DriveCounts,
     metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
-    parts = DriveBlocks.of_set(feature_set)
+    blocks = DriveBlocks.of_set(feature_set)
     try:
         if feature_set.change_ticks:
-            late = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
-            sums = change_sums(signals, workspace, drive, feature_set.change_ticks, late)
+            delay = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
+            sums = change_sums(signals, workspace, drive, feature_set.change_ticks, delay)
         else:
-            sums = drive_sums(workspace, parts, drive)
+            sums = drive_sums(workspace, blocks, drive)
     except DataError as error:
         raise DataError(f"{metadata['file']}: drive {metadata['drive_id']}: {error}") from None
-    return gram_rows(sums, feature_set.columns, parts, metadata)
+    return gram_rows(sums, feature_set.columns, blocks, metadata)
 
 
 def gram_rows(
-    found: "Mapping[Kind, BlockSums]",
+    sums_by_pattern: "Mapping[Pattern, BlockSums]",
     columns: Sequence[str],
-    parts: DriveBlocks,
-    known: Mapping[str, Any],
+    blocks: DriveBlocks,
+    metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
-    """Yield the Gram rows of a drive's sums with what is known of it, sorted as by SQL."""
-    for absent, part in sorted(found):
-        sums = found[absent, part]
+    """Yield the Gram rows of the sums of a drive with its metadata, sorted as by SQL."""
+    for absent, block in sorted(sums_by_pattern):
+        sums = sums_by_pattern[absent, block]
         names = [name for i, name in enumerate(columns) if not absent >> i & 1]
         yield {
-            **known,
-            "part": parts.name(part),
+            **metadata,
+            "part": blocks.name(block),
             "signals": ",".join(names),
             "n": sums.n,
             "clipped": sums.clipped,
@@ -420,7 +425,7 @@ def gram_rows(
 
 @dataclass
 class BlockSums:
-    """Sums of the rows of a drive, or of a part of it, that have the same columns."""
+    """Sums over the rows of a drive, or of a block of it, that have the same columns."""
 
     size: int
     n: int = 0
@@ -432,51 +437,50 @@ class BlockSums:
         self.sums = np.zeros(self.size, dtype=np.int64)
         self.products = np.zeros((self.size, self.size), dtype=np.int64)
 
-    def add(self, block: FloatArray, clipped: FloatArray) -> None:
-        """Add complete rows, shape (columns, rows), and what was clipped in each.
+    def add(self, values: FloatArray, clipped: FloatArray) -> None:
+        """Add complete rows, shape (columns, rows), and the number of clipped values of each.
 
-        At most `BLOCK_ROWS`: then all sums are exact. Columns of zeros, as those of a gate that is
-        shut, are passed over.
+        Sums of at most `BLOCK_ROWS` rows are exact. Columns of zeros, such as those of a closed
+        gate, are skipped.
         """
-        self.n += block.shape[1]
+        self.n += values.shape[1]
         self.clipped += int(clipped.sum())
-        self.sums += block.sum(axis=1).astype(np.int64)
-        some = block.any(axis=1)
-        block = block if some.all() else block[some]
-        self.products[np.ix_(some, some)] += (block @ block.T).astype(np.int64)
+        self.sums += values.sum(axis=1).astype(np.int64)
+        nonzero = values.any(axis=1)
+        values = values if nonzero.all() else values[nonzero]
+        self.products[np.ix_(nonzero, nonzero)] += (values @ values.T).astype(np.int64)
 
 
-Kind = tuple[int, int]
-"""Which columns rows lack, a number of one bit each, and which part of the drive they are."""
+Pattern = tuple[int, int]
+"""Bit mask of the columns that rows lack, and number of the block of the drive."""
 
 
 def drive_sums(
-    workspace: Workspace, parts: DriveBlocks, counts: DriveCounts
-) -> dict[Kind, BlockSums]:
-    """Return the sums of a drive's rows, by columns missing and part; raises as `wide_grams`."""
-    plan, total = workspace.plan, len(counts.ticks)
-    _require_64_bits(total, max(plan.limits))
-    found: dict[Kind, BlockSums] = {}
-    for rows, block, clipped in workspace.blocks(counts):
-        _add_by_kind(found, block, clipped, parts.numbers(counts.ticks[rows]))
-    return found
+    workspace: Workspace, blocks: DriveBlocks, counts: DriveCounts
+) -> dict[Pattern, BlockSums]:
+    """Return the sums of the rows of a drive by pattern; raises as `wide_grams`."""
+    _require_64_bits(len(counts.ticks), max(workspace.plan.limits))
+    sums: dict[Pattern, BlockSums] = {}
+    for rows, values, clipped in workspace.blocks(counts):
+        _add_by_pattern(sums, values, clipped, blocks.numbers(counts.ticks[rows]))
+    return sums
 
 
 def change_sums(
     signals: SignalCatalog,
     workspace: Workspace,
     counts: DriveCounts,
-    times: Sequence[int],
-    late: int = 0,
-) -> dict[Kind, BlockSums]:
-    """Return the sums of a drive's changes, by columns missing and time; the course is `late`."""
+    durations: Sequence[int],
+    delay: int = 0,
+) -> dict[Pattern, BlockSums]:
+    """Return the sums of the changes of a drive by pattern; a block is a duration in ticks."""
     _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
-    fixes = Fixes(course_units(signals), workspace, counts, late)
-    found: dict[Kind, BlockSums] = {}
-    for part, apart in enumerate(times):
-        rows, columns, clipped = fixes.changes(apart)
-        _add_by_kind(found, columns, clipped, np.full(len(rows), part))
-    return found
+    fixes = Fixes(course_units(signals), workspace, counts, delay)
+    sums: dict[Pattern, BlockSums] = {}
+    for block, duration in enumerate(durations):
+        rows, values, clipped = fixes.changes(duration)
+        _add_by_pattern(sums, values, clipped, np.full(len(rows), block))
+    return sums
 
 
 def _require_64_bits(rows: int, largest: int) -> None:
@@ -484,29 +488,33 @@ def _require_64_bits(rows: int, largest: int) -> None:
         raise StorageError(f"the drive has {rows:,} rows: too many for 64-bit sums.")
 
 
-def _add_by_kind(
-    found: dict[Kind, BlockSums], columns: FloatArray, clipped: FloatArray, numbers: IntArray
+def _add_by_pattern(
+    sums: dict[Pattern, BlockSums], values: FloatArray, clipped: FloatArray, blocks: IntArray
 ) -> None:
-    """Add rows of several kinds, given the part of each, so many at once as are exact."""
-    for (absent, part), rows in _kinds(columns, numbers):
-        has = [i for i in range(len(columns)) if not absent >> i & 1]
-        sums = found.setdefault((absent, part), BlockSums(len(has)))
-        for first in range(0, len(rows), BLOCK_ROWS):
-            some = rows[first : first + BLOCK_ROWS]
-            block = columns if len(some) == len(clipped) else columns.take(some, axis=1)
-            sums.add(block if len(has) == len(block) else block[has], clipped[some])
+    """Add rows to the sums of their pattern, at most `BLOCK_ROWS` at a time."""
+    for (absent, block), rows in _find_patterns(values, blocks):
+        present = [i for i in range(len(values)) if not absent >> i & 1]
+        total = sums.setdefault((absent, block), BlockSums(len(present)))
+        for start in range(0, len(rows), BLOCK_ROWS):
+            chunk = rows[start : start + BLOCK_ROWS]
+            selected = values if len(chunk) == len(clipped) else values.take(chunk, axis=1)
+            complete = selected if len(present) == len(selected) else selected[present]
+            total.add(complete, clipped[chunk])
 
 
-def _kinds(block: FloatArray, numbers: IntArray) -> Iterator[tuple[Kind, NDArray[np.int64]]]:
-    lacks = np.isnan(block)
-    some = np.flatnonzero(lacks.any(axis=0))  # few, as a rule: patterns take sorting
-    pattern_of_row, absents = np.zeros(block.shape[1], dtype=np.int64), [0]
-    if len(some):
-        packed = np.packbits(lacks[:, some], axis=0, bitorder="little")
-        patterns, of_some = np.unique(packed, axis=1, return_inverse=True)
-        absents += [int.from_bytes(one.tobytes(), "little") for one in patterns.T]
-        pattern_of_row[some] = 1 + of_some.reshape(-1)
-    kind_of_row = numbers * len(absents) + pattern_of_row
-    for kind in np.unique(kind_of_row).tolist():
-        number, pattern = divmod(kind, len(absents))
-        yield (absents[pattern], number), np.flatnonzero(kind_of_row == kind)
+def _find_patterns(
+    values: FloatArray, blocks: IntArray
+) -> Iterator[tuple[Pattern, NDArray[np.int64]]]:
+    """Yield each pattern of missing columns and block, and its rows."""
+    is_missing = np.isnan(values)
+    incomplete = np.flatnonzero(is_missing.any(axis=0))  # usually few: only these are sorted
+    pattern_of_row, masks = np.zeros(values.shape[1], dtype=np.int64), [0]
+    if len(incomplete):
+        packed = np.packbits(is_missing[:, incomplete], axis=0, bitorder="little")
+        patterns, indices = np.unique(packed, axis=1, return_inverse=True)
+        masks += [int.from_bytes(column.tobytes(), "little") for column in patterns.T]
+        pattern_of_row[incomplete] = 1 + indices.reshape(-1)
+    key_of_row = blocks * len(masks) + pattern_of_row
+    for key in np.unique(key_of_row).tolist():
+        block, pattern = divmod(key, len(masks))
+        yield (masks[pattern], block), np.flatnonzero(key_of_row == key)

@@ -151,7 +151,7 @@ def _counted(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
         {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
         tuple(made_of),
         resolved.change_ticks,
-        DriveBlocks.of_set(resolved).times or (None,),
+        DriveBlocks.of_set(resolved).durations or (None,),
         resolved.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )

@@ -1,7 +1,7 @@
-"""Brings measured logs into the warehouse; the same file through the same mapping lands once.
+"""Stores measured logs in the warehouse. The same file with the same mapping is stored once.
 
-`ingest_files` goes through batches of logs: `write_batch` reads each log and writes data files,
-`commit_batch` commits these.
+`ingest_files` processes batches of logs: `write_batch` reads each log and writes data files,
+`commit_batch` commits them.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ FAILURES_SHOWN = 5
 
 
 class IngestTask(NamedTuple):
-    """A file to ingest, and the digest of what this very path had when it was ingested before."""
+    """A file to ingest, and the digest of the content that its path had when last ingested."""
 
     file: Path
     earlier: str | None = None
@@ -69,39 +69,39 @@ class IngestTask(NamedTuple):
 
 Batch: TypeAlias = tuple[IngestTask, ...]
 BuildRemoval: TypeAlias = Callable[[TableName, Snapshot, Collection[SourceRef]], Change]
-"""Returns what takes the drives of origins, or their refused rows, out of a table."""
+"""Build the commit that deletes the drives, or rejected rows, of these sources from a table."""
 
 
 @dataclass
 class FileReport(Record):
-    """What a file became, and what looks wrong in it."""
+    """The counts of a file and what looks implausible in it."""
 
     file: str
     counts: IngestCounts
     suspicions: tuple[Fault, ...] = ()
-    """In the file as a whole; and in the longest drive of all files that are read together."""
+    """Faults of the file; and of the longest drive, in the report of one file of a batch."""
 
     @property
     def alarms(self) -> tuple[Fault, ...]:
-        """What looks wrong and does harm."""
-        return tuple(one for one in self.suspicions if one.does_harm)
+        """The faults that harm a model."""
+        return tuple(fault for fault in self.suspicions if fault.does_harm)
 
 
 @dataclass
 class IngestReport(FileReport):
-    """What became of one file."""
+    """The result of ingesting one file."""
 
     DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
 
     new: bool = True
     drives_forgotten: int = 0
-    """Drives that were left out: of cars that were forgotten, or forgotten themselves."""
+    """Drives that were skipped because they, or their cars, were erased."""
     drives_replaced: int = 0
-    """Drives that gave way to it: its recording, from another file or through another mapping."""
+    """Drives that this file replaces: the same recording, or the same path with other content."""
 
     @property
     def rows_quarantined(self) -> int:
-        """How many rows were refused."""
+        """Number of rejected rows."""
         return sum(self.counts.quarantined.values())
 
 
@@ -114,19 +114,19 @@ class SignalRange:
     low: float
     high: float
     missing: float
-    """Part of the ticks without a value."""
+    """Fraction of the ticks without a value."""
 
 
 @dataclass
 class Preview(FileReport, Answer):
-    """What would become of a file."""
+    """The result that ingesting a file would have."""
 
     DOCUMENT = "file *counts ranges suspicions"
 
     ranges: tuple[SignalRange, ...] = ()
 
     def parts(self) -> Iterator[Part]:
-        """Return how many rows are taken, a table of the signals, and what looks wrong."""
+        """Return the counts of rows, a table of the signals, and the faults."""
         counts = self.counts
         rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
         yield TextTable(
@@ -139,16 +139,16 @@ class Preview(FileReport, Answer):
             "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
             left=2,
         )
-        yield from (f"looks wrong: {one}" for one in self.suspicions)
+        yield from (f"looks wrong: {fault}" for fault in self.suspicions)
 
 
 @dataclass
 class WrittenFile:
-    """What one file of a batch became: its report, and by what it is recognised.
+    """A file of a batch after writing: its report and its fingerprints.
 
     Attributes:
-        same: which files, and drives of others, have its fingerprints, whether still there or not.
-        replaced: those that give way to it.
+        same: sources with its fingerprints, whether their rows still exist or not.
+        replaced: the sources that it replaces.
     """
 
     log: Path
@@ -160,7 +160,7 @@ class WrittenFile:
 
 
 class NewFiles(NamedTuple):
-    """Data files of one table that are not committed yet, and their transactions."""
+    """Uncommitted data files of one table, and their transactions."""
 
     transactions: tuple[AppTransaction, ...]
     files: tuple[AddAction, ...]
@@ -168,7 +168,7 @@ class NewFiles(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenBatch:
-    """What a batch of files became; `forgotten` are the entries that its drives were judged by."""
+    """A batch after writing; `forgotten` are the entries of the erasure log that it respects."""
 
     files: tuple[WrittenFile, ...]
     failures: tuple[InputError, ...]
@@ -177,8 +177,8 @@ class WrittenBatch:
 
     @property
     def replaced(self) -> frozenset[SourceRef]:
-        """What gives way to it."""
-        return frozenset[SourceRef]().union(*(one.replaced for one in self.files))
+        """The sources that the batch replaces."""
+        return frozenset[SourceRef]().union(*(file.replaced for file in self.files))
 
 
 def ingest_files(
@@ -186,19 +186,20 @@ def ingest_files(
     files: Iterable[Path],
     mapping: Mapping,
     executor: Executor | None = None,
-    known: IngestCache | None = None,
+    cache: IngestCache | None = None,
     replace: Replace = "no",
     build_removal: BuildRemoval | None = None,
 ) -> Iterator[IngestReport]:
-    """Ingest files, and yield a report of each as it is committed; small files land together.
+    """Ingest files and yield the report of each after its commit.
 
-    An executor's workers read batches in any order, but its threads none of large files, each of
-    which keeps all cores busy. `known` remembers what is in. A recording that is there is refused,
-    unless it is to be replaced: then `build_removal` takes it out in the same commit.
+    Small files are committed together. The workers of an executor read batches in any order; large
+    files, each of which uses all cores, are not given to threads. `cache` skips files that were
+    ingested before. A stored recording is refused, or replaced by `replace`: then `build_removal`
+    deletes the old rows in the same commit.
 
-    At the end raises `InputError`, which names all files that cannot be used, or `RepeatedError`
-    where all of these are there already; `ClusterError` for files that workers died of; and
-    `ConfigError` for a mapping of other signals.
+    Raises at the end `InputError` with all files that cannot be used, or `RepeatedError` if all of
+    these are stored already; `ClusterError` for files at which workers died; and `ConfigError` for
+    a mapping of other signals.
     """
     if mapping.signal_catalog != warehouse.catalog.signals:  # counts would have another scale
         raise ConfigError(
@@ -208,21 +209,21 @@ def ingest_files(
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
     failures: list[InputError] = []
-    asked = (IngestTask(file, known.digest_of(file) if known else None) for file in files)
-    for batch, written in _written(executor, write, _batches(asked)):
-        # Not the file's name: it may name a car, and the Delta log outlives what is forgotten.
-        digest = digest_of([one.digest for one in written.files])
+    tasks = (IngestTask(file, cache.digest_of(file) if cache else None) for file in files)
+    for batch, written in _written(executor, write, _batches(tasks)):
+        # Not the file's name: it may contain a car's name, and the Delta log outlives erasures.
+        digest = digest_of([file.digest for file in written.files])
         note = {"job": "ingest", "mapping": mapping.name, "digest": digest}
         committed, new = commit_batch(
             warehouse, written, partial(write, batch), note, build_removal
         )
         failures += committed.failures
-        for one in committed.files:
-            transaction = file_transaction(one.digest).name
-            yield _finished(warehouse, one, is_new=transaction in new)
-            new -= {transaction}  # the same content in another file is not new
-            if known is not None:
-                known.remember(one.log, one.digest)
+        for file in committed.files:
+            transaction = file_transaction(file.digest).name
+            yield _finished(warehouse, file, is_new=transaction in new)
+            new -= {transaction}  # a second file with the same content is not new
+            if cache is not None:
+                cache.remember(file.log, file.digest)
     if failures:
         raise _joined(failures)
 
@@ -230,7 +231,7 @@ def ingest_files(
 def _written(
     executor: Executor | None, write: Callable[[Batch], WrittenBatch], batches: Iterable[Batch]
 ) -> Iterator[tuple[Batch, WrittenBatch]]:
-    """Yield batches as they are written."""
+    """Yield each batch with its result, large files last and not by threads."""
     alone: list[Batch] = []
     if isinstance(executor, ThreadPoolExecutor):
         together: list[Batch] = []
@@ -242,39 +243,43 @@ def _written(
 
 
 def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
-    """Group files, in their order, into batches of `BATCH_BYTES` and one file at least."""
+    """Group files, in order, into batches of at most `BATCH_BYTES` or one file."""
     batch: list[IngestTask] = []
     size = 0
-    for asked in files:
-        more = size_of(asked.file)
-        if batch and (size + more > BATCH_BYTES or len(batch) >= BATCH_FILES):
+    for task in files:
+        size_bytes = size_of(task.file)
+        if batch and (size + size_bytes > BATCH_BYTES or len(batch) >= BATCH_FILES):
             yield tuple(batch)
             batch, size = [], 0
-        batch.append(asked)
-        size += more
+        batch.append(task)
+        size += size_bytes
     if batch:
         yield tuple(batch)
 
 
-def _finished(warehouse: Warehouse, one: WrittenFile, *, is_new: bool) -> IngestReport:
-    """Return the report of a file, once it is known whether this process has committed it."""
-    report = one.report
+def _finished(warehouse: Warehouse, written: WrittenFile, *, is_new: bool) -> IngestReport:
+    """Return the report of a file; `is_new` if this process committed it."""
+    report = written.report
     report.new = is_new
     if not is_new:
         report.suspicions, report.drives_replaced = (), 0
-        if not report.drives_forgotten and is_fully_erased(warehouse, one.digest):
+        if not report.drives_forgotten and is_fully_erased(warehouse, written.digest):
             report.drives_forgotten = report.counts.drives
             report.counts = dataclasses.replace(report.counts, drives=0, ticks=0)
     return report
 
 
 def _joined(failures: list[InputError]) -> InputError:
-    """Return one error that names all."""
+    """Return one error for all failures."""
     if len(failures) == 1:
         return failures[0]
     first = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
-    kind = RepeatedError if all(isinstance(o, RepeatedError) for o in failures) else InputError
+    kind = (
+        RepeatedError
+        if all(isinstance(failure, RepeatedError) for failure in failures)
+        else InputError
+    )
     return kind(
         f"{pluralize(len(failures), 'file')} cannot be used; all others are stored. {first}"
         + (f" And {more:,} more." if more > 0 else "")
@@ -284,25 +289,25 @@ def _joined(failures: list[InputError]) -> InputError:
 # A batch of files becomes data files.
 
 FILE_ROWS = 2**18
-"""A data file is written as soon as it has so many rows; its last drive may make it larger."""
+"""Rows at which a data file is written. Its last drive may exceed them."""
 
 
 def write_batch(
     warehouse: Warehouse, mapping: Mapping, files: Batch, replace: Replace = "no"
 ) -> WrittenBatch:
-    """Read files, and write their rows together: one data file a day. Nothing is committed.
+    """Read files and write their rows, together in one data file a day. Commits nothing.
 
-    A file that cannot be used is a failure of its own.
+    A file that cannot be used becomes a failure; the others are written.
     """
     failures: list[InputError] = []
     written: list[WrittenFile] = []
     longest: list[tuple[FileReport, MeasuredDrive | None]] = []
     with ThreadPoolExecutor(WRITERS) as writers:
         batch = _Writer(warehouse, mapping, files, writers, replace)
-        for asked in files:
+        for task in files:
             try:
-                with open_measured(asked.file, mapping) as stream:
-                    one = batch.write(stream, asked)
+                with open_measured(task.file, mapping) as stream:
+                    report_of_file = batch.write(stream, task)
             except BaseException as error:
                 for data in batch.data.values():
                     data.discard_log()
@@ -312,9 +317,9 @@ def write_batch(
             else:
                 for data in batch.data.values():
                     data.end_log()
-                written.append(one)
-                if one.report.new:
-                    longest.append((one.report, stream.longest))
+                written.append(report_of_file)
+                if report_of_file.report.new:
+                    longest.append((report_of_file.report, stream.longest))
         _judge_longest(mapping.signal_catalog, longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
@@ -323,9 +328,9 @@ def write_batch(
 def _judge_longest(
     signals: SignalCatalog, results: Iterable[tuple[FileReport, MeasuredDrive | None]]
 ) -> None:
-    """Add what looks wrong in the longest drive of files to the report of its file.
+    """Check the longest drive of some files, and add its faults to the report of its file.
 
-    It stands for all, since to look at a drive takes longer than to load a small file.
+    One drive only: the check takes longer than ingesting a small file.
     """
     drives = [(report, drive) for report, drive in results if drive is not None]
     if drives:
@@ -334,7 +339,7 @@ def _judge_longest(
 
 
 class _Writer:
-    """Writes files together."""
+    """Writes the files of a batch."""
 
     def __init__(
         self,
@@ -344,68 +349,69 @@ class _Writer:
         writers: ThreadPoolExecutor,
         replace: Replace,
     ) -> None:
-        self.warehouse, self.erasure_log, self.mapping = (
-            warehouse,
-            ErasureLog(warehouse.root),
-            mapping,
-        )
+        self.warehouse, self.mapping = warehouse, mapping
+        self.erasure_log = ErasureLog(warehouse.root)
         self.forgotten, self._number = self.erasure_log.begun(), len(files)
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
         self._same = DuplicateDetector(warehouse, logs, mapping.name, replace)
 
     def _look(self) -> Snapshot:
-        """Look at the tables as they are now; return a snapshot of the logs."""
+        """Read the current state of the tables; return a snapshot of the logs."""
         snapshots = {name: table.snapshot() for name, table in tables_of(self.warehouse).items()}
-        self._landed = {name: one.landed_among(self._number) for name, one in snapshots.items()}
+        self._landed = {
+            name: written.landed_among(self._number) for name, written in snapshots.items()
+        }
         return snapshots["logs"]
 
     def _lacks(self, name: TableName, digest: str) -> bool:
-        """Whether a file's rows are neither in a table nor about to be."""
+        """Return True if a file's rows are neither in a table nor in this batch."""
         return digest not in self.data[name].digests and not self._landed[name](FILES + digest)
 
-    def write(self, stream: MeasuredStream, asked: IngestTask) -> WrittenFile:
-        """Read a file, and write all but its last rows, which wait; return what it became.
+    def write(self, stream: MeasuredStream, task: IngestTask) -> WrittenFile:
+        """Read a file and write its rows; the last rows wait for those of other files.
 
-        Raises `InputError`, and `RepeatedError` for a recording that is in the logs.
+        Raises `InputError`, and `RepeatedError` for a stored recording.
         """
         digest, first_drive = stream.digest, drive_id(stream.prefix, 0)
         if not self._lacks("logs", digest) and readmit_file(self.warehouse, digest, first_drive):
             self._look()
         is_new = self._lacks("logs", digest)
         for name, data in self.data.items():
-            data.begin_log(digest, wanted=is_new and self._lacks(name, digest))
+            data.begin_log(digest, is_new=is_new and self._lacks(name, digest))
         fingerprints = {f"{PREFIX}{stream.content[:16]}": SourceRef.of(digest).number}
         left_out, ticks = set[str](), 0
         for drives in _groups(stream.drives()):
-            kept = drop_erased_drives(
+            accepted = drop_erased_drives(
                 sorted(drives, key=lambda drive: drive.drive_id), self.erasure_log
             )
-            left_out |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in kept}
-            ticks += _rows_of(kept)
-            if is_new and kept:
+            left_out |= {drive.drive_id for drive in drives} - {
+                drive.drive_id for drive in accepted
+            }
+            ticks += _rows_of(accepted)
+            if is_new and accepted:
                 full = _rows_of(drives) >= FILE_ROWS
-                self.data["logs"].add(log_table(kept, self.mapping), full=full)
-                fingerprints |= fingerprints_of(kept)
+                self.data["logs"].add(log_table(accepted, self.mapping), full=full)
+                fingerprints |= fingerprints_of(accepted)
         for table, following in pairwise(chain(stream.quarantine(), [None])):
             allowed = drop_erased_rejects(table, self.erasure_log, left_out)
             self.data["quarantine"].add(allowed, full=following is not None)
-        report = IngestReport(str(asked.file), stream.counts, new=is_new)
-        one = WrittenFile(asked.file, digest, report)
+        report = IngestReport(str(task.file), stream.counts, new=is_new)
+        written = WrittenFile(task.file, digest, report)
         if is_new:
             report.drives_forgotten, report.suspicions = len(left_out), stream.suspicions()
             drives_left = stream.counts.drives - len(left_out)
             report.counts = dataclasses.replace(stream.counts, drives=drives_left, ticks=ticks)
-            one.fingerprints = fingerprints if ticks else {}
-            is_there = asked.earlier and self._landed["logs"](FILES + asked.earlier)
-            earlier = asked.earlier if is_there else None
-            found = self._same.find(asked.file, digest, one.fingerprints, stream.name, earlier)
-            one.same, one.replaced, report.drives_replaced = found
-        return one
+            written.fingerprints = fingerprints if ticks else {}
+            is_there = task.earlier and self._landed["logs"](FILES + task.earlier)
+            earlier = task.earlier if is_there else None
+            found = self._same.find(task.file, digest, written.fingerprints, stream.name, earlier)
+            written.same, written.replaced, report.drives_replaced = found
+        return written
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
-    """Yield drives with as many rows as a data file has; the last ones may have fewer."""
+    """Yield groups of drives with the rows of a data file; the last group may have fewer."""
     group: list[MeasuredDrive] = []
     for drive in drives:
         group.append(drive)
@@ -420,11 +426,11 @@ def _rows_of(drives: Iterable[MeasuredDrive]) -> int:
     return sum(drive.ticks.size for drive in drives)
 
 
-# What would become of files: they are read as above, and nothing is written.
+# Dry run: files are read as above, and nothing is written.
 
 
 def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
-    """Read logs as `ingest_files` does, with the same verdict; store nothing.
+    """Read logs and check them as `ingest_files` does, and store nothing.
 
     Raises `InputError`.
     """
@@ -437,32 +443,32 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
 
 
 def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
-    """Return what would become of a log, and its longest drive. Raises `InputError`."""
+    """Return the preview of a log and its longest drive. Raises `InputError`."""
     ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
     values: Counter[str] = Counter()
     with open_measured(log, mapping) as stream:
         for drive in stream.drives():
             for name, counts in drive.counts.items():
                 values[name] += len(counts) - counts.null_count
-                found = pc.min_max(counts).as_py()
-                ends[name] += [] if found["min"] is None else [found["min"], found["max"]]
-        of_rows = stream.suspicions()  # which may look into the file again
+                extremes = pc.min_max(counts).as_py()
+                ends[name] += [] if extremes["min"] is None else [extremes["min"], extremes["max"]]
+        suspicions = stream.suspicions()  # may read the file again
     ranges = []
-    for name, some in ends.items():
+    for name, bounds in ends.items():
         signal = mapping.signal_catalog[name]
         scale = float(signal.scale)
-        low, high = (scale * min(some), scale * max(some)) if some else (np.nan, np.nan)
+        low, high = (scale * min(bounds), scale * max(bounds)) if bounds else (np.nan, np.nan)
         missing = 1 - values[name] / max(stream.counts.ticks, 1)
         ranges.append(SignalRange(name, signal.unit, low, high, missing))
-    return Preview(str(log), stream.counts, of_rows, tuple(ranges)), stream.longest
+    return Preview(str(log), stream.counts, suspicions, tuple(ranges)), stream.longest
 
 
 MOST_TICKS = 200_000
-"""Ticks of the longest drive that are looked at: half an hour."""
+"""Maximum number of ticks of the longest drive that are checked: half an hour."""
 
 
 def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
-    """Return the signals of the beginning of a drive, as `check_plausibility` takes them."""
+    """Return the signals of the first ticks of a drive, for `check_plausibility`."""
     selected = drive.ticks - drive.ticks[0] < MOST_TICKS
     counts = {  # by Polars: Arrow's own would load pandas
         name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[selected]
@@ -471,14 +477,14 @@ def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
     return to_regular_grid(signals, drive.ticks[selected], counts)
 
 
-# Data files of bounded size. Nothing is committed yet.
+# Writing data files of bounded size.
 
 WRITERS = 2
-"""Data files that are written at once: encoding them is the longest part of an ingest."""
+"""Data files written at the same time; encoding them takes most of the time of an ingest."""
 
 
 class DataFiles:
-    """Data files of a batch in one table. Logs are begun one by one, and ended or discarded."""
+    """The data files of a batch in one table. Each log is begun, then ended or discarded."""
 
     def __init__(self, table: Table, threads: ThreadPoolExecutor) -> None:
         """Take the table, and threads to write with."""
@@ -488,45 +494,45 @@ class DataFiles:
         self._waiting: dict[str, pa.Table] = {}
         self.digests: list[str] = []
 
-    def begin_log(self, digest: str, *, wanted: bool) -> None:
-        """Begin a log, whose rows are passed over unless they are wanted."""
-        self._digest, self._is_wanted = digest, wanted
-        self._rest: pa.Table | None = None
+    def begin_log(self, digest: str, *, is_new: bool) -> None:
+        """Begin a log. Its rows are ignored unless it is new."""
+        self._digest, self._is_new = digest, is_new
+        self._remaining: pa.Table | None = None
 
     def add(self, rows: pa.Table, *, full: bool) -> None:
-        """Write rows of the log to a data file of their own if they are enough to fill it."""
-        if self._is_wanted and rows.num_rows:
+        """Write rows to a data file of their own if `full`, else keep them for `end_log`."""
+        if self._is_new and rows.num_rows:
             if full:
                 name = f"measured-{self._digest[:24]}-{len(self._of_this_log) + 1}"
                 self._of_this_log.append(self._begin(name, [rows]))
             else:
-                self._rest = rows
+                self._remaining = rows
 
     def end_log(self) -> None:
-        """End the log: the rest of its rows wait for those of others."""
-        if self._of_this_log or self._rest is not None:
+        """End the log: its remaining rows wait for those of other logs."""
+        if self._of_this_log or self._remaining is not None:
             self.digests.append(self._digest)
         self._written += self._of_this_log
         self._of_this_log = []
-        if self._rest is not None:
-            self._waiting[self._digest] = self._rest
+        if self._remaining is not None:
+            self._waiting[self._digest] = self._remaining
         if sum(rows.num_rows for rows in self._waiting.values()) >= FILE_ROWS:
             self._write_waiting()
 
     def discard_log(self) -> None:
-        """Delete what was written of the log that is being read."""
+        """Delete the files written of the current log."""
         written = [writing for writing in self._of_this_log if writing.exception() is None]
         self._table.discard(file for writing in written for file in writing.result())
         self._of_this_log = []
 
     def finish(self) -> NewFiles:
-        """Return all data files, written, and their transactions."""
+        """Wait for all data files; return them and their transactions."""
         self._write_waiting()
         files = tuple(file for writing in self._written for file in writing.result())
         return NewFiles(tuple(map(file_transaction, sorted(self.digests))), files)
 
     def _write_waiting(self) -> None:
-        """Write rows in the order of their logs' digests, and so of the names of drives."""
+        """Write waiting rows in the order of their logs' digests, which is that of drive names."""
         digests = sorted(self._waiting)
         if digests:
             rows = [self._waiting[digest] for digest in digests]
@@ -534,7 +540,7 @@ class DataFiles:
             self._waiting = {}
 
     def _begin(self, name: str, rows: list[pa.Table]) -> Future[list[AddAction]]:
-        """Write rows while the caller goes on; at most `WRITERS` files are under way."""
+        """Start writing rows, after the oldest of `WRITERS` files under way has ended."""
         begun = [*self._written, *self._of_this_log]
         if len(begun) >= WRITERS:
             begun[-WRITERS].result()
@@ -542,13 +548,13 @@ class DataFiles:
 
     def _write(self, name: str, rows: list[pa.Table]) -> list[AddAction]:
         by_day = _by_day(pa.concat_tables(rows).unify_dictionaries())
-        encoded = {day: self._table.encode(part) for day, part in by_day.items()}
-        del by_day  # a disk may take its time
+        encoded = {day: self._table.encode(of_day) for day, of_day in by_day.items()}
+        del by_day  # frees memory during slow writes
         return [self._table.put(name, content, day) for day, content in encoded.items()]
 
 
 def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
-    """Return the rows of each day; refused ones, which are not kept by day, as they are."""
+    """Return rows by day; rejected rows, which have no day, under None."""
     if "day" not in rows.column_names:
         return {None: rows}
     days = rows["day"].unique().to_pylist()
@@ -578,7 +584,7 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
 
 
 def _gather(values: Sequence[Any], at: IntArray, kind: pa.DataType) -> pa.Array:
-    """Return values at positions; not by `pa.array`, which imports pandas if it is there."""
+    """Return values at positions. Not by `pa.array`, which imports pandas if installed."""
     if pa.types.is_string(kind):
         texts = list(dict.fromkeys(text for text in values if text is not None))
         codes = [None if text is None else texts.index(text) for text in values]
@@ -587,7 +593,7 @@ def _gather(values: Sequence[Any], at: IntArray, kind: pa.DataType) -> pa.Array:
     return pl.Series(values, strict=False).gather(at).to_arrow().cast(kind)
 
 
-# What was written is committed: refused rows, then drives.
+# Commits: rejected rows first, then drives.
 
 
 def commit_batch(
@@ -597,55 +603,50 @@ def commit_batch(
     note: dict[str, str],
     build_removal: BuildRemoval | None = None,
 ) -> tuple[WrittenBatch, frozenset[str]]:
-    """Commit what was written of a batch; return it, and the transactions added to the logs.
+    """Commit a batch; return it and the transactions added to the logs.
 
-    Where something was forgotten, or committed by another process, since it was written, `write`
-    writes it again. What gives way to the new files is taken out in the same commits.
+    If an erasure or another process's commit makes the batch outdated, `write` writes it again. The
+    sources that it replaces are deleted in the same commits.
     """
     tables = tables_of(warehouse)
 
     def is_outdated(name: TableName, snapshot: Snapshot) -> bool:
-        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
+        # After the snapshot: an erasure that begins from now on makes this commit a conflict.
         if ErasureLog(warehouse.root).begun() != written.forgotten:
             return True
         landed = snapshot.landed_among(len(written.new[name].transactions))
         if any(landed(transaction.name) for transaction in written.new[name].transactions):
             return True
-        new = [one for one in written.files if one.fingerprints] if name == "logs" else []
-        known = Fingerprints(snapshot.transactions if new else {})
-        return any(known.find(one.fingerprints) - one.same for one in new)
+        new = [file for file in written.files if file.fingerprints] if name == "logs" else []
+        fingerprints = Fingerprints(snapshot.transactions if new else {})
+        return any(fingerprints.find(file.fingerprints) - file.same for file in new)
 
     def commit(name: TableName) -> frozenset[str]:
         nonlocal written
         snapshot = tables[name].snapshot()
         while is_outdated(name, snapshot):
             for other, table in tables.items():
-                table.discard(written.new[other].files)  # but what has landed
+                table.discard(written.new[other].files)  # except committed ones
             written = write()
             snapshot = tables[name].snapshot()
         new = written.new[name]
-        gone = Change()
+        removal = Change()
         if written.replaced and build_removal and written.new["logs"].files:
-            gone = build_removal(name, snapshot, written.replaced)
-        transactions = {
-            transaction.name: transaction for transaction in (*gone.transactions, *new.transactions)
-        }
-        for one in written.files if name == "logs" else ():
+            removal = build_removal(name, snapshot, written.replaced)
+        transactions = {t.name: t for t in (*removal.transactions, *new.transactions)}
+        for file in written.files if name == "logs" else ():
             transactions |= {
-                mark: AppTransaction(mark, number) for mark, number in one.fingerprints.items()
+                fingerprint: AppTransaction(fingerprint, number)
+                for fingerprint, number in file.fingerprints.items()
             }
-        if new.files or gone.remove:
-            add = [*new.files, *gone.add]
+        if new.files or removal.remove:
+            add = [*new.files, *removal.add]
             try:
-                snapshot.commit(Change(add, gone.remove, tuple(transactions.values()), note))
+                snapshot.commit(Change(add, removal.remove, tuple(transactions.values()), note))
             except ConflictError:
-                tables[name].discard(gone.add)
+                tables[name].discard(removal.add)
                 raise
-        return (
-            frozenset(transaction.name for transaction in new.transactions)
-            if new.files
-            else frozenset()
-        )
+        return frozenset(t.name for t in new.transactions) if new.files else frozenset()
 
     retry_conflicts(lambda: commit("quarantine"))
     new = retry_conflicts(lambda: commit("logs"))

@@ -1,4 +1,4 @@
-"""Recognises what is in the logs already, and what was forgotten: neither is loaded again."""
+"""Detects recordings that are stored already or were erased: neither is stored again."""
 
 import json
 import os
@@ -33,22 +33,22 @@ from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Replace: TypeAlias = Literal["no", "corrected", "all"]
-"""Which recordings of the logs give way to the same ones: `corrected` are those of the same file
-through a mapping of the same name that has changed since."""
+"""Which stored recordings a new one replaces: `corrected` are those of the same file, ingested with
+an earlier mapping of the same name."""
 
 
 def tables_of(warehouse: Warehouse) -> dict[TableName, Table]:
-    """Return the tables that files go to, in the order in which they are committed."""
+    """Return the tables that files are written to, in the order of commits."""
     return {"quarantine": warehouse.quarantine, "logs": warehouse.logs}
 
 
-# What was forgotten does not come back.
+# Erased cars and drives are not stored again.
 
 
 def drop_erased_drives(
     drives: Sequence[MeasuredDrive], erasure_log: ErasureLog
 ) -> list[MeasuredDrive]:
-    """Return the drives that were not forgotten under any name, nor their cars."""
+    """Return the drives without those that were erased, under any name, or whose cars were."""
     cars = {drive.drive_id: str(drive.metadata["vehicle_id"]) for drive in drives}
     erased = erasure_log.erased(set(cars.values()), set(cars))
     counts = erasure_log.erased_count_digests()
@@ -64,9 +64,10 @@ def drop_erased_drives(
 def drop_erased_rejects(
     refused: pa.Table, erasure_log: ErasureLog, left_out: Collection[str] = ()
 ) -> pa.Table:
-    """Return the refused rows of what was not forgotten; `left_out` are drives of their file.
+    """Return the rejected rows without those of erased cars and drives.
 
-    A row goes with its car, or with its drive, whose name begins that of each stretch of it.
+    `left_out` are the erased drives of their file. A rejected row has the name of the uncut drive,
+    which begins the names of its segments.
     """
     vehicles, named = (
         set(refused[column].unique().drop_null().cast(pa.string()).to_pylist())
@@ -74,18 +75,18 @@ def drop_erased_rejects(
     )
     erased = erasure_log.erased(vehicles, named)
     drives = erased.drives | set(left_out)
-    whole = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
-    for column, unwanted in (("vehicle_id", erased.vehicles), ("drive_id", drives | whole)):
-        if unwanted:
-            names = pa.array(sorted(unwanted), pa.string())
-            mine = pc.is_in(refused[column].cast(pa.string()), names)
-            refused = refused.filter(pc.invert(pc.fill_null(mine, False)))
+    prefixes = {name for name in named if any(drive.startswith(f"{name}-") for drive in drives)}
+    for column, erased_names in (("vehicle_id", erased.vehicles), ("drive_id", drives | prefixes)):
+        if erased_names:
+            names = pa.array(sorted(erased_names), pa.string())
+            is_erased = pc.is_in(refused[column].cast(pa.string()), names)
+            refused = refused.filter(pc.invert(pc.fill_null(is_erased, False)))
     return refused
 
 
-# Fingerprints recognise a recording: a digest of a file's bytes, or of a drive's counts. Each is a
-# transaction in the commit of the rows, so that two processes that load one drive are in conflict.
-# Its number says where it is from, and no name of a car follows from it:
+# A fingerprint identifies a recording: a digest of a file's bytes, or of a drive's counts. Each is
+# a transaction in the commit of the rows, so that two processes that store one drive conflict. Its
+# number contains the source, and no name of a car can be derived from it:
 #
 #     40 bits of the file's digest | 3 bits: 0 of a file | 20 bits of the drive's name
 
@@ -94,15 +95,15 @@ DIGEST_CHARACTERS = 10
 _DRIVE_BITS, _KIND_BITS = 20, 3
 
 MEASURED = rf"-([0-9a-f]{{{DIGEST_CHARACTERS}}})[0-9a-f]{{2}}((-[0-9]+){{1,2}})$"
-"""What the name of a measured drive ends in: its file's digest, and which drive of it."""
+"""The end of a measured drive's name: its file's digest, and the number of the drive."""
 
 _MEASURED = re.compile(MEASURED)
 
 
 class SourceRef(NamedTuple):
-    """Where a recording is from: the first characters of a file's digest, and a drive's hash or 0.
+    """The source of a recording: the first characters of a file's digest, and a drive's hash.
 
-    0 stands for the whole file.
+    The hash is 0 for the whole file.
     """
 
     digest: str
@@ -110,76 +111,76 @@ class SourceRef(NamedTuple):
 
     @classmethod
     def of(cls, digest: str) -> "SourceRef":
-        """Return the origin of a file with this digest."""
+        """Return the reference to a file with this digest."""
         return cls(digest[:DIGEST_CHARACTERS])
 
     @classmethod
     def of_drive(cls, drive_id: str) -> "SourceRef | None":
-        """Return the origin of a drive; None if its name is not that of a measured one."""
-        if (found := _MEASURED.search(drive_id)) is None:
+        """Return the reference to a drive, None if its name is not that of a measured drive."""
+        if (match := _MEASURED.search(drive_id)) is None:
             return None
-        hashed = int(sha256(found[2].encode()).hexdigest(), 16)
-        return cls(found[1], 1 + hashed % (2**_DRIVE_BITS - 1))
+        hashed = int(sha256(match[2].encode()).hexdigest(), 16)
+        return cls(match[1], 1 + hashed % (2**_DRIVE_BITS - 1))
 
     @classmethod
     def of_number(cls, number: int) -> "SourceRef":
-        """Return the origin that a fingerprint's number says."""
+        """Return the reference that a fingerprint's number contains."""
         digest = number >> (_KIND_BITS + _DRIVE_BITS)
         return cls(f"{digest:0{DIGEST_CHARACTERS}x}", number % 2**_DRIVE_BITS)
 
     @property
     def number(self) -> int:
-        """Number of a fingerprint from here."""
+        """The number of a fingerprint of this source."""
         kind = int(self.drive != 0) << _DRIVE_BITS
         return int(self.digest, 16) << (_KIND_BITS + _DRIVE_BITS) | kind | self.drive
 
     @property
     def file(self) -> "SourceRef":
-        """The file that it is, or is in."""
+        """The reference to its file."""
         return SourceRef(self.digest)
 
 
-def is_from(drive_id: str, origins: Collection[SourceRef]) -> bool:
-    """Whether a drive is one of some, or came in a file of theirs."""
-    origin = SourceRef.of_drive(drive_id)
-    return origin is not None and (origin in origins or origin.file in origins)
+def is_from(drive_id: str, sources: Collection[SourceRef]) -> bool:
+    """Return True if a drive, or its file, is among the sources."""
+    source = SourceRef.of_drive(drive_id)
+    return source is not None and (source in sources or source.file in sources)
 
 
 class Fingerprints:
-    """The fingerprints of what is in the logs."""
+    """The fingerprints of the stored recordings."""
 
     def __init__(self, transactions: Named[str, int]) -> None:
         """Take the transactions of a snapshot of the logs."""
-        there = {name: number for name, number in transactions.items() if number != WITHDRAWN}
-        self._numbers = {name: n for name, n in there.items() if name.startswith(PREFIX)}
-        self._files = [name for name in there if name.startswith(FILES)]
+        valid = {name: number for name, number in transactions.items() if number != WITHDRAWN}
+        self._numbers = {name: n for name, n in valid.items() if name.startswith(PREFIX)}
+        self._files = [name for name in valid if name.startswith(FILES)]
 
     def find(self, fingerprints: Iterable[str]) -> frozenset[SourceRef]:
-        """Return which files, and which drives of others, have the same fingerprints."""
+        """Return the files and drives with one of the fingerprints."""
         numbers = map(self._numbers.get, fingerprints)
         return frozenset(SourceRef.of_number(number) for number in numbers if number is not None)
 
     def withdraw(
-        self, origins: Collection[SourceRef], files: Collection[SourceRef]
+        self, sources: Collection[SourceRef], files: Collection[SourceRef]
     ) -> list[AppTransaction]:
-        """Return what withdraws fingerprints of origins, and files themselves that are all gone."""
+        """Return the transactions that withdraw sources' fingerprints, and fully removed files."""
         of_drives = [
             name
             for name, number in self._numbers.items()
-            if (origin := SourceRef.of_number(number)) in origins or origin.file in files
+            if (source := SourceRef.of_number(number)) in sources or source.file in files
         ]
         of_files = [n for n in self._files if SourceRef.of(n.removeprefix(FILES)) in files]
         return [AppTransaction(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
 def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
-    """Return the fingerprint of each drive's counts, and the number of its origin."""
-    of = ((drive, SourceRef.of_drive(drive.drive_id)) for drive in drives)
-    return {f"{PREFIX}{drive.counts_digest}": origin.number for drive, origin in of if origin}
+    """Return the fingerprint of each drive's counts, with the number of its source."""
+    sources = ((drive, SourceRef.of_drive(drive.drive_id)) for drive in drives)
+    return {f"{PREFIX}{drive.counts_digest}": source.number for drive, source in sources if source}
 
 
 def file_transaction(digest: str) -> AppTransaction:
-    """Return the transaction that a file's content is."""
+    """Return the transaction that records a file's content."""
     return AppTransaction(f"{FILES}{digest}", 1)
 
 
@@ -188,15 +189,15 @@ def digest_of(digests: Sequence[str]) -> str:
     return digests[0] if len(digests) == 1 else sha256("".join(digests).encode()).hexdigest()
 
 
-# Which files of this machine are known: a cache, so that a folder of thousands need not be read to
-# find nothing new. Whether their content is in the logs is asked of the logs.
+# A cache of this machine's files, so that a folder of thousands is not read to find nothing new.
+# The logs decide whether a content is stored.
 
 
 @dataclass
 class IngestCache:
-    """Which content the files of this machine had when they were ingested through a mapping.
+    """The content that files of this machine had when they were ingested with a mapping.
 
-    `digests` has size, time of change and digest by path.
+    `digests` contains size, time of change and digest by path.
     """
 
     cache: Path
@@ -204,7 +205,7 @@ class IngestCache:
 
     @classmethod
     def of(cls, warehouse: Warehouse, mapping: Mapping) -> "IngestCache":
-        """Return what is remembered for a data root and a mapping."""
+        """Read the cache of a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
         cache = cache_folder("ingested") / f"{about[:32]}.json"
         with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
@@ -213,27 +214,27 @@ class IngestCache:
         return cls(cache)
 
     def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
-        """Return the files that are not in the logs, as far as size and time of change show."""
+        """Return the files that are not in the logs, judged by size and time of change."""
         landed = warehouse.logs.snapshot().landed_among(len(self.digests))
 
-        def is_there(file: Path) -> bool:
-            known = self.digests.get(_name_of(file))
-            return known is not None and _state_of(file) == known[:2] and landed(FILES + known[2])
+        def is_landed(file: Path) -> bool:
+            entry = self.digests.get(_name_of(file))
+            return entry is not None and _state_of(file) == entry[:2] and landed(FILES + entry[2])
 
-        return [file for file in files if not is_there(file)]
+        return [file for file in files if not is_landed(file)]
 
     def digest_of(self, file: Path) -> str | None:
-        """Return the digest of what a path had when it was ingested, None if it never was."""
-        known = self.digests.get(_name_of(file))
-        return None if known is None else known[2]
+        """Return the digest of a path's content when last ingested, None if it never was."""
+        entry = self.digests.get(_name_of(file))
+        return None if entry is None else entry[2]
 
     def remember(self, file: Path, digest: str) -> None:
-        """Keep in mind that a file is in the logs."""
+        """Record that a file is in the logs."""
         if state := _state_of(file):
             self.digests[_name_of(file)] = (*state, digest)
 
     def save(self) -> None:
-        """Write the cache; what cannot be written is not kept."""
+        """Write the cache; ignores a folder that is not writable."""
         keep_json(self.cache, {"files": self.digests})
 
 
@@ -242,28 +243,28 @@ def _name_of(log: Path) -> str:
 
 
 def _state_of(log: Path) -> tuple[int, int] | None:
-    """Return size and what changes when the content does; None if that is not known."""
-    with suppress(OSError):  # whoever reads it says what is wrong
-        found = log.stat()
-        return found.st_size, found.st_mtime_ns
+    """Return size and time of change, None if the file cannot be examined."""
+    with suppress(OSError):  # the reader of the file reports the problem
+        status = log.stat()
+        return status.st_size, status.st_mtime_ns
     return None
 
 
 def size_of(log: Path) -> int:
-    """Return the bytes of a log, 0 if that is not known."""
+    """Return the bytes of a log, 0 if it cannot be examined."""
     return (_state_of(log) or (0, 0))[0]
 
 
-# What becomes of a file whose recording is in the logs already.
+# Files whose recording is stored already.
 
 
 class DuplicateDetector:
-    """Looks for the recordings of a batch of files, in the logs and in the batch."""
+    """Finds recordings that are stored already, or twice in a batch."""
 
     def __init__(
         self, warehouse: Warehouse, logs: Snapshot, mapping: str, replace: Replace
     ) -> None:
-        """Take a snapshot of the logs, the mapping's name, and what is to give way."""
+        """Take a snapshot of the logs, the mapping's name, and which recordings to replace."""
         self._warehouse, self._logs = warehouse, logs
         self._mapping, self._replace = mapping, replace
         self._logs_have: Fingerprints | None = None
@@ -278,52 +279,51 @@ class DuplicateDetector:
         name: str,
         earlier: str | None,
     ) -> tuple[frozenset[SourceRef], frozenset[SourceRef], int]:
-        """Return what has a file's fingerprints, there or not, what gives way, and how many drives.
+        """Return the sources with a file's fingerprints, those to replace, and their drives' count.
 
-        `name` is the file's as `source_file` has it; `earlier` is the digest of what its path had
-        before, if that is there. Raises `RepeatedError` for what does not give way to it.
+        `name` is the value of the file's `source_file`; `earlier` is the digest of the stored
+        content that its path had before. Raises `RepeatedError` for a recording not to replace.
         """
-        for origin in Fingerprints(self._batch).find(fingerprints):
-            # Another one: the same bytes count once anyway.
+        for source in Fingerprints(self._batch).find(fingerprints):
+            # A file with other bytes: identical files are stored once anyway.
             raise RepeatedError(
-                f"{quote_name(log)}: same recording as {quote_name(self._files[origin.digest])}. "
-                "Leave one "
-                "of them out."
+                f"{quote_name(log)}: same recording as {quote_name(self._files[source.digest])}. "
+                "Leave one of them out."
             )
         if self._logs_have is None:
             self._logs_have = Fingerprints(self._logs.transactions)
-        origins = self._logs_have.find(fingerprints)
+        sources = self._logs_have.find(fingerprints)
         changed = earlier is not None and earlier != digest
         if earlier is not None and changed:
-            origins |= {SourceRef.of(earlier)}
-        there = _drives_of(self._warehouse, {origin.file for origin in origins})
-        replaced = _replaced(there, origins, name)
-        drives = [drive for drive in there if is_from(drive, replaced)]
-        gives_way = self._replace == "all" or (
+            sources |= {SourceRef.of(earlier)}
+        stored = _drives_of(self._warehouse, {source.file for source in sources})
+        replaced = _replaced(stored, sources, name)
+        drives = [drive for drive in stored if is_from(drive, replaced)]
+        is_replaced = self._replace == "all" or (
             self._replace == "corrected"
             and not changed
-            and replaced <= {origin for origin in origins if not origin.drive}
+            and replaced <= {source for source in sources if not source.drive}
             and {re.sub(MEASURED, "", drive) for drive in drives} <= {self._mapping}
         )
-        if drives and not gives_way:
-            what = "this recording is in the logs already"
-            what = "it has changed since it was ingested" if changed else what
-            source, more = quote_name(there[drives[0]]), pluralize(len(drives), "drive")
-            such = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
+        if drives and not is_replaced:
+            problem = "this recording is in the logs already"
+            problem = "it has changed since it was ingested" if changed else problem
+            source_file, more = quote_name(stored[drives[0]]), pluralize(len(drives), "drive")
+            count = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
             raise RepeatedError(
-                f"{quote_name(log)}: {what} and would count twice: {such} from {source}. To "
-                "replace "
-                f"the old one: --replace. To remove it: fleet-slip forget --drive {drives[0]}"
+                f"{quote_name(log)}: {problem} and would count twice: {count} from {source_file}. "
+                "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
+                f"{drives[0]}"
             )
         self._batch.update(fingerprints)
         self._files[SourceRef.of(digest).digest] = log
-        return origins, replaced if drives else frozenset(), len(drives)
+        return sources, replaced if drives else frozenset(), len(drives)
 
 
 def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
-    """Withdraw a file of which no drive is left, and whose first one may come back; say if so.
+    """Withdraw the transactions of a fully erased file whose first drive may return.
 
-    Only what was forgotten by a drive's name may: what is too old stays away.
+    Returns False if it may not. Only drives that were erased by name may return.
     """
     erasure_log = ErasureLog(warehouse.root)
     if (
@@ -346,32 +346,32 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
 
 def is_fully_erased(warehouse: Warehouse, digest: str) -> bool:
-    """Whether drives were forgotten, and none is left of a file that was ingested."""
+    """Return True if there are erasures and no drive of an ingested file is stored."""
     return bool(ErasureLog(warehouse.root).entries()) and not _drives_of(
         warehouse, {SourceRef.of(digest)}
     )
 
 
 def _replaced(
-    there: Named[str, str], origins: frozenset[SourceRef], name: str
+    stored: Named[str, str], sources: frozenset[SourceRef], name: str
 ) -> frozenset[SourceRef]:
-    """Return what gives way: of a file of the same name all, else the drives that are the same."""
-    same = {drive: SourceRef.of_drive(drive) for drive in there if is_from(drive, origins)}
+    """Return what the new file replaces: all drives of a file of the same name, else duplicates."""
+    same = {drive: SourceRef.of_drive(drive) for drive in stored if is_from(drive, sources)}
     return frozenset(
-        origin.file if origin.file in origins or there[drive] == name else origin
-        for drive, origin in same.items()
-        if origin is not None
+        source.file if source.file in sources or stored[drive] == name else source
+        for drive, source in same.items()
+        if source is not None
     )
 
 
 def _drives_of(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
-    """Return the drives that came in some files and are in the logs, and their `source_file`."""
+    """Return the stored drives of some files, with their `source_file`."""
     if not files:
         return {}
     query = (
         "SELECT drive_id, source_file FROM drives "
         "WHERE list_contains($digests, regexp_extract(drive_id, $measured, 1)) ORDER BY ALL"
     )
-    given = {"digests": sorted({one.digest for one in files}), "measured": MEASURED}
+    parameters = {"digests": sorted({file.digest for file in files}), "measured": MEASURED}
     with connect_tables(warehouse, query) as database:
-        return dict(database.execute(query, given).fetchall())
+        return dict(database.execute(query, parameters).fetchall())

@@ -1,4 +1,4 @@
-"""What a night came to: `Fleet.nightly` returns it, and the next night knows it."""
+"""The summary of a night, which `Fleet.nightly` returns, and the log of nights."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import PlainSerializer, TypeAdapter
+from pydantic import Field, PlainSerializer, TypeAdapter
 
 from fleet_slip.base import Record, pluralize
 from fleet_slip.errors import AlarmError, FleetSlipError, printable
@@ -22,48 +22,49 @@ if TYPE_CHECKING:
     from fleet_slip.operations.quality_report import SensorFault
 
 NIGHTS_FOLDER = "nights"
-"""Of numbered documents, two of a night: its beginning and its end."""
+"""Folder of numbered documents: one when a night begins, one when it ends."""
 
 Hashes: TypeAlias = Annotated[frozenset[str], PlainSerializer(sorted)]
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """What a root had when a night began; `known` are hashes of its faulty drives."""
+class Baseline:
+    """The state of a data root when a night began; `known_faults` are hashes of faulty drives."""
 
     champion: str | None
     drives: int
     rows: int
     quarantined: int
-    known: Hashes = frozenset()
+    known_faults: Annotated[Hashes, Field(alias="known")] = frozenset()
     candidate: str | None = None
 
 
-_BEGINNING = TypeAdapter(Beginning)
+_BASELINE = TypeAdapter(Baseline)
 
 
 @dataclass(frozen=True)
-class Nights:
+class NightlyLog:
     """The nights of one model in a data root."""
 
     root: Folder
     model: str
 
-    def begin(self, night: date, now: Beginning) -> Beginning:
-        """Record the beginning of a night; return the one that is there, if the night has one."""
-        day, known = night.isoformat(), frozenset[str]()
+    def begin(self, night: date, state: Baseline) -> Baseline:
+        """Record the beginning of a night; return its first record if it is repeated."""
+        day, faults = night.isoformat(), frozenset[str]()
         for content in self._newest_first():
             if content["event"] == "begun" and content["night"] == day:
-                return _BEGINNING.validate_python(content)
+                return _BASELINE.validate_python(content)
             if content["event"] == "ended" and content["night"] < day:
-                known = frozenset(content["faulty"])
+                faults = frozenset(content["faulty"])
                 break
-        begun = replace(now, known=known)
-        self._append("begun", {"night": day, **_BEGINNING.dump_python(begun, mode="json")})
-        return begun
+        baseline = replace(state, known_faults=faults)
+        content = _BASELINE.dump_python(baseline, mode="json", by_alias=True)
+        self._append("begun", {"night": day, **content})
+        return baseline
 
     def end(self, content: Mapping[str, Any]) -> None:
-        """Record how a night ended."""
+        """Record the end of a night."""
         self._append("ended", content)
 
     def _newest_first(self) -> Iterator[Mapping[str, Any]]:
@@ -74,8 +75,8 @@ class Nights:
                 yield content
 
     def _append(self, event: str, content: Mapping[str, Any]) -> None:
-        known = {"event": event, "model": self.model}
-        DocumentFolder(self.root, NIGHTS_FOLDER).append({**known, **content})
+        head = {"event": event, "model": self.model}
+        DocumentFolder(self.root, NIGHTS_FOLDER).append({**head, **content})
 
 
 State: TypeAlias = Literal["done", "attention", "failed", "left out"]
@@ -83,40 +84,36 @@ State: TypeAlias = Literal["done", "attention", "failed", "left out"]
 
 @dataclass(frozen=True)
 class NightStep(Record):
-    """One step of a night.
+    """One step of a night: its state, what it did in a sentence, and its error if it failed."""
 
-    Attributes:
-        state: whether it was done, calls for attention, failed, or could not be asked for.
-        told: what it did or found, in a sentence.
-        error: what it failed with.
-    """
-
-    DOCUMENT = "name state told exit_code=error.exit_code"
+    DOCUMENT = "name state told=summary exit_code=error.exit_code"
 
     name: str
     state: State
-    told: str
+    summary: str
     seconds: float
     error: FleetSlipError | None = None
 
 
 @dataclass(frozen=True)
 class NightReport(Answer):
-    """The summary of a night. All but `seconds` is the same if the night was killed on its way.
+    """The summary of a night. Only `seconds` depends on whether the night was interrupted.
 
-    Attributes:
-        before: what the root had when the night first began.
-        faults: the drives with faulty sensors; `new_faults` came with this night. The
-            summary names them.
-        chart: the errors of the champion of before on the days since it was trained, if there are
-            enough days to tell what is usual.
+    Attributes
+    ----------
+    before : Baseline
+        State of the data root when the night first began.
+    faults : tuple of SensorFault
+        Drives with faulty sensors; `new_faults` are those of this night.
+    chart : Chart or None
+        Errors of the previous champion on each day since its training, if there are enough days.
     """
 
     model: str
     night: date
     root: str
     steps: tuple[NightStep, ...]
-    before: Beginning
+    before: Baseline
     drives: int
     rows: int
     quarantined: int
@@ -128,54 +125,58 @@ class NightReport(Answer):
 
     @property
     def new_faults(self) -> "tuple[SensorFault, ...]":
-        """The faulty drives that the night before did not know of."""
-        known = self.before.known
+        """The faulty drives that the previous night did not report."""
         return tuple(
-            one for one in self.faults if hash_drive(self.model, one.drive_id) not in known
+            fault
+            for fault in self.faults
+            if hash_drive(self.model, fault.drive_id) not in self.before.known_faults
         )
 
     @property
     def problem(self) -> FleetSlipError | None:
-        """The first failure, else what calls for attention; None after a good night."""
+        """The first failure, else what needs attention; None after a good night."""
         night = f"the night of {self.night}"
-        found: FleetSlipError | None = None
-        for step in self.steps:
-            if step.error is not None:
-                found = type(step.error)(f"{night}: {step.name} failed: {step.error}")
-                break
-        calling = [f"{one.name}: {one.told}" for one in self.steps if one.state == "attention"]
-        if calling and found is None:
-            found = AlarmError(f"{night}: {' '.join(calling)}")
-        if found is not None:
-            found.headline = f"{night}: {self.verdict}"
-        return found
+        alarms = [f"{step.name}: {step.summary}" for step in self._with_state("attention")]
+        problem: FleetSlipError
+        if failures := [(step.name, step.error) for step in self.steps if step.error]:
+            name, error = failures[0]
+            problem = type(error)(f"{night}: {name} failed: {error}")
+        elif alarms:
+            problem = AlarmError(f"{night}: {' '.join(alarms)}")
+        else:
+            return None
+        problem.headline = f"{night}: {self.verdict}"
+        return problem
+
+    def _with_state(self, state: State) -> list[NightStep]:
+        return [step for step in self.steps if step.state == state]
 
     @property
     def exit_code(self) -> int:
-        """That of the first failure, 10 if something calls for attention, else 0."""
+        """The exit code of the first failure, 10 if something needs attention, else 0."""
         return self.problem.exit_code if self.problem else 0
 
     @property
     def verdict(self) -> str:
-        """How the night went, in a few words."""
-        failed = [step.name for step in self.steps if step.state == "failed"]
-        calling = [step.name for step in self.steps if step.state == "attention"]
-        parts = [f"{' and '.join(failed)} failed"] if failed else []
-        if calling:
-            calls = "calls" if len(calling) == 1 else "call"
-            parts.append(f"{' and '.join(calling)} {calls} for attention")
-        return ", ".join(parts) or "all went well"
+        """The outcome in a few words."""
+        failed = [step.name for step in self._with_state("failed")]
+        alarms = [step.name for step in self._with_state("attention")]
+        clauses = [f"{' and '.join(failed)} failed"] if failed else []
+        if alarms:
+            verb = "calls" if len(alarms) == 1 else "call"
+            clauses.append(f"{' and '.join(alarms)} {verb} for attention")
+        return ", ".join(clauses) or "all went well"
 
     @property
     def gained(self) -> str:
-        """What the night brought in."""
+        """The new drives, rows and rejected rows."""
         rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
-        held = self.quarantined - self.before.quarantined
+        rejected = self.quarantined - self.before.quarantined
         new = f"{pluralize(drives, 'drive')}, {pluralize(rows, 'row')}"
-        return f"{new}; in quarantine: {pluralize(held, 'row')}" if held else new
+        return f"{new}; in quarantine: {pluralize(rejected, 'row')}" if rejected else new
 
     def as_past(self) -> dict[str, Any]:
-        """Return the night as the record keeps it; `faulty` are hashes of the faulty drives."""
+        """Return the document of the nightly log; `faulty` are hashes of the faulty drives."""
         return {
             "night": self.night.isoformat(),
             "exit_code": self.exit_code,
@@ -183,32 +184,32 @@ class NightReport(Answer):
             "rows": self.rows,
             "champion": self.champion,
             "steps": {step.name: step.state for step in self.steps},
-            "faulty": sorted({hash_drive(self.model, one.drive_id) for one in self.faults}),
+            "faulty": sorted({hash_drive(self.model, f.drive_id) for f in self.faults}),
         }
 
     def parts(self) -> Iterator[Part]:
-        """Return the summary for people, lines of text."""
-        wide = max(len(step.name) for step in self.steps)
+        """Render the summary as lines of text."""
+        width = max(len(step.name) for step in self.steps)
         mark = {"done": "ok", "attention": "LOOK", "failed": "FAILED", "left out": "-"}
         lines = [
             f"{self.model}, night of {self.night}: {self.verdict} (exit code {self.exit_code})",
             f"new: {self.gained}; champion: {self.champion or 'none'}"
             + (f", was {self.before.champion}" if self.moved else ""),
-            *(f"  {one.name:<{wide}}  {mark[one.state]:<6}  {one.told}" for one in self.steps),
+            *(f"  {s.name:<{width}}  {mark[s.state]:<6}  {s.summary}" for s in self.steps),
             *(
-                f"  {one.drive_id}: {one.fault.kind} {' '.join(one.fault.signals)}"
-                for one in self.new_faults
+                f"  {new.drive_id}: {new.fault.kind} {' '.join(new.fault.signals)}"
+                for new in self.new_faults
             ),
         ]
         yield "\n".join(printable(line).rstrip() for line in lines)
 
     @property
     def moved(self) -> bool:
-        """Whether the night replaced a champion."""
+        """True if the night replaced a champion."""
         return self.before.champion not in (None, self.champion)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `nightly --json` prints."""
+        """Return the document that `nightly --json` prints."""
         return {
             "model": self.model,
             "night": self.night,
@@ -223,20 +224,20 @@ class NightReport(Answer):
             "champion_before": self.before.champion,
             "candidate": self.candidate,
             "steps": [step.as_dict() for step in self.steps],
-            "faults": [one.as_dict() for one in self.faults],
-            "new_faults": [one.drive_id for one in self.new_faults],
+            "faults": [fault.as_dict() for fault in self.faults],
+            "new_faults": [fault.drive_id for fault in self.new_faults],
             "alarms": [str(day.day) for day in self.chart.alarms] if self.chart else [],
             "seconds": self.seconds,
         }
 
 
 def write_summary(report: NightReport, folder: Path) -> list[Path]:
-    """Write NIGHT.txt and .json, each as a whole; return them. Raises `StorageError`."""
+    """Write the summary as NIGHT.txt and NIGHT.json; return the files. Raises `StorageError`."""
     files = {
         f"{report.night}.txt": f"{report}\n",
         f"{report.night}.json": json.dumps(report.as_dict(), indent=2, default=str) + "\n",
     }
-    place = LocalFolder(folder)
+    target = LocalFolder(folder)
     for name, text in files.items():
-        place.put(name, text.encode("utf-8", "backslashreplace"))
+        target.put(name, text.encode("utf-8", "backslashreplace"))
     return [folder / name for name in files]

@@ -185,8 +185,8 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
 
 def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
     """Return the days of drives and the files that they came in, as numbers, and their cars."""
-    origins = [SourceRef.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
-    files = [one.digest if one else "" for one in origins]
+    sources = [SourceRef.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
+    files = [one.digest if one else "" for one in sources]
     of_day, of_file, of_car = (
         np.unique(np.array(values, dtype=str), return_inverse=True)[1]
         for values in (metadata["day"].to_pylist(), files, metadata["vehicle_id"].to_pylist())

@@ -197,21 +197,25 @@ def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
 
 
 def build_removal(
-    warehouse: Warehouse, name: TableName, snapshot: Snapshot, origins: Collection[SourceRef]
+    warehouse: Warehouse, name: TableName, snapshot: Snapshot, sources: Collection[SourceRef]
 ) -> Change:
     """Return the change that takes the drives, or the refused rows, of some origins out."""
     if name == "quarantine":
-        return _without_refused(snapshot, origins)
+        return _without_refused(snapshot, sources)
     drives = drives_in(warehouse, snapshot)
-    gone = {p: {one for one in there if is_from(one, origins)} for p, there in drives.items()}
-    left = {SourceRef.of_drive(one) for p, there in drives.items() for one in there - gone[p]}
-    files = {one.file for one in origins} - {one.file for one in left if one}
-    transactions = Fingerprints(snapshot.transactions).withdraw(origins, files)
-    concerned = [file for file in snapshot.files if gone.get(file.path)]
+    removed = {
+        p: {drive for drive in present if is_from(drive, sources)} for p, present in drives.items()
+    }
+    remaining = {
+        SourceRef.of_drive(drive) for p, present in drives.items() for drive in present - removed[p]
+    }
+    files = {s.file for s in sources} - {source.file for source in remaining if source}
+    transactions = Fingerprints(snapshot.transactions).withdraw(sources, files)
+    concerned = [file for file in snapshot.files if removed.get(file.path)]
     if concerned:
         transactions += rewrite_transactions(snapshot, concerned)
-    kept = [Rewriting("kept", [file], gone[file.path]) for file in concerned]
-    return Change(write_again(warehouse, snapshot, kept), concerned, transactions)
+    rewritings = [Rewriting("kept", [file], removed[file.path]) for file in concerned]
+    return Change(write_again(warehouse, snapshot, rewritings), concerned, transactions)
 
 
 def _without_refused(snapshot: Snapshot, origins: Collection[SourceRef]) -> Change:

@@ -40,10 +40,8 @@ def fleet_slip_nightly() -> None:
 
     @task
     def nightly() -> str:
-        landing, mapping = os.environ["FLEET_SLIP_LANDING"], os.environ["FLEET_SLIP_MAPPING"]
-        return give(
-            "nightly", "--landing", landing, "--mapping", mapping, "--model", "fleet", "--json"
-        )
+        inbox, mapping = os.environ["FLEET_SLIP_INBOX"], os.environ["FLEET_SLIP_MAPPING"]
+        return give("nightly", "--inbox", inbox, "--mapping", mapping, "--model", "fleet", "--json")
 
     @task
     def status() -> str:

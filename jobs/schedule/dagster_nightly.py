@@ -19,7 +19,7 @@ cluster, not all done."""
 class Night(dagster.Config):
     """Where logs land, their mapping, and the model."""
 
-    landing: str = "/srv/fleet-slip/landing"
+    inbox: str = "/srv/fleet-slip/inbox"
     mapping: str = "/etc/fleet-slip/mapping.toml"
     model: str = "fleet"
 
@@ -27,7 +27,7 @@ class Night(dagster.Config):
 @dagster.asset
 def champion(context: dagster.AssetExecutionContext, config: Night) -> dagster.MaterializeResult:
     """The model version in use after the night."""
-    words = ["--landing", config.landing, "--mapping", config.mapping, "--model", config.model]
+    words = ["--inbox", config.inbox, "--mapping", config.mapping, "--model", config.model]
     done = subprocess.run(
         [PROGRAM, "nightly", *words, "--json"], capture_output=True, text=True, check=False
     )

@@ -56,21 +56,21 @@ def _fill(fleet: Fleet) -> Fleet:
 def test_a_notebook_does_what_the_command_line_does(filled: Fleet) -> None:
     cohort = filled.cohort("adhesion > 0.9")
     selection = cohort.select(models="table1", folds=3)
-    publication = filled.publish("dry", selection)
+    publication = filled.models.publish("dry", selection)
     assert publication.new
     assert publication.version.manifest.trained_on.cohort == "adhesion > 0.9"
-    assert not filled.publish("dry", selection).new
+    assert not filled.models.publish("dry", selection).new
     log = filled.sql("FROM log").pl()
-    angles = filled.model("dry").predict(log)
+    angles = filled.models.get("dry").predict(log)
     error = (angles - log["sideslip_rad"]).to_numpy()
-    score = filled.score("dry")
+    score = filled.evaluation.score("dry")
     assert score.rows == len(error)
     assert abs(error).max() == pytest.approx(score.error_max_deg * 3.14159265 / 180, rel=1e-6)
-    assert filled.check().drives == 4
-    assert filled.status().tables["logs"].rows == log.height
-    assert not filled.verify().damage
-    assert not filled.quality().findings
-    assert filled.compact(dry_run=True).vacuumed.dry_run
+    assert filled.maintenance.check_grams().drives == 4
+    assert filled.maintenance.status().tables["logs"].rows == log.height
+    assert not filled.maintenance.verify().damage
+    assert not filled.maintenance.quality().findings
+    assert filled.maintenance.compact(dry_run=True).vacuumed.dry_run
 
 
 def test_a_call_that_changes_the_warehouse_is_in_the_history_of_runs(filled: Fleet) -> None:
@@ -89,7 +89,7 @@ def test_only_what_the_history_may_keep_is_kept(tmp_path: Path) -> None:
     own = fleet_slip.open(tmp_path / "own")
     (tmp_path / "own").mkdir()
     with pytest.raises(QuestionError):
-        own.forget(vehicle=vehicle)
+        own.maintenance.forget(vehicle=vehicle)
     history = [file for file in (tmp_path / "own/runs").iterdir() if file.suffix == ".jsonl"]
     text = "".join(file.read_text() for file in history)
     assert "forget" in text
@@ -121,8 +121,8 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
     cohort = fleet.cohort("speed_factor < 0.95")
     assert "speed_factor" in repr(cohort)
     diagnosis = cohort.diagnose("bent")
-    assert diagnosis.fitted.model.signals == fleet.model("bent").manifest.signals
-    assert cohort.diagnose(fleet.model("bent")).drives == diagnosis.drives
+    assert diagnosis.fitted.model.signals == fleet.models.get("bent").manifest.signals
+    assert cohort.diagnose(fleet.models.get("bent")).drives == diagnosis.drives
     subset = cohort.select(order="ay,yaw_rate", all_subsets=True, criterion="bic")
     assert subset.choice and subset.choice.subsets
     with pytest.raises(UsageError, match="not both"):
@@ -149,7 +149,7 @@ def test_measured_files_are_ingested_and_reported_in_their_order(tmp_path: Path)
     reports = fleet.ingest(
         files,
         mapping,
-        each=lambda report: each.append(report.file),
+        on_report=lambda report: each.append(report.file),
         progress=lambda done, total: seen.append((done, total)),
     )
     assert [report.file for report in reports] == each == [str(file) for file in files]
@@ -190,7 +190,7 @@ def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
     selection = fleet.cohort().select(models="table1")
     made: list[object] = []
     threads = [
-        threading.Thread(target=lambda: made.append(fleet.publish("slip", selection)))
+        threading.Thread(target=lambda: made.append(fleet.models.publish("slip", selection)))
         for _ in range(2)
     ]
     for thread in threads:
@@ -198,11 +198,11 @@ def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
     for thread in threads:
         thread.join(120)
     assert len(made) == 2
-    assert fleet.models("slip").num_rows == 1
+    assert fleet.models.versions("slip").num_rows == 1
 
 
 def test_a_manifest_names_the_columns_of_todays_catalog(fleet: Fleet) -> None:
-    manifest: Manifest = fleet.model("bent").manifest
+    manifest: Manifest = fleet.models.get("bent").manifest
     log = {name for name, *_ in fleet.sql("DESCRIBE log").fetchall()}
     assert {*manifest.columns(fleet.warehouse.catalog.signals)} <= log
     folder: Folder = fleet.root

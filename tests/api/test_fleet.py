@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 
 import fleet_slip
-from fleet_slip.api.cohort import FleetCohort
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.api.fleet_cohort import FleetCohort
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.select import Selection
@@ -114,13 +114,13 @@ def test_a_relation_cannot_write(fleet: Fleet, tmp_path: Path) -> None:
 
 def test_a_wrong_root_is_not_an_empty_warehouse(tmp_path: Path) -> None:
     nowhere = fleet_slip.open(tmp_path / "nothing")
-    for ask in (lambda: nowhere.sql("FROM log"), nowhere.models):
+    for ask in (lambda: nowhere.sql("FROM log"), nowhere.models.versions):
         with pytest.raises(StorageError, match="no data root"):
             ask()
 
 
 def test_threads_share_a_fleet_and_a_model(fleet: Fleet) -> None:
-    model = fleet.model("bent")
+    model = fleet.models.get("bent")
     answers: dict[int, object] = {}
 
     def ask(number: int) -> None:
@@ -142,7 +142,7 @@ def test_all_queries_of_a_session_see_the_same_commits(smoke_copy: Path) -> None
     fleet = fleet_slip.open(smoke_copy)
     with fleet.session() as session:
         before = session.sql(COUNT).fetchall()
-        fleet.forget(drive="smoke-2024-05-01-0000")
+        fleet.maintenance.forget(drive="smoke-2024-05-01-0000")
         assert session.sql(COUNT).fetchall() == before
     assert fleet.sql(COUNT).fetchall() != before
 
@@ -191,9 +191,9 @@ def test_answers_are_shown_on_a_line_or_two(smoke_root: Path) -> None:
     selection = cohort.select(models="table1")
     assert repr(selection).startswith("<Selection: ")
     assert "RMSE" in repr(selection)
-    model = fleet.model("smoke")
+    model = fleet.models.get("smoke")
     assert repr(model).startswith("<ModelVersion smoke@1: ")
-    for answer in (selection, model, fleet.status()):
+    for answer in (selection, model, fleet.maintenance.status()):
         assert len(repr(answer)) < 500
     assert len(repr(selection.models[0].model)) < 200  # its fractions may have 10,000 digits
     assert "Fraction" not in repr(cohort.diagnose(model))
@@ -203,8 +203,8 @@ def test_a_notebook_shows_what_commands_print(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     selection = fleet.cohort("campaign <> '<script>'").select(models="table1")
     assert f"winner: {selection.winner.model.name}. " in selection._repr_html_()
-    page = fleet.model("smoke")._repr_html_()
-    assert page.count("\n") == len(fleet.model("smoke").manifest.terms) + 2
+    page = fleet.models.get("smoke")._repr_html_()
+    assert page.count("\n") == len(fleet.models.get("smoke").manifest.terms) + 2
     assert (page[:5], page[-6:]) == ("<pre>", "</pre>")
     assert "&lt;script&gt;" in selection._repr_html_()
     assert "<script>" not in selection._repr_html_() + page
@@ -226,7 +226,10 @@ def test_a_notebook_needs_no_widgets() -> None:
 
 def test_an_answer_is_the_text_that_its_command_prints(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    answers = {"quality": fleet.quality(), "diagnose smoke": fleet.cohort().diagnose("smoke")}
+    answers = {
+        "quality": fleet.maintenance.quality(),
+        "diagnose smoke": fleet.cohort().diagnose("smoke"),
+    }
     for words, answer in answers.items():
         assert str(answer) == run_on(smoke_root, *words.split()).stdout.rstrip()
 
@@ -236,9 +239,9 @@ def test_a_users_lines_are_typed(fleet: Fleet) -> None:
     cohort = assert_type(fleet.cohort("adhesion > 0.9"), FleetCohort)
     selection = assert_type(cohort.select(models="table1", folds=3), Selection)
     assert_type(selection.winner.model.correlation, float)
-    assert_type(fleet.status().problems, tuple[str, ...])
+    assert_type(fleet.maintenance.status().problems, tuple[str, ...])
     log = assert_type(fleet.sql("FROM log LIMIT 10"), duckdb.DuckDBPyRelation).pl()
-    model = assert_type(fleet.model("smoke@1"), ModelVersion)
+    model = assert_type(fleet.models.get("smoke@1"), ModelVersion)
     frame = pl.DataFrame(log)
     assert isinstance(assert_type(model.predict(frame), pl.Series), pl.Series)
     columns = {name: frame[name].to_numpy() for name in model.columns}

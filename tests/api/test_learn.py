@@ -77,20 +77,20 @@ def test_show_and_exports_list_the_assumptions(
     shown = run_on(folder / "root", "show", "golf")
     assert "assumed" in shown.stdout
     fleet = fleet_slip.open(folder / "root")
-    assumed = list(fleet.model("golf").manifest.assumed)
+    assumed = list(fleet.models.get("golf").manifest.assumed)
     for to in ("c", "sql"):
-        fleet.export("golf", to, tmp_path)
+        fleet.models.export("golf", to, tmp_path)
         name = f"sideslip_golf_{to}"
         assert json.loads((tmp_path / f"{name}_manifest.json").read_text())["assumed"] == assumed
         assert assumed[0] in (tmp_path / f"{name}_README.md").read_text()
-    assert fleet.verify().damage == []
+    assert fleet.maintenance.verify().damage == []
 
 
 def test_a_version_without_assumptions_is_what_it_was(
     learned: tuple[Path, Finished, Finished],
 ) -> None:
     folder, _, _ = learned
-    manifest = fleet_slip.open(folder / "root").model("golf").manifest
+    manifest = fleet_slip.open(folder / "root").models.get("golf").manifest
     assert "assumed" not in manifest.model_copy(update={"assumed": ()}).model_dump(mode="json")
 
 

@@ -15,9 +15,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api import nightly
-from fleet_slip.api.nightly import Night
+from fleet_slip.api.nightly import NightlyPipeline
 from fleet_slip.errors import StorageError, UsageError
-from fleet_slip.operations.night import Beginning, NightReport, Nights
+from fleet_slip.operations.night import Baseline, NightlyLog, NightReport
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.predicate import hash_drive, parse_predicate, without_drives
@@ -107,7 +107,7 @@ def give(place: Path, night: int, **options: Any) -> NightReport:
 
 
 def command(place: Path, night: int, *options: str) -> list[str]:
-    words = ["nightly", "--landing", f"{place / 'landing'}", "--model", "smoke", *OPTIONS]
+    words = ["nightly", "--inbox", f"{place / 'landing'}", "--model", "smoke", *OPTIONS]
     mapping = [] if "--mapping" in options else ["--mapping", f"{place / 'landing.toml'}"]
     return [*words, *mapping, "--night", f"{day_of(night)}", *options]
 
@@ -162,7 +162,7 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
             f"smoke@{night + 1}",
         ), str(report)
     assert "smoke@2 is up to date" in str(give(place, 2))
-    assert fleet.verify(full=True).findings == []
+    assert fleet.maintenance.verify(full=True).findings == []
 
 
 class Killed(BaseException):
@@ -170,7 +170,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("step", ["_retain", "_publish", "_candidate"])
+@pytest.mark.parametrize("step", ["_retain", "_publish", "_waiting_candidate"])
 def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     place: Path, landing: Landing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
 ) -> None:
@@ -178,16 +178,16 @@ def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     twin = Path(shutil.copytree(place, tmp_path / "twin"))
     undisturbed = give(twin, 2)
 
-    def kill(_: Night) -> None:
+    def kill(_: NightlyPipeline) -> None:
         raise Killed
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(Night, step, kill)
+        patch.setattr(NightlyPipeline, step, kill)
         give(place, 2)
     again = give(place, 2)
     assert figures(again) == figures(undisturbed)
     assert state(place / "data") == state(twin / "data")
-    assert not fleet_slip.open(place / "data").verify().damage
+    assert not fleet_slip.open(place / "data").maintenance.verify().damage
 
 
 @pytest.mark.long
@@ -299,7 +299,7 @@ def test_what_means_nothing_is_refused_before_anything_is_written(
     run_command: Callable[..., Finished], tmp_path: Path
 ) -> None:
     done = run_command(
-        *("nightly", "--landing", ".", "--mapping", "m", "--model", "m", "--night", "yesterday")
+        *("nightly", "--inbox", ".", "--mapping", "m", "--model", "m", "--night", "yesterday")
     )
     assert done.exit_code == 2
     assert "--night yesterday: not a date" in done.stderr
@@ -312,35 +312,35 @@ def test_what_means_nothing_is_refused_before_anything_is_written(
 
 
 MONDAY, TUESDAY = date(2026, 10, 5), date(2026, 10, 6)
-NOW = Beginning("fleet@1", drives=4, rows=100, quarantined=0)
+NOW = Baseline("fleet@1", drives=4, rows=100, quarantined=0)
 
 
 @pytest.fixture
-def nights(tmp_path: Path) -> Nights:
-    return Nights(LocalFolder(tmp_path), "fleet")
+def nights(tmp_path: Path) -> NightlyLog:
+    return NightlyLog(LocalFolder(tmp_path), "fleet")
 
 
 def past(night: date, *faulty: str) -> dict[str, object]:
     return {"night": night.isoformat(), "drives": 4, "faulty": faulty}
 
 
-def test_a_night_that_is_given_again_has_the_beginning_it_had(nights: Nights) -> None:
+def test_a_night_that_is_given_again_has_the_beginning_it_had(nights: NightlyLog) -> None:
     assert nights.begin(MONDAY, NOW) == NOW
-    later = Beginning("fleet@2", drives=8, rows=200, quarantined=3)
+    later = Baseline("fleet@2", drives=8, rows=200, quarantined=3)
     assert nights.begin(MONDAY, later) == NOW
     nights.end(past(MONDAY, "cd"))
     assert nights.begin(MONDAY, later) == NOW
     nights.end(past(MONDAY, "ab"))  # as it ended at last
-    assert nights.begin(TUESDAY, later) == replace(later, known=frozenset({"ab"}))
+    assert nights.begin(TUESDAY, later) == replace(later, known_faults=frozenset({"ab"}))
 
 
-def test_models_have_nights_of_their_own(nights: Nights) -> None:
+def test_models_have_nights_of_their_own(nights: NightlyLog) -> None:
     nights.end(past(MONDAY, "ab"))
-    other = Nights(nights.root, "other")
-    assert other.begin(TUESDAY, NOW).known == frozenset()
+    other = NightlyLog(nights.root, "other")
+    assert other.begin(TUESDAY, NOW).known_faults == frozenset()
 
 
-def test_a_changed_record_is_refused(nights: Nights, tmp_path: Path) -> None:
+def test_a_changed_record_is_refused(nights: NightlyLog, tmp_path: Path) -> None:
     nights.end(past(MONDAY))
     file = tmp_path / "nights/1.json"
     file.write_text(file.read_text().replace('"drives": 4', '"drives": 5'))

@@ -69,7 +69,7 @@ def test_a_selection_is_not_affected_by_opening_another_root(fleets: tuple[Fleet
     first, second = fleets
     first.gram("mine")
     before = first.cohort().select(models="few")
-    second.migrate()
+    second.maintenance.migrate()
     second.gram("mine")
     other = second.cohort().select(models="few")
     after = first.cohort().select(models="few")
@@ -92,8 +92,8 @@ def test_lists_and_campaigns_of_a_folder_are_found_without_an_environment_variab
     with pytest.raises(ConfigError, match="nothing is called 'brief'"):
         second.simulate("brief")
     first.gram("mine")
-    published = first.publish("few", first.cohort().select(models="few"), force=True)
-    again = first.publish("few")
+    published = first.models.publish("few", first.cohort().select(models="few"), force=True)
+    again = first.models.publish("few")
     assert (again.new, again.version) == (False, published.version)
 
 

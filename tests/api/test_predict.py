@@ -200,7 +200,7 @@ def test_the_bits_on_the_logs_are_those_of_a_dot_product_in_sql(fleet: Fleet) ->
 
 def test_a_relation_is_a_frame(fleet: Fleet) -> None:
     relation = fleet.sql("FROM log ORDER BY drive_id, tick LIMIT 100")
-    one = fleet.model("smoke")
+    one = fleet.models.get("smoke")
     assert one.predict(relation).to_pylist() == one.predict(relation.pl()).to_list()
 
 

@@ -77,7 +77,7 @@ def test_the_delay_is_found_with_its_uncertainty(
 ) -> None:
     fleet = late_fleet(tmp_path, delay_s)
     fleet.gram("calibration")
-    found = fleet.calibrate()
+    found = fleet.maintenance.calibrate()
     (car,), (one,) = found.receivers.cars, found.receivers.cars.values()
     assert one.drives == 8
     assert abs(one.value - delay_s) < 0.005
@@ -178,7 +178,7 @@ def test_a_late_course_teaches_what_one_in_time_does(late_fleet: LateFleet, tmp_
             fleet.gram(name)
         selection = fleet.cohort("true").select(label="course", model=MODEL)
         coefficients.append([float(c) for c in selection.winner.model.model.coefficients])
-        assert fleet.publish("in_time", selection).new
+        assert fleet.models.publish("in_time", selection).new
     assert coefficients[1] == pytest.approx(coefficients[0], rel=0.1)
 
 
@@ -194,7 +194,7 @@ def test_gram_rows_follow_the_delay_that_more_drives_tell(
     assert len({row[2] for row in rows}) == 1
     assert len(rows) > len(early)
     assert not fleet.gram("course").changed
-    assert fleet.check().wide_drives
+    assert fleet.maintenance.check_grams().wide_drives
 
 
 def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
@@ -202,7 +202,7 @@ def test_what_a_forgotten_drive_told_of_the_delay_is_gone(
 ) -> None:
     fleet = late_fleet(tmp_path, 0.087, grams=("course",))
     ((drive,), *_) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
-    fleet.forget(drive=drive)
+    fleet.maintenance.forget(drive=drive)
     kept = corrected_rows(fleet)
     assert drive not in {row[0] for row in kept}
     other = fleet_slip.open(tmp_path / "anew")
@@ -233,8 +233,8 @@ def test_what_a_course_of_unknown_delay_taught_is_not_published(
     with pytest.raises(
         RefusedError, match=r"not estimated to 5 ms \(late-0000: \d\d ms, from too few"
     ):
-        fleet.publish("late", selection)
-    assert fleet.publish("late", selection, force=True).new
+        fleet.models.publish("late", selection)
+    assert fleet.models.publish("late", selection, force=True).new
 
 
 def test_one_wild_car_leaves_the_delays_of_the_others_known() -> None:

@@ -28,7 +28,7 @@ def test_a_second_run_does_nothing(
 ) -> None:
     second = run_command("run", "--campaign", "smoke", "--json").json
     assert not second["changed"]
-    published = fleet_slip.open(smoke_root).model("smoke")
+    published = fleet_slip.open(smoke_root).models.get("smoke")
     assert second["publish"]["sha256"] == published.sha256
     assert "nothing to do" in run_command("run", "--campaign", "smoke").stderr
 
@@ -154,7 +154,7 @@ def test_publish_show_score_promote_and_roll_back(
     forced = run_command("publish", "slip", *alone, "--force", "--json").json
     assert (forced["version"], forced["new"]) == (2, True)
     assert run_command("show", "slip", "--json").json["version"] == 2
-    assert run_command("promote", "slip", "--previous").exit_code == 0
+    assert run_command("rollback", "slip").exit_code == 0
     shown = run_command("show", "slip@champion", "--json").json
     assert shown["version"] == 1
     score = run_command("score", "slip", "--json").json
@@ -200,7 +200,7 @@ FORGED = (
         (["show", "smoke", "--root", "mine"], 2, "--root stands before the command"),
         (["ingest", __file__], 4, "fleet-slip mapping suggest LOG"),
         (["score", "smoke@9"], 5, "has no version"),
-        (["promote", "nowhere", "--previous"], 5, "no model is called"),
+        (["rollback", "nowhere"], 5, "no model is called"),
         (["score", "smoke", "--cohort", "mass_kg > 9000"], 5, "no row of the cohort"),
         (["ingest", "none.csv", "--mapping", "race_car_250lm"], 4, "none.csv"),
         (["ingest", "none.csv", "--mapping", "unknown"], 3, "Known: race_car_250lm"),
@@ -310,13 +310,13 @@ def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
     run_command: RunCommand, smoke_copy: Path
 ) -> None:
     assert run_command(*WORSE, "--force").exit_code == 0
-    for hold in (["pin", "smoke"], ["promote", "smoke", "--previous"]):
+    for hold in (["pin", "smoke"], ["rollback", "smoke"]):
         assert run_command(*hold).exit_code == 0
         before = run_command("show", "smoke", "--json").json["version"]
         night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
         assert night.json["candidate"]
         assert run_command("show", "smoke", "--json").json["version"] == before
-    assert run_command("pin", "smoke", "--off").exit_code == 0
+    assert run_command("unpin", "smoke").exit_code == 0
     night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
     assert not night.json["candidate"]
 

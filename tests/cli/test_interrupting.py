@@ -9,19 +9,19 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 import fleet_slip
-from fleet_slip.api.calls import doc_of
-from fleet_slip.api.cohort import FleetCohort
-from fleet_slip.api.fleet import Fleet
+from fleet_slip import errors
+from fleet_slip.api.fleet_cohort import FleetCohort
 from fleet_slip.cli import app as program
-from fleet_slip.cli.app import COMMANDS, GROUPS, CommandGroup, load_command
+from fleet_slip.cli.app import COMMANDS, EXIT_CODES, GROUPS, CommandGroup, load_command
 from fleet_slip.models.request import SelectionRequest
+from fleet_slip.regression.orders import METHODS, RANKINGS
+from fleet_slip.regression.subsets import CRITERIA
 from fleet_slip.storage.runs import LOGGER
 from tests.support.budget import processor_s
 from tests.support.commands import COMMAND, PATIENCE_S, run
@@ -243,30 +243,23 @@ def test_summaries_are_read_without_running_a_module() -> None:
     assert not {f"fleet_slip.cli.{module}" for module in COMMANDS.values()} & loaded
 
 
-def test_a_selections_options_stand_once_and_are_those_of_the_api() -> None:
-    options = {field.name for field in fields(SelectionRequest)}
-    in_python = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
-    assert in_python == options
+def test_select_and_publish_take_the_options_of_the_api() -> None:
+    """Their help names every ranking, criterion and method."""
+    options = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
-    assert taken["select"] - {"json", "predicate", "everything", "include_faulty"} == options
+    assert taken["select"] - {"json", "cohort", "everything", "include_faulty"} == options
     assert taken["publish"] & options == options
+    assert options == {field.name for field in fields(SelectionRequest)}
+    helps = {one.name: one.help for one in load_command("select").params}
+    for option, names in (("ranking", RANKINGS), ("criterion", CRITERIA), ("search", METHODS)):
+        assert all(re.search(rf"\b{name}\b", helps[option]) for name in names)
 
 
-@pytest.mark.parametrize(
-    ("command", "method"),
-    [
-        ("run", Fleet.run),
-        ("nightly", Fleet.nightly),
-        ("forget", Fleet.forget),
-        ("monitor", Fleet.monitor),
-        ("diagnose", FleetCohort.diagnose),
-    ],
-)
-def test_options_are_the_parameters_of_a_method_with_their_words(
-    command: str, method: Callable[..., object]
-) -> None:
-    parameters = inspect.signature(method).parameters
-    told = {name: text for name, one in parameters.items() if (text := doc_of(one.annotation))}
-    taken = {one.name: one.help for one in load_command(command).params}
-    assert told
-    assert {name: taken[name].replace("--signals", "`signals`") for name in told} == told
+def test_exit_codes_in_help_are_those_of_the_errors() -> None:
+    classes = [errors.FleetSlipError]
+    for kind in classes:
+        classes += kind.__subclasses__()
+    codes = {kind.exit_code for kind in classes}
+    assert {*EXIT_CODES} == {0, errors.INTERRUPTED, *codes}
+    page = (Path(__file__).parents[2] / "docs/commands.md").read_text(encoding="utf-8")
+    assert {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)} == {*EXIT_CODES}

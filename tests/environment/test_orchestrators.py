@@ -27,7 +27,7 @@ def environment(landing: Landing, place: Path) -> dict[str, str]:
         **os.environ,
         "FLEET_SLIP": COMMAND,
         "FLEET_SLIP_ROOT": str(place / "data"),
-        "FLEET_SLIP_LANDING": str(landing.folder),
+        "FLEET_SLIP_INBOX": str(landing.folder),
         "FLEET_SLIP_MAPPING": str(landing.mapping),
         "AIRFLOW_HOME": str(place / "airflow"),
         "AIRFLOW__CORE__LOAD_EXAMPLES": "false",
@@ -49,13 +49,13 @@ def test_airflow_runs_the_night_and_then_tells_the_health(landing: Landing, tmp_
     done = run([str(python), str(dags / "airflow_nightly.py")], env=given)
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "state=success" in done.stdout + done.stderr
-    assert fleet_slip.open(tmp_path / "data").model("fleet").reference == "fleet@1"
+    assert fleet_slip.open(tmp_path / "data").models.get("fleet").reference == "fleet@1"
 
 
 def materialize(landing: Landing, place: Path, mapping: str) -> Finished:
     config = (
         "{ops: {champion: {config: {"
-        f"landing: '{landing.folder}', mapping: '{mapping}', model: fleet"
+        f"inbox: '{landing.folder}', mapping: '{mapping}', model: fleet"
         "}}}}"
     )
     file = place / "config.yaml"
@@ -69,7 +69,7 @@ def test_dagster_makes_the_champion_an_asset(landing: Landing, tmp_path: Path) -
     done = materialize(landing, tmp_path, str(landing.mapping))
     assert done.exit_code == 0, done.stderr
     assert "RUN_SUCCESS" in done.stderr + done.stdout
-    assert fleet_slip.open(tmp_path / "data").model("fleet").reference == "fleet@1"
+    assert fleet_slip.open(tmp_path / "data").models.get("fleet").reference == "fleet@1"
 
 
 @pytest.mark.tools("dagster")

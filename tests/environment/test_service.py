@@ -123,7 +123,7 @@ def test_the_service_does_its_night_and_keeps_its_compiled_code(
     landing.prepare()
     landing.land("first", landing.drives(), date(2026, 10, 5))
     words = shlex.split(service["ExecStart"])[1:]
-    words[words.index("--landing") + 1] = str(landing.folder)
+    words[words.index("--inbox") + 1] = str(landing.folder)
     words[words.index("--mapping") + 1] = str(landing.mapping)
     done = run(confined(service, folder, [*words, "--json"]))
     assert done.exit_code == 0, done.stderr

@@ -61,7 +61,7 @@ def test_a_night_makes_no_other_system_calls(tmp_path: Path, smoke_root: Path) -
     landing = Landing(tmp_path / "landing", smoke_root)
     landing.prepare()
     landing.land("first", landing.drives(), date(2026, 10, 5))
-    words = [COMMAND, "--root", str(tmp_path / "data"), "nightly", "--landing", landing.folder]
+    words = [COMMAND, "--root", str(tmp_path / "data"), "nightly", "--inbox", landing.folder]
     options = ["--mapping", landing.mapping, "--model", "fleet", "--models", "table1"]
     counts = tmp_path / "calls"
     command = ["strace", "-f", "-c", "-S", "name", "-U", "name", "-o", str(counts)]

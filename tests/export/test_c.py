@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c import LARGEST_UNSIGNED
+from fleet_slip.export.c import MAX_UNSIGNED
 from fleet_slip.export.compile import angles_by_kernel, compile_program
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
@@ -110,7 +110,7 @@ def test_no_bytes_make_the_fuzz_target_overflow(tmp_path: Path) -> None:
 
 def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    files = export_texts(fleet.model("smoke"), fleet.warehouse, "c")
+    files = export_texts(fleet.models.get("smoke"), fleet.warehouse, "c")
     ends = (".h", ".c", "_test.c", "_fuzz.c", ".a2l", "_c_README.md", "_c_manifest.json")
     assert list(files) == [f"sideslip_smoke{end}" for end in ends]
     for name, text in files.items():
@@ -129,7 +129,7 @@ def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_pa
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++")
 def test_a_program_in_cpp_takes_the_header(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    for name, text in export_texts(fleet.model("smoke"), fleet.warehouse, "c").items():
+    for name, text in export_texts(fleet.models.get("smoke"), fleet.warehouse, "c").items():
         (tmp_path / name).write_text(text)
     (tmp_path / "main.cpp").write_text("""
         #include "sideslip_smoke.h"
@@ -174,7 +174,7 @@ int main(void) {
 def test_inputs_beyond_their_ranges_are_counted(smoke_root: Path, tmp_path: Path) -> None:
     """A missing one is none; a counter that is full stays so."""
     fleet = fleet_slip.open(smoke_root)
-    for name, text in export_texts(fleet.model("smoke"), fleet.warehouse, "c").items():
+    for name, text in export_texts(fleet.models.get("smoke"), fleet.warehouse, "c").items():
         (tmp_path / name).write_text(text)
     (tmp_path / "main.c").write_text(COUNTING)
     code, printed = result_of(compile_c(tmp_path, ["main.c"]))
@@ -192,11 +192,11 @@ def test_names_of_scales_differ_where_c_looks() -> None:
 def test_the_page_beside_them_tells_inputs_and_files(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     for to in ("c", "sql", "dbc"):
-        files = export_texts(fleet.model("smoke"), fleet.warehouse, to)
+        files = export_texts(fleet.models.get("smoke"), fleet.warehouse, to)
         page = files[f"sideslip_smoke_{to}_README.md"]
         assert all(f"| `{name}` | " in page for name in files if not name.endswith(".md"))
         assert "| `ay` | m/s^2 | 0.001 | -30000 to 30000 |" in page
-        assert "every 0.01 s" in page
+        assert "A tick is 0.01 s" in page
         assert ("view `log`," in page) == (to == "sql")
 
 
@@ -220,7 +220,7 @@ def test_quotients_take_64_bits_only_where_they_need_them() -> None:
     ]
     assert "nearest_32" in text
     assert "nearest_64" not in text
-    assert LARGEST_UNSIGNED > 2 * 3 * 32767 * 16 + 3
+    assert MAX_UNSIGNED > 2 * 3 * 32767 * 16 + 3
 
 
 NAMES = ("mean_3", "sum_4", "heavy")
@@ -250,7 +250,7 @@ def text(tmp_path: Path) -> str:
     for name, content in files.items():
         (tmp_path / name).write_text(content)
     found = files["sideslip_any.a2l"]
-    declared = re.search(r"functions:\n(.*?) \*/", found, re.DOTALL)
+    declared = re.search(r"program:\n(.*?) \*/", found, re.DOTALL)
     assert declared is not None
     measured = re.findall(r"MEASUREMENT (\S+) .*\n  (\w+) .*\n  SYMBOL_LINK \"(\S+)\" 0", found)
     assert {symbol for _, _, symbol in measured} >= {"sideslip_any_in.ay_count"}

@@ -233,14 +233,14 @@ def test_received_rows_are_those_of_the_log(
     came = received_rows(tmp_path / "cars", of_course.messages(table, late))
     logs = LocalFolder(tmp_path / "logs")
     for one in of_course.sets:
-        delay = late if one.of.in_time else 0
-        mine = [row for row in came if row["feature_set"] == one.of.identity]
-        expected = grams_of(kernel_rows(logs, table, one.of.name, delay), one.columns)
+        delay = late if one.counted.in_time else 0
+        mine = [row for row in came if row["feature_set"] == one.counted.identity]
+        expected = grams_of(kernel_rows(logs, table, one.counted.name, delay), one.columns)
         if one.complete:
             expected = {k: v for k, v in expected.items() if len(k[1]) in (0, len(one.columns))}
-        assert grams_of(mine, one.columns) == expected, one.of.name
-        changes = [gram for (_, names, _), gram in expected.items() if names and one.of.times]
-        assert bool(changes) == bool(one.of.times)
+        assert grams_of(mine, one.columns) == expected, one.counted.name
+        changes = [gram for (_, names, _), gram in expected.items() if names and one.counted.times]
+        assert bool(changes) == bool(one.counted.times)
         assert not changes or sum(gram.n for gram in changes) > 20
 
 

@@ -12,7 +12,7 @@ import fleet_slip
 from fleet_slip.errors import RefusedError
 from fleet_slip.export.costs import cost_on_board, costs_content, describe_costs
 from fleet_slip.export.files import export_files
-from fleet_slip.export.program import LARGEST_SUM, OUTPUT_COUNTS, fixed_point
+from fleet_slip.export.program import MAX_SUM, OUTPUT_COUNTS, fixed_point
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import DEFINITIONS, model_of
 from tests.support.catalog import CATALOG
@@ -53,7 +53,7 @@ def test_a_feature_is_computed_once() -> None:
 
 
 def test_the_manifest_of_an_export_and_show_say_the_same(smoke_root: Path) -> None:
-    version = fleet_slip.open(smoke_root).model("smoke")
+    version = fleet_slip.open(smoke_root).models.get("smoke")
     counted = costs_content(version)
     assert counted["columns"] == len(version.manifest.terms)
     assert counted["memory_bytes"] > 1000 < counted["estimated_instructions"]
@@ -112,8 +112,8 @@ def test_no_sum_of_parts_overflows_and_together_they_are_the_whole(
     lower = sum(part * n for (_, part), n in zip(found.parts, sizes, strict=True))
     assert all(0 <= part < 2**found.low_bits for _, part in found.parts)
     half = 2 ** (found.bits - found.low_bits - 1)
-    assert upper + (lower >> found.low_bits) + half < LARGEST_SUM
-    assert lower < LARGEST_SUM
+    assert upper + (lower >> found.low_bits) + half < MAX_SUM
+    assert lower < MAX_SUM
     whole = [(u << found.low_bits) + low for u, low in found.parts]
     assert whole == [found.intercept, *found.coefficients]
     assert all(-(2**31) < part < 2**31 for part, _ in found.parts[1:])

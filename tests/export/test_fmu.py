@@ -182,10 +182,10 @@ def run_fmpy(*words: str) -> str:
 @pytest.mark.tools("fmpy")
 def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    version = fleet.model("smoke")
+    version = fleet.models.get("smoke")
     program = compile_program(CATALOG, version.manifest)
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick").pl()
-    fleet.export(version, "fmu", tmp_path)
+    fleet.models.export(version, "fmu", tmp_path)
     columns = [one.column for one in program.signals]
     with (tmp_path / "in.csv").open("w", newline="") as file:
         table = csv.writer(file)

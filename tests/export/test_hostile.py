@@ -20,7 +20,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
 from fleet_slip.export.files import export_files
 from fleet_slip.export.mlflow_model import LoggedVersion
-from fleet_slip.export.templating import different
+from fleet_slip.export.templating import distinct
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
@@ -39,8 +39,8 @@ def exported(to: str) -> dict[str, bytes]:
 
 
 def test_names_are_different_however_they_are_made() -> None:
-    assert different(["a", "a", "a_2", "a"]) == ("a", "a_2", "a_2_2", "a_3")
-    long = different(["x" * 40, "x" * 40, "x" * 32, "x" * 30 + "_2"], 32)
+    assert distinct(["a", "a", "a_2", "a"]) == ("a", "a_2", "a_2_2", "a_3")
+    long = distinct(["x" * 40, "x" * 40, "x" * 32, "x" * 30 + "_2"], 32)
     assert len({*long}) == 4
     assert {len(one) for one in long} == {32}
 

@@ -77,7 +77,7 @@ class Registered:
 
 
 def test_a_registered_version_says_what_it_is(smoke_root: Path) -> None:
-    version = fleet_slip.open(smoke_root).model("smoke")
+    version = fleet_slip.open(smoke_root).models.get("smoke")
     client = Registered()
     describe(client, version, "7", {"champion": version.version, "old": version.version + 1})
     (name, number, told), *aliases = client.asked
@@ -94,7 +94,7 @@ import mlflow, numpy as np, fleet_slip
 uri, root, drive = sys.argv[1:]
 mlflow.set_tracking_uri(uri)
 fleet = fleet_slip.open(root)
-version = fleet.model("logged")
+version = fleet.models.get("logged")
 chosen = f"drive_id = '{drive}' AND tick < 3000"
 frame = fleet.sql(f"SELECT * FROM log WHERE {chosen} ORDER BY tick").df()
 model = mlflow.pyfunc.load_model("models:/logged/1")
@@ -128,7 +128,7 @@ def test_a_version_is_registered_once_and_loads_back(
     drive = "smoke-2024-05-01-0003"
     done = run(programs / "python", "-c", LOAD, server, root, drive)
     told: dict[str, Any] = json.loads(done.stdout)
-    version = fleet_slip.open(root).model("logged")
+    version = fleet_slip.open(root).models.get("logged")
     assert (told["equal"], told["rows"], told["versions"], told["example"]) == (True, 3000, 1, True)
     assert told["tags"]["fleet_slip.sha256"] == version.sha256
     assert told["tags"]["fleet_slip.reference"] == "logged@1"
@@ -170,7 +170,7 @@ def test_without_the_library_the_extra_is_named(
     monkeypatch.setitem(sys.modules, "mlflow", None)
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(ConfigError, match=r"mlflow. Run: pip install 'fleet-slip\[mlflow\]'"):
-        fleet.log_to_mlflow("smoke", "http://127.0.0.1:9")
+        fleet.models.log_to_mlflow("smoke", "http://127.0.0.1:9")
 
 
 @pytest.mark.parametrize("listening", [True, False])

@@ -58,7 +58,7 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
 
 def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    version = fleet.model("smoke")
+    version = fleet.models.get("smoke")
     files = export_files(version, fleet.warehouse, "onnx")
     assert [*files] == [
         f"sideslip_smoke_{end}"

@@ -132,7 +132,7 @@ def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
 @pytest.fixture(scope="module")
 def document(smoke_root: Path) -> Any:
     fleet = fleet_slip.open(smoke_root)
-    ((name, text),) = export_texts(fleet.model("smoke"), fleet.warehouse, "json").items()
+    ((name, text),) = export_texts(fleet.models.get("smoke"), fleet.warehouse, "json").items()
     assert name == "smoke-1.json"
     return json.loads(text)
 
@@ -148,7 +148,7 @@ def test_the_checks_hold_and_are_of_no_drive_of_the_logs(document: Any) -> None:
 
 
 def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> None:
-    version = fleet_slip.open(smoke_root).model("smoke")
+    version = fleet_slip.open(smoke_root).models.get("smoke")
     model = document["model"]
     assert model["reference"] == "smoke@1"
     assert model["sha256"] == checksum(model["manifest"]) == version.sha256
@@ -161,16 +161,18 @@ def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> N
 
 def test_an_export_is_the_same_again(smoke_root: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
-    one, other = (export_texts(fleet.model("smoke"), fleet.warehouse, "json") for _ in range(2))
+    one, other = (
+        export_texts(fleet.models.get("smoke"), fleet.warehouse, "json") for _ in range(2)
+    )
     assert one == other
 
 
 def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(QuestionError, match="no version"):
-        fleet.export("smoke@9", "json", tmp_path)
-    with pytest.raises(UsageError, match="export to one of json"):
-        fleet.export("smoke", "pascal", tmp_path)  # type: ignore[arg-type]
+        fleet.models.export("smoke@9", "json", tmp_path)
+    with pytest.raises(UsageError, match="Choose from: json"):
+        fleet.models.export("smoke", "pascal", tmp_path)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -52,7 +52,7 @@ def test_select_records_the_step_that_computes_gram_rows(
 
 
 def test_within_a_command_it_is_a_step_of_its_run(without_windows: Fleet) -> None:
-    without_windows.publish("slip")
+    without_windows.models.publish("slip")
     assert not runs_of(without_windows, "ensure_grams")
     query = "SELECT steps::VARCHAR FROM runs WHERE command = 'publish' ORDER BY started_at DESC"
     steps = without_windows.sql(query).fetchall()[0][0]

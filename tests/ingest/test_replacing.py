@@ -72,8 +72,8 @@ def test_a_corrected_mapping_replaces_what_came_through_the_old_one(
     assert refused.fetchall() == [("b.csv", 1), ("monday.csv", 1)]
     fleet.gram()
     assert fleet.sql("SELECT count(DISTINCT drive_id) FROM grams").fetchall() == [(2,)]
-    assert fleet.check().drives == 2
-    assert not fleet.verify(full=True).damage
+    assert fleet.maintenance.check_grams().drives == 2
+    assert not fleet.maintenance.verify(full=True).damage
     (again,) = fleet.ingest(tmp_path / "monday.csv", corrected())
     assert not again.new
 
@@ -188,5 +188,5 @@ def test_a_replacement_that_stops_at_any_commit_ends_as_if_it_had_not(
     assert drives(fleet)["monday.csv"] == -before["monday.csv"]
     assert fleet.sql("SELECT count(*) FROM quarantine").fetchall() == [(2,)]
     fleet.gram()
-    assert fleet.check().drives == 2
-    assert not fleet.verify(full=True).damage
+    assert fleet.maintenance.check_grams().drives == 2
+    assert not fleet.maintenance.verify(full=True).damage

@@ -73,7 +73,7 @@ def fleet(calibrated: Path, tmp_path: Path) -> Fleet:
 
 def without_label(fleet: Fleet) -> Manifest:
     selection = fleet.cohort("true").select(label="course", model=COLUMNS)
-    return fleet.publish("freed", selection).version.manifest
+    return fleet.models.publish("freed", selection).version.manifest
 
 
 def test_the_intercept_needs_the_calibration_and_the_columns(
@@ -81,13 +81,13 @@ def test_the_intercept_needs_the_calibration_and_the_columns(
 ) -> None:
     selection = uncalibrated.cohort("true").select(label="course", model=COLUMNS)
     with pytest.raises(DataError, match="fleet-slip gram --features calibration"):
-        uncalibrated.publish("too_early", selection)
+        uncalibrated.models.publish("too_early", selection)
     made = fleet_slip.open(shutil.copytree(str(uncalibrated.root), tmp_path / "data"))
     made.gram("calibration")
     with pytest.raises(DataError, match="fleet-slip gram --features windows"):
-        made.publish("too_early", made.cohort("true").select(label="course", model=COLUMNS))
+        made.models.publish("too_early", made.cohort("true").select(label="course", model=COLUMNS))
     through = uncalibrated.cohort("true").select(label="course", model=COLUMNS, intercept=False)
-    manifest = uncalibrated.publish("none", through, force=True).version.manifest
+    manifest = uncalibrated.models.publish("none", through, force=True).version.manifest
     assert manifest.intercept == 0 and manifest.learned_from and manifest.learned_from.cars == 0
 
 
@@ -102,7 +102,7 @@ def test_a_model_without_a_label_is_one_of_the_angle(fleet: Fleet) -> None:
     )
     assert learned.intercept_uncertainty_deg is not None
     assert learned.intercept_uncertainty_deg == pytest.approx(0.15, rel=0.02), "what all share"
-    score = fleet.score("freed")
+    score = fleet.evaluation.score("freed")
     assert score.correlation is not None and score.correlation > 0.995
     # The label's noise, 0.0286 deg, is in it.
     assert score.error_std_deg < 0.06 and abs(score.error_mean_deg) < 0.02
@@ -154,7 +154,7 @@ def test_the_same_again_is_nothing_new_and_the_gate_compares_changes(fleet: Flee
     assert without_label(fleet) == first
     fewer = fleet.cohort("true").select(label="course", model="ay_mean_16")
     with pytest.raises(RefusedError, match="worse than the champion"):
-        fleet.publish("freed", fewer)
+        fleet.models.publish("freed", fewer)
 
 
 def test_columns_are_searched_for(fleet: Fleet) -> None:

@@ -76,7 +76,7 @@ def fleet(tmp_path: Path, made: Path, own_set: Path) -> Fleet:
 
 
 def published(fleet: Fleet) -> ModelVersion:
-    return fleet.publish("tiny", fleet.cohort().select(models="outer")).version
+    return fleet.models.publish("tiny", fleet.cohort().select(models="outer")).version
 
 
 def the_line(fleet: Fleet) -> FirstStageModel:
@@ -117,7 +117,7 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
 
 
 def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
-    version = fleet.model("tiny")
+    version = fleet.models.get("tiny")
     manifest, line = version.manifest, the_line(fleet)
     assert manifest.trained_on.feature_set.startswith(f"tiny_{line.digest}-")
     estimate = manifest.definitions["line"].made
@@ -133,10 +133,10 @@ def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
 
 
 def test_published_again_nothing_is_computed_again(fleet: Fleet) -> None:
-    first = fleet.model("tiny")
+    first = fleet.models.get("tiny")
     version = fleet.warehouse.grams.snapshot().version
     assert published(fleet) == first
-    assert fleet.publish("tiny").version == first
+    assert fleet.models.publish("tiny").version == first
     assert fleet.warehouse.grams.snapshot().version == version
     assert len(fleet.warehouse.stacked_models.digests()) == 1
 
@@ -144,7 +144,7 @@ def test_published_again_nothing_is_computed_again(fleet: Fleet) -> None:
 def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> None:
     line = the_line(fleet)
     ((drive,),) = fleet.sql("SELECT min(drive_id) FROM drives").fetchall()
-    fleet.forget(drive=drive)
+    fleet.maintenance.forget(drive=drive)
     after = published(fleet).manifest.trained_on.feature_set
     assert line.digest not in after
     others = set(fleet.warehouse.stacked_models.digests()) - {line.digest}
@@ -160,17 +160,17 @@ def test_whoever_opens_the_root_later_finds_the_line(fleet: Fleet, own_set: Path
         if number == 0:
             later.cohort().diagnose("tiny")
         else:
-            later.score("tiny")
+            later.evaluation.score("tiny")
 
 
 def test_a_drive_too_long_for_its_slope_is_refused(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On board a slope adds up no more from then on: the two would differ."""
-    version = fleet.model("tiny")
+    version = fleet.models.get("tiny")
     monkeypatch.setattr("fleet_slip.columns.block_program.most_products", lambda _: 1000)
     with pytest.raises(DataError, match="too many for windows"):
-        fleet.score(version)
+        fleet.evaluation.score(version)
 
 
 def test_counts_of_another_grain_need_another_line(

@@ -38,7 +38,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, grams: Sequence[Gram]) -> Pat
     folder = tmp_path_factory.mktemp("honest")
     fleet = fleet_slip.open(folder / "data")
     receive(fleet, folder / "honest", honest(grams, START_S))
-    fleet.publish("beta", select(fleet))
+    fleet.models.publish("beta", select(fleet))
     next_day = drive_grams(range(CARS, 2 * CARS))
     receive(fleet, folder / "next", honest(next_day, START_S + DAY_S))
     return folder / "data"
@@ -102,8 +102,8 @@ def test_cars_with_a_wrong_label_are_unusual_whatever_their_rows(
 ) -> None:
     receive(fleet, tmp_path / "forged", forged(grams, how))
     with pytest.raises(RefusedError, match=r"not published: (beta@1 had|it is worse than)"):
-        fleet.publish("beta", select(fleet))
+        fleet.models.publish("beta", select(fleet))
 
 
 def test_a_fleet_that_does_not_lie_replaces_its_champion(fleet: fleet_slip.Fleet) -> None:
-    assert fleet.publish("beta", select(fleet)).version.version == 2
+    assert fleet.models.publish("beta", select(fleet)).version.version == 2

@@ -95,7 +95,7 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
 def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) -> None:
     made = done_on(own, "publish", "with", "--model", INPUTS, "--prior", few, "--force")
     fleet = fleet_slip.open(own)
-    manifest = fleet.model("with").manifest
+    manifest = fleet.models.get("with").manifest
     assert manifest.prior is not None
     assert (manifest.prior.campaign, manifest.prior.drives) == ("few", 2)
     assert manifest.prior.campaign_sha256 == load_campaign(few, SHIPPED_CONFIGS).digest
@@ -184,7 +184,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     monkeypatch.setattr(module, "simulate_prior", simulate)
     monkeypatch.setattr(module, "FILTERS", ())
     fleet = fleet_slip.open(own)
-    content = fleet.evaluate_measured("identified", "true").content
+    content = fleet.evaluation.evaluate_measured("identified", "true").content
     assert content["vehicle"] == "own", "it brings its car along"
     assert set(seen) == {5} and len(seen) == content["parts"]
     assert len(set(simulated)) == len(simulated) == content["parts"]
@@ -284,7 +284,7 @@ def test_the_command_names_it_and_the_version_keeps_how(
     assert document["drives_weighed"]["d06"]["weight"] == 0
     made = run_command("publish", "safe", "--order", TWO, "--robust", "--force")
     assert made.exit_code == 0, made.stderr
-    manifest = fleet.model("safe").manifest
+    manifest = fleet.models.get("safe").manifest
     assert manifest.selected_by.asked is not None and manifest.selected_by.asked["robust"]
     assert (manifest.trained_on.drives, manifest.trained_on.rows) == (24, 2400)
     again = run_command("publish", "safe", "--json")

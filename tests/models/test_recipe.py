@@ -142,7 +142,7 @@ def test_publishing_computes_the_columns_of_the_usual_list(smoke_copy: Path) -> 
         shutil.rmtree(smoke_copy / made_of_logs)
     fleet.gram()
     made = answer(smoke_copy, "publish", "m")
-    chosen = fleet.model("m").manifest
+    chosen = fleet.models.get("m").manifest
     assert (made["new"], chosen.selected_by.model_list) == (True, "estimator")
 
 

@@ -258,12 +258,12 @@ def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
 def test_the_tables_here_are_not_those_that_made_it(smoke_root: Path, tmp_path: Path) -> None:
     """Their numbers would be taken for those of tables here, by chance the same."""
     home, away = fleet_slip.open(smoke_root), fleet_slip.open(tmp_path / "away")
-    made = home.model("smoke")
+    made = home.models.get("smoke")
     origin = ImportedFrom(reference=made.reference, sha256=made.sha256)
-    drives = home.registry().trained_drives(made.manifest)
+    drives = home.models.registry.trained_drives(made.manifest)
     assert drives is not None
     manifest = made.manifest.model_copy(update={"imported_from": origin})
-    brought = away.registry().add(manifest, drives.content)
+    brought = away.models.registry.add(manifest, drives.content)
     arguments = (home.warehouse, made.manifest.trained_on.cohort, "estimator", None)
     assert is_current(made.manifest, *arguments)
     assert not is_current(brought.manifest, *arguments)

@@ -115,7 +115,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
         update_grams(fleet.warehouse)
         chosen = fleet.cohort().select(models="table1")
         for name in ("old", *WAYS):
-            fleet.publish(name, chosen)
+            fleet.models.publish(name, chosen)
 
     return made_once(tmp_path_factory, "wrong_nights", make)
 
@@ -143,7 +143,7 @@ def test_every_way_to_a_champion_leaves_a_wrong_night_out(
     shutil.copytree(honest, tmp_path / "data")
     (landing := tmp_path / "landing").mkdir()
     fleet = fleet_slip.open(tmp_path / "data")
-    right = error_deg(fleet.model("old").manifest, truth)
+    right = error_deg(fleet.models.get("old").manifest, truth)
     land_day(fleet, DAYS, np.random.default_rng(2), WRONG[kind])
     update_grams(fleet.warehouse)
 
@@ -155,12 +155,12 @@ def test_every_way_to_a_champion_leaves_a_wrong_night_out(
             assert code in (0, 7)
         if "python" in ways:
             try:
-                fleet.publish(f"{kept}python", fleet.cohort().select(models="table1"))
+                fleet.models.publish(f"{kept}python", fleet.cohort().select(models="table1"))
             except RefusedError:
                 assert code == 7
         if "night" in ways:
             name = f"{kept}night"
             fleet.nightly(landing, "race_car_250lm", name, models="table1", night=NIGHT)
-        found = [fleet.model(f"{kept}{way}").manifest for way in ways]
+        found = [fleet.models.get(f"{kept}{way}").manifest for way in ways]
         assert len({one.trained_on.cohort for one in found}) == 1
         assert max(error_deg(one, truth) for one in found) < WORST * right

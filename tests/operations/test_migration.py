@@ -161,26 +161,26 @@ def test_there_are_some_and_they_are_small() -> None:
 
 
 def test_a_root_is_migrated_read_and_sound(fleet: Fleet) -> None:
-    assert fleet.migrate().sealed
-    assert not fleet.migrate().changed
+    assert fleet.maintenance.migrate().sealed
+    assert not fleet.maintenance.migrate().changed
     fleet.gram()
-    assert fleet.check().drives == DRIVES
+    assert fleet.maintenance.check_grams().drives == DRIVES
     (rows,) = fleet.sql("SELECT count(*) FROM log").fetchall()
     assert rows == (ROWS,)
-    assert not fleet.verify(full=True).findings
-    assert not fleet.quality().findings
-    assert not fleet.forget(drive=ERASED).changed
+    assert not fleet.maintenance.verify(full=True).findings
+    assert not fleet.maintenance.quality().findings
+    assert not fleet.maintenance.forget(drive=ERASED).changed
 
 
 def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> None:
-    fleet.migrate()
+    fleet.maintenance.migrate()
     fleet.gram()
-    old = fleet.model("smoke")
-    score = fleet.score(old)
+    old = fleet.models.get("smoke")
+    score = fleet.evaluation.score(old)
     assert score.rows == ROWS
     assert score.error_std_deg < 0.2
     selection = fleet.cohort().select(model=",".join(old.manifest.signals))
-    again = fleet.publish("smoke", selection, force=True).version.manifest
+    again = fleet.models.publish("smoke", selection, force=True).version.manifest
     assert [term.coefficient_exact for term in again.terms] == [
         term.coefficient_exact for term in old.manifest.terms
     ]
@@ -188,9 +188,9 @@ def test_its_model_estimates_and_is_trained_again_to_the_same(fleet: Fleet) -> N
 
 
 def test_it_takes_gram_rows_of_cars_once_it_is_migrated(fleet: Fleet, tmp_path: Path) -> None:
-    fleet.migrate()
+    fleet.maintenance.migrate()
     fleet.gram()
     report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", [row_of(gram_of(1))]))
     assert report.gram_rows == 1
-    fleet.forget(vehicle="VIN1")
-    assert not fleet.verify(full=True).damage
+    fleet.maintenance.forget(vehicle="VIN1")
+    assert not fleet.maintenance.verify(full=True).damage

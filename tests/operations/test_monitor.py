@@ -119,9 +119,9 @@ def test_days_to_learn_from_may_be_chosen_and_must_be_enough(
     with pytest.raises(DataError, match="has 2 in the cohort"):
         monitor(warehouse, version, since=DAY + timedelta(days=2))
     fleet = fleet_slip.open(warehouse.root)
-    assert fleet.monitor("m", since=str(DAY + timedelta(days=5))) == chart
+    assert fleet.maintenance.monitor("m", since=str(DAY + timedelta(days=5))) == chart
     with pytest.raises(UsageError, match="since tomorrow: not a date; write it as 2024-05-01"):
-        fleet.monitor("m", since="tomorrow")
+        fleet.maintenance.monitor("m", since="tomorrow")
 
 
 def test_limits_are_the_prediction_interval_of_one_more_day() -> None:

@@ -321,7 +321,7 @@ LAPS = {"column": "car", "vehicle_id": "car-of-mine"}
 
 def forget_all(fleet: Fleet) -> int:
     drives = fleet.sql("SELECT drive_id FROM drives").fetchall()
-    return sum(fleet.forget(drive=drive, now=True).drives for (drive,) in drives)
+    return sum(fleet.maintenance.forget(drive=drive, now=True).drives for (drive,) in drives)
 
 
 def corrected() -> Mapping:
@@ -348,7 +348,7 @@ def test_what_is_forgotten_while_it_is_replaced_is_not_doubled(
     laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
     found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
     assert all(many == 1 for _, many in found)
-    assert not laps.verify(full=True).damage
+    assert not laps.maintenance.verify(full=True).damage
 
 
 def test_what_was_superseded_is_no_drive(laps: Fleet, tmp_path: Path) -> None:

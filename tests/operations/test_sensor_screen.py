@@ -72,13 +72,16 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     assert "4 drives" in told.stdout
     assert "6 drives" in run_command("select", "--models", "table1", "--include-faulty").stdout
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
-    assert fleet.model("m").manifest.trained_on.drives == 4
+    assert fleet.models.get("m").manifest.trained_on.drives == 4
     by_hand = fleet.cohort().select(models="table1")
     assert by_hand.as_dict()["examined"] == str(found)
-    assert fleet.publish("m", by_hand).reason == "The champion is the same model."
+    assert fleet.models.publish("m", by_hand).reason == "The champion is the same model."
     scored = run_command("score", "m")
     assert "2 drives of 6 left out: faulty sensors (2 stuck ay)" in scored.stderr
-    assert (fleet.score("m").drives, fleet.score("m", include_faulty=True).drives_left_out) == (
+    assert (
+        fleet.evaluation.score("m").drives,
+        fleet.evaluation.score("m", include_faulty=True).drives_left_out,
+    ) == (
         4,
         4,
     )
@@ -118,12 +121,12 @@ def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
     fleet.gram()
     chosen = fleet.cohort().select(models="table1")
     with pytest.raises(RefusedError, match=rf"of 5 inspected drives contradict .*{told}"):
-        fleet.publish("m", chosen)
+        fleet.models.publish("m", chosen)
     night = fleet.nightly(landing.folder, str(landing.mapping), "m", models="table1")
     assert night.exit_code != 0
     assert night.champion is None
-    assert fleet.publish("m", chosen, candidate=True).candidate
-    assert fleet.publish("m", chosen, force=True).new
+    assert fleet.models.publish("m", chosen, candidate=True).candidate
+    assert fleet.models.publish("m", chosen, force=True).new
 
 
 def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
@@ -138,11 +141,11 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.ingest(landing.land(name, some, day, **changes), str(landing.mapping))
         fleet.gram()
         if name == "a":
-            assert fleet.publish("m", fleet.cohort()).new
+            assert fleet.models.publish("m", fleet.cohort()).new
     chosen = fleet.cohort().select()
     with pytest.raises(RefusedError, match="differ from its training set"):
-        fleet.publish("m", chosen)
-    assert fleet.publish("m", chosen, candidate=True).candidate
+        fleet.models.publish("m", chosen)
+    assert fleet.models.publish("m", chosen, candidate=True).candidate
 
 
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
@@ -159,28 +162,28 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={name: bound})
         monkeypatch.setattr(training_checks, "load_thresholds", lambda _, strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
-            fleet.publish("m", asked)
-        dry = fleet.would_publish("m", asked)
+            fleet.models.publish("m", asked)
+        dry = fleet.models.preview("m", asked)
         assert (dry.refused, dry.publishes, dry.reason) == (True, False, str(refused.value))
-        assert fleet.would_publish("m", asked, candidate=True).candidate
+        assert fleet.models.preview("m", asked, candidate=True).candidate
         said = run_command(*command)
         assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
         monkeypatch.setattr(training_checks, "load_thresholds", load_thresholds)
-    assert not fleet.models().num_rows
+    assert not fleet.models.versions().num_rows
     assert "m would be published. " in run_command(*command).stderr
-    assert fleet.publish("m", asked).new
+    assert fleet.models.publish("m", asked).new
 
 
 def test_a_champion_of_more_columns_needs_drives_for_them_too(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cohort = fleet.cohort("day = DATE '2026-10-05'")
-    assert fleet.publish("m", cohort.select(model="ay, yaw_rate")).new
+    assert fleet.models.publish("m", cohort.select(model="ay, yaw_rate")).new
     strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
     monkeypatch.setattr(training_checks, "load_thresholds", lambda _: strict)
     with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
-        fleet.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
-    assert not fleet.would_publish("m", cohort.select(model="ay, steering_wheel")).refused
+        fleet.models.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
+    assert not fleet.models.preview("m", cohort.select(model="ay, steering_wheel")).refused
 
 
 def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
@@ -254,8 +257,8 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
     with monkeypatch.context() as patch:
         patch.setattr(sensor_screen, "READ_ON_THE_WAY", 100)
         with pytest.raises(NotScreenedError, match=r"6 measured drives .* --include-faulty"):
-            fleet.publish("m")
+            fleet.models.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr
     assert "computed missing Gram rows of 6 measured drives" in done.stderr
-    assert fleet.model("m").manifest.trained_on.drives == 4
+    assert fleet.models.get("m").manifest.trained_on.drives == 4

@@ -25,7 +25,7 @@ def logged(folder: Path, name: str, seed: int) -> str:
 
 
 def night(folder: Path, date: str) -> str:
-    words = ["nightly", "--landing", str(folder / "landing"), "--mapping", str(folder / "m.toml")]
+    words = ["nightly", "--inbox", str(folder / "landing"), "--mapping", str(folder / "m.toml")]
     words += ["--model", "freed", "--models", "course", "--night", date]
     return done_on(folder / "fleet", *words, "--output", str(folder / f"{date}.md")).stdout
 

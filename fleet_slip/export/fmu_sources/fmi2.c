@@ -1,8 +1,8 @@
-/* An exported estimator as an FMU for co-simulation, FMI 2.0: take SI units, step, give SI units.
+/* An exported estimator as an FMU for co-simulation, FMI 2.0: inputs and outputs in SI units.
  *
- * Types and functions as the standard defines them (fmi-standard.org, 2.0.4). fmi_model.h defines
- * the estimator: its names, scales, and how a sample is filled. Value references: the inputs from
- * 0 on, the parameters behind them, the angle, and whether it is valid. */
+ * Types and functions are those of the standard (fmi-standard.org, 2.0.4). fmi_model.h defines the
+ * names, scales and samples of the estimator. Value references are the inputs from 0, then the
+ * parameters, the angle, and valid. */
 #include <math.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -18,87 +18,87 @@
 #define EXPORTED __attribute__((visibility("default")))
 #endif
 
-#define ANGLE_REFERENCE (SIGNALS + TOLD)
-#define VALID_REFERENCE (SIGNALS + TOLD + 1)
+#define ANGLE_REFERENCE (SIGNALS + PARAMETERS)
+#define VALID_REFERENCE (SIGNALS + PARAMETERS + 1)
 
 typedef struct {
     model_state state;
     double inputs[SIGNALS];
-    int32_t told[TOLD + 1];
+    int32_t parameters[PARAMETERS + 1];
     double angle;
     bool valid;
 } instance;
 
-static void clear(instance *one)
+static void clear(instance *self)
 {
-    (void)memset(one, 0, sizeof *one);
-    for (size_t i = 0U; i < TOLD; i++) {
-        one->told[i] = INT32_MIN;
+    (void)memset(self, 0, sizeof *self);
+    for (size_t i = 0U; i < PARAMETERS; i++) {
+        self->parameters[i] = INT32_MIN;
     }
 }
 
-/* Begins a drive: called when initialization ends, with what the car was told. */
-static void begin(instance *one)
+/* Starts a drive with the parameters; called at the end of the initialization. */
+static void start(instance *self)
 {
-    begin_drive(&one->state, one->told);
-    one->angle = 0.0;
-    one->valid = false;
+    start_drive(&self->state, self->parameters);
+    self->angle = 0.0;
+    self->valid = false;
 }
 
-/* The count nearest to a physical value, halves to even; INT16_MIN where it is missing. */
+/* Nearest count of a physical value, halves to even; INT16_MIN if it is missing. */
 static int16_t count_of(double physical, double scale)
 {
     const double count = nearbyint(physical / scale);
-    const bool inside = (count >= -32767.0) && (count <= 32767.0); /* not if it is not a number */
+    const bool inside = (count >= -32767.0) && (count <= 32767.0); /* false for NaN */
     return inside ? (int16_t)count : INT16_MIN;
 }
 
-/* Takes whole ticks with the inputs as they are; returns whether the step is of whole ticks. */
-static bool advance(instance *one, double step_s)
+/* Advances by ticks with constant inputs; returns false if the step is not a number of ticks. */
+static bool advance(instance *self, double step_s)
 {
     const double ticks = step_s / TICK_S;
-    const double whole = floor(ticks + 0.5);
-    if (!((whole >= 1.0) && (whole <= 1e9) && (fabs(ticks - whole) < 1e-3))) {
+    const double rounded = floor(ticks + 0.5);
+    if (!((rounded >= 1.0) && (rounded <= 1e9) && (fabs(ticks - rounded) < 1e-3))) {
         return false;
     }
-    for (uint32_t i = 0U; i < (uint32_t)whole; i++) {
+    for (uint32_t i = 0U; i < (uint32_t)rounded; i++) {
         int16_t counts[SIGNALS];
         model_sample sample;
         int32_t angle;
         for (size_t at = 0U; at < SIGNALS; at++) {
-            counts[at] = count_of(one->inputs[at], scales[at]);
+            counts[at] = count_of(self->inputs[at], scales[at]);
         }
         fill_sample(&sample, counts);
-        one->valid = model_step(&one->state, &sample, &angle);
-        one->angle = (double)angle * ANGLE_SCALE;
+        self->valid = model_step(&self->state, &sample, &angle);
+        self->angle = (double)angle * ANGLE_SCALE;
     }
     return true;
 }
 
-static bool get_real(const instance *one, uint32_t reference, double *value)
+static bool get_real(const instance *self, uint32_t reference, double *value)
 {
     if (reference == ANGLE_REFERENCE) {
-        *value = one->angle;
+        *value = self->angle;
     } else if (reference < SIGNALS) {
-        *value = one->inputs[reference];
+        *value = self->inputs[reference];
     } else {
         return false;
     }
     return true;
 }
 
-static bool set_real(instance *one, uint32_t reference, double value)
+static bool set_real(instance *self, uint32_t reference, double value)
 {
     if (reference >= SIGNALS) {
         return false;
     }
-    one->inputs[reference] = value;
+    self->inputs[reference] = value;
     return true;
 }
 
-static bool is_told(uint32_t reference)
+static bool is_parameter(uint32_t reference)
 {
-    return (reference >= SIGNALS) && (reference < (SIGNALS + TOLD));
+    return (reference >= SIGNALS) && (reference < (SIGNALS + PARAMETERS));
 }
 
 typedef enum { fmi2OK, fmi2Warning, fmi2Discard, fmi2Error, fmi2Fatal, fmi2Pending } fmi2Status;
@@ -114,20 +114,20 @@ typedef struct {
     void *componentEnvironment;
 } fmi2CallbackFunctions;
 
-#define REFERENCES fmi2Component c, const fmi2ValueReference references[], size_t many
+#define REFERENCES fmi2Component c, const fmi2ValueReference references[], size_t count
 
-static fmi2Status told(bool good)
+static fmi2Status status(bool is_valid)
 {
-    return good ? fmi2OK : fmi2Error;
+    return is_valid ? fmi2OK : fmi2Error;
 }
 
 EXPORTED const char *fmi2GetTypesPlatform(void) { return "default"; }
 EXPORTED const char *fmi2GetVersion(void) { return "2.0"; }
 
-EXPORTED fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t many,
+EXPORTED fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t count,
                                         const fmi2String categories[])
 {
-    (void)c; (void)on; (void)many; (void)categories;
+    (void)c; (void)on; (void)count; (void)categories;
     return fmi2OK;
 }
 
@@ -139,78 +139,78 @@ EXPORTED fmi2Component fmi2Instantiate(fmi2String name, int kind, fmi2String tok
     if ((kind != 1) || (token == NULL) || (strcmp(token, TOKEN) != 0)) {
         if ((functions != NULL) && (functions->logger != NULL)) {
             functions->logger(functions->componentEnvironment, name, fmi2Error, "error",
-                              "it is for co-simulation, and its GUID must be that of its files");
+                              "use it for co-simulation, with the GUID of its model description");
         }
         return NULL;
     }
-    instance *one = malloc(sizeof *one);
-    if (one != NULL) {
-        clear(one);
-        begin(one);
+    instance *self = malloc(sizeof *self);
+    if (self != NULL) {
+        clear(self);
+        start(self);
     }
-    return one;
+    return self;
 }
 
 EXPORTED void fmi2FreeInstance(fmi2Component c) { free(c); }
 
 EXPORTED fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean defined, double tolerance,
-                                        double start, fmi2Boolean stops, double stop)
+                                        double start_time, fmi2Boolean stops, double stop)
 {
-    (void)c; (void)defined; (void)tolerance; (void)start; (void)stops; (void)stop;
+    (void)c; (void)defined; (void)tolerance; (void)start_time; (void)stops; (void)stop;
     return fmi2OK;
 }
 
 EXPORTED fmi2Status fmi2EnterInitializationMode(fmi2Component c) { (void)c; return fmi2OK; }
-EXPORTED fmi2Status fmi2ExitInitializationMode(fmi2Component c) { begin(c); return fmi2OK; }
+EXPORTED fmi2Status fmi2ExitInitializationMode(fmi2Component c) { start(c); return fmi2OK; }
 EXPORTED fmi2Status fmi2Terminate(fmi2Component c) { (void)c; return fmi2OK; }
 
 EXPORTED fmi2Status fmi2Reset(fmi2Component c)
 {
     clear(c);
-    begin(c);
+    start(c);
     return fmi2OK;
 }
 
 EXPORTED fmi2Status fmi2GetReal(REFERENCES, double values[])
 {
-    bool good = true;
-    for (size_t i = 0U; i < many; i++) { good = get_real(c, references[i], &values[i]) && good; }
-    return told(good);
+    bool is_valid = true;
+    for (size_t i = 0U; i < count; i++) { is_valid = get_real(c, references[i], &values[i]) && is_valid; }
+    return status(is_valid);
 }
 
 EXPORTED fmi2Status fmi2SetReal(REFERENCES, const double values[])
 {
-    bool good = true;
-    for (size_t i = 0U; i < many; i++) { good = set_real(c, references[i], values[i]) && good; }
-    return told(good);
+    bool is_valid = true;
+    for (size_t i = 0U; i < count; i++) { is_valid = set_real(c, references[i], values[i]) && is_valid; }
+    return status(is_valid);
 }
 
 EXPORTED fmi2Status fmi2GetInteger(REFERENCES, int values[])
 {
-    const instance *one = c;
-    for (size_t i = 0U; i < many; i++) {
-        if (!is_told(references[i])) { return fmi2Error; }
-        values[i] = one->told[references[i] - SIGNALS];
+    const instance *self = c;
+    for (size_t i = 0U; i < count; i++) {
+        if (!is_parameter(references[i])) { return fmi2Error; }
+        values[i] = self->parameters[references[i] - SIGNALS];
     }
     return fmi2OK;
 }
 
 EXPORTED fmi2Status fmi2SetInteger(REFERENCES, const int values[])
 {
-    instance *one = c;
-    for (size_t i = 0U; i < many; i++) {
-        if (!is_told(references[i])) { return fmi2Error; }
-        one->told[references[i] - SIGNALS] = values[i];
+    instance *self = c;
+    for (size_t i = 0U; i < count; i++) {
+        if (!is_parameter(references[i])) { return fmi2Error; }
+        self->parameters[references[i] - SIGNALS] = values[i];
     }
     return fmi2OK;
 }
 
 EXPORTED fmi2Status fmi2GetBoolean(REFERENCES, fmi2Boolean values[])
 {
-    const instance *one = c;
-    for (size_t i = 0U; i < many; i++) {
+    const instance *self = c;
+    for (size_t i = 0U; i < count; i++) {
         if (references[i] != VALID_REFERENCE) { return fmi2Error; }
-        values[i] = one->valid ? 1 : 0;
+        values[i] = self->valid ? 1 : 0;
     }
     return fmi2OK;
 }
@@ -218,19 +218,19 @@ EXPORTED fmi2Status fmi2GetBoolean(REFERENCES, fmi2Boolean values[])
 EXPORTED fmi2Status fmi2SetBoolean(REFERENCES, const fmi2Boolean values[])
 {
     (void)c; (void)references; (void)values;
-    return told(many == 0U);
+    return status(count == 0U);
 }
 
 EXPORTED fmi2Status fmi2GetString(REFERENCES, fmi2String values[])
 {
     (void)c; (void)references; (void)values;
-    return told(many == 0U);
+    return status(count == 0U);
 }
 
 EXPORTED fmi2Status fmi2SetString(REFERENCES, const fmi2String values[])
 {
     (void)c; (void)references; (void)values;
-    return told(many == 0U);
+    return status(count == 0U);
 }
 
 EXPORTED fmi2Status fmi2GetFMUstate(fmi2Component c, void **state)
@@ -280,31 +280,31 @@ EXPORTED fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char bytes[],
 }
 
 EXPORTED fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference of[],
-                                                 size_t many, const fmi2ValueReference by[],
+                                                 size_t count, const fmi2ValueReference by[],
                                                  size_t more, const double by_values[],
                                                  double values[])
 {
-    (void)c; (void)of; (void)many; (void)by; (void)more; (void)by_values; (void)values;
+    (void)c; (void)of; (void)count; (void)by; (void)more; (void)by_values; (void)values;
     return fmi2Error;
 }
 
 EXPORTED fmi2Status fmi2SetRealInputDerivatives(REFERENCES, const int orders[],
                                                 const double values[])
 {
-    (void)c; (void)references; (void)many; (void)orders; (void)values;
+    (void)c; (void)references; (void)count; (void)orders; (void)values;
     return fmi2Error;
 }
 
 EXPORTED fmi2Status fmi2GetRealOutputDerivatives(REFERENCES, const int orders[], double values[])
 {
-    (void)c; (void)references; (void)many; (void)orders; (void)values;
+    (void)c; (void)references; (void)count; (void)orders; (void)values;
     return fmi2Error;
 }
 
 EXPORTED fmi2Status fmi2DoStep(fmi2Component c, double time, double step, fmi2Boolean keeps)
 {
     (void)time; (void)keeps;
-    return told(advance(c, step));
+    return status(advance(c, step));
 }
 
 EXPORTED fmi2Status fmi2CancelStep(fmi2Component c) { (void)c; return fmi2Error; }

@@ -2,7 +2,7 @@
 
 #define TOKEN "${token}"
 #define SIGNALS ${program.signals|length}U
-#define TOLD ${parameters|length}U
+#define PARAMETERS ${parameters|length}U
 #define TICK_S ${tick_s}
 #define ANGLE_SCALE ${angle.scale|decimal}
 #define model_step ${prefix}_step
@@ -18,16 +18,16 @@ static void fill_sample(model_sample *to, const int16_t counts[])
 //% endfor
 }
 
-static void begin_drive(model_state *state, const int32_t told[])
+static void start_drive(model_state *state, const int32_t parameters[])
 {
-//% if knows
+//% if has_car
     ${prefix}_car car;
 //% for field in fields.facts + fields.numbers
-    car.${field} = told[${loop.index0}];
+    car.${field} = parameters[${loop.index0}];
 //% endfor
     ${prefix}_start(state, &car);
 //% else
-    (void)told;
+    (void)parameters;
     ${prefix}_start(state);
 //% endif
 }

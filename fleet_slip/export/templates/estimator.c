@@ -6,7 +6,7 @@
 //% for helper in helpers
 ${helper}
 //% endfor
-void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" if knows})
+void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" if has_car})
 {
 //% for line in start
     ${line}
@@ -14,14 +14,14 @@ void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" i
 }
 
 //% if learned
-void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if knows}uint32_t kept)
+void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if has_car}uint32_t retained)
 {
-    const uint32_t parts = (kept < 256U) ? kept : 256U;
+    const uint32_t parts = (retained < 256U) ? retained : 256U;
 //% for key in learned
     const int64_t sum_${key} = floor_shift(state->sum_${key} * (int64_t)parts, 8U);
     const uint64_t values_${key} = ((uint64_t)state->values_${key} * parts) / 256U;
 //% endfor
-    ${prefix}_start(state${", car" if knows});
+    ${prefix}_start(state${", car" if has_car});
 //% for key in learned
     state->sum_${key} = sum_${key};
     state->values_${key} = (uint32_t)values_${key};

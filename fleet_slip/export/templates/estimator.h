@@ -20,7 +20,7 @@ extern "C" {
 //% endfor
 #define ${upper}_ANGLE_SCALE ${angle.scale|decimal} /* ${angle.unit|unit} */
 
-/* A count that is missing; one beyond its range is, too. */
+/* Missing count. A count outside its range is missing, too. */
 #define ${upper}_MISSING INT16_MIN
 
 /* Counts of one tick: physical = scale * count. */
@@ -29,11 +29,11 @@ typedef struct {
 //% include "templates/sample.h"
 } ${prefix}_sample;
 
-//% if knows
-/* What a car does not know. */
+//% if has_car
+/* Unknown property of the car. */
 #define ${upper}_UNKNOWN INT32_MIN
 
-/* What a car knows of itself. */
+/* Properties of the car. */
 typedef struct {
 //% for one, field in zip(program.facts, fields.facts)
     int32_t ${field}; /* ${"whole number" if one.equals is none else "1 or 0"} */
@@ -44,40 +44,39 @@ typedef struct {
 } ${prefix}_car;
 
 //% endif
-/* What is kept from tick to tick. */
+/* State between two ticks. */
 typedef struct {
 //% for one in state
     ${one.declared}
 //% endfor
 } ${prefix}_state;
 
-/* Begins a drive. */
-void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" if knows});
+/* Starts a drive. */
+void ${prefix}_start(${prefix}_state *state${", const " ~ prefix ~ "_car *car" if has_car});
 
 //% if program.learned
-/* Begins another drive of the same car, which remembers so many of 256 parts of what drives have
- * taught it of load and tyres. The state must be kept meanwhile, in memory that needs no power. */
-void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if knows}uint32_t kept);
+/* Starts another drive of the same car and retains a share (retained / 256) of the sums from which it
+ * learns load and tyres. Keep the state in non-volatile memory between the drives. */
+void ${prefix}_next(${prefix}_state *state, ${"const " ~ prefix ~ "_car *car, " if has_car}uint32_t retained);
 
 //% endif
-/* Takes the next tick, and writes ${angle.column} in counts of ${angle.scale|decimal}
- * ${angle.unit}, within ${"%.12f"|format(angle.error|float)} counts of the exact model.
- * Returns whether there is an angle; else 0 is written. Call it at every tick: one
- * without a message is a sample of missing counts. */
+/* Computes ${angle.column} at the next tick, in counts of ${angle.scale|decimal} ${angle.unit},
+ * within ${"%.12f"|format(angle.error|float)} counts of the exact model. Returns false and writes 0
+ * if there is no angle. Call it at every tick, without a message with missing counts. */
 bool ${prefix}_step(${prefix}_state *state, const ${prefix}_sample *sample, int32_t *angle);
 
-/* How often each input was there, but beyond its range. Begin with zeros. */
+/* Number of counts outside the range, for each input. Initialise it with zeros. */
 typedef struct {
 //% for field in fields.signals
     uint32_t ${field};
 //% endfor
 } ${prefix}_outside;
 
-/* Counts what a tick has beyond the ranges; no angle depends on it. */
+/* Counts the inputs of a tick that are outside their ranges. The angle does not depend on it. */
 static inline void ${prefix}_count_outside(${prefix}_outside *outside, const ${prefix}_sample *sample)
 {
-//% for field, beyond in outside.items()
-    if ((sample->${field} != INT16_MIN) && (${beyond}) && (outside->${field} < UINT32_MAX)) {
+//% for field, condition in outside.items()
+    if ((sample->${field} != INT16_MIN) && (${condition}) && (outside->${field} < UINT32_MAX)) {
         outside->${field}++;
     }
 //% else

@@ -12,18 +12,18 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     static ${prefix}_state state;
     ${prefix}_sample sample;
     size_t at = 0U;
-//% if knows
+//% if has_car
     ${prefix}_car car;
     if (size < sizeof car) { return 0; }
     (void)memcpy(&car, data, sizeof car);
     at = sizeof car;
 //% endif
-    ${prefix}_start(&state${", &car" if knows});
+    ${prefix}_start(&state${", &car" if has_car});
     for (; (size - at) >= sizeof sample; at += sizeof sample) {
         int32_t angle;
         (void)memcpy(&sample, &data[at], sizeof sample);
         if ((!${prefix}_step(&state, &sample, &angle)) && (angle != 0)) {
-            abort(); /* where there is none, 0 is written */
+            abort(); /* 0 without an angle */
         }
     }
     return 0;

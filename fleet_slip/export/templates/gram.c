@@ -1,22 +1,22 @@
 /* Gram rows of a drive, exported by fleet-slip. Do not edit.
- * Columns of rows by feature set, a bit of a mask each, the first the lowest:
+ * Columns of rows by feature set, one bit of a mask each, the first one lowest:
 //% for one in sets
- * ${one.of.identity}: ${one.columns|join(", ")}.${" */" if loop.last}
+ * ${one.counted.identity}: ${one.columns|join(", ")}.${" */" if loop.last}
 //% endfor
 #include "${prefix}_gram.h"
 
 #define SETS ${sets|length}U
 #define MISSING INT32_MIN
 
-/* What is counted of a feature set. */
+/* Layout of a feature set. */
 typedef struct {
     uint32_t columns;
-    uint32_t parts;
-    uint32_t first_part;
+    uint32_t blocks;
+    uint32_t first_block;
     uint32_t first_number;
     uint32_t most_rows;
     uint64_t definition;
-    bool complete; /* rows that lack some columns are not counted */
+    bool complete; /* rows with some, but not all columns are not counted */
 } counted_set;
 
 static const counted_set counted[SETS] = {
@@ -28,56 +28,56 @@ static const counted_set counted[SETS] = {
 //% for helper in helpers
 ${helper}
 //% endfor
-/* Sums and products of so many columns. */
+/* Number of sums and products of columns. */
 static uint32_t numbers_of(uint32_t columns)
 {
     return columns + ((columns * (columns + 1U)) / 2U);
 }
 
-/* Counts a row of a feature set, over one of the times that it changes over. */
+/* Counts a row of a feature set, for one of the times of its changes. */
 static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t *row)
 {
-    const counted_set *const of = &counted[set];
+    const counted_set *const spec = &counted[set];
     uint32_t mask = 0U;
     uint32_t lacking = 0U;
-    for (uint32_t i = 0U; i < of->columns; i++) {
+    for (uint32_t i = 0U; i < spec->columns; i++) {
         if (row[i] == MISSING) {
-            row[i] = 0; /* adds nothing */
+            row[i] = 0; /* adds 0 */
             lacking++;
         } else {
             mask |= ((uint32_t)1U << i);
         }
     }
-    uint32_t found = 0U;
-    if (of->complete && (lacking > 0U) && (lacking < of->columns)) {
+    uint32_t index = 0U;
+    if (spec->complete && (lacking > 0U) && (lacking < spec->columns)) {
         return;
     }
-    while ((found < gram->used[set]) && ((gram->parts[of->first_part + found].mask != mask) ||
-                                         (gram->parts[of->first_part + found].over != over))) {
-        found++;
+    while ((index < gram->used[set]) && ((gram->blocks[spec->first_block + index].mask != mask) ||
+                                         (gram->blocks[spec->first_block + index].over != over))) {
+        index++;
     }
-    const bool is_new = (found == gram->used[set]) && (found < of->parts);
-    const uint32_t size = numbers_of(of->columns);
+    const bool is_new = (index == gram->used[set]) && (index < spec->blocks);
+    const uint32_t size = numbers_of(spec->columns);
     if (is_new) {
-        ${prefix}_gram_part *const part = &gram->parts[of->first_part + found];
-        part->mask = mask;
-        part->over = over;
-        part->rows = 0U;
+        ${prefix}_gram_block *const block = &gram->blocks[spec->first_block + index];
+        block->mask = mask;
+        block->over = over;
+        block->rows = 0U;
         for (uint32_t i = 0U; i < size; i++) {
-            gram->numbers[of->first_number + (found * size) + i] = 0;
+            gram->numbers[spec->first_number + (index * size) + i] = 0;
         }
         gram->used[set]++;
     }
-    if ((found == of->parts) || (gram->parts[of->first_part + found].rows == of->most_rows)) {
-        gram->lost[set] += (gram->lost[set] < ${most_rows}U) ? 1U : 0U;
+    if ((index == spec->blocks) || (gram->blocks[spec->first_block + index].rows == spec->most_rows)) {
+        gram->lost[set] += (gram->lost[set] < ${max_rows}U) ? 1U : 0U;
     } else {
-        uint32_t at = of->first_number + (found * size);
-        gram->parts[of->first_part + found].rows++;
-        for (uint32_t i = 0U; i < of->columns; i++) {
+        uint32_t at = spec->first_number + (index * size);
+        gram->blocks[spec->first_block + index].rows++;
+        for (uint32_t i = 0U; i < spec->columns; i++) {
             gram->numbers[at] += row[i];
             at++;
         }
-        for (uint32_t i = 0U; i < of->columns; i++) {
+        for (uint32_t i = 0U; i < spec->columns; i++) {
             for (uint32_t j = 0U; j <= i; j++) {
                 gram->numbers[at] += (int64_t)row[i] * row[j];
                 at++;
@@ -89,7 +89,7 @@ static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t
 //% if changed
 //% include "templates/gram_changes.c"
 //% endif
-void ${prefix}_gram_start(${prefix}_gram *gram${", int32_t late" if changed})
+void ${prefix}_gram_start(${prefix}_gram *gram${", int32_t delay" if changed})
 {
     for (uint32_t i = 0U; i < SETS; i++) {
         gram->used[i] = 0U;
@@ -105,31 +105,31 @@ void ${prefix}_gram_start(${prefix}_gram *gram${", int32_t late" if changed})
 //% for number, _ in changed
     gram->at_columns_${number} = 0U;
 //% endfor
-    for (uint32_t i = 0U; i < TRACK; i++) {
-        gram->track[i].course = MISSING;
-        gram->track[i].yaw_rate = 0;
-        gram->track[i].turned = 0U;
-        gram->track[i].run = 0U;
+    for (uint32_t i = 0U; i < HISTORY; i++) {
+        gram->history[i].course = MISSING;
+        gram->history[i].yaw_rate = 0;
+        gram->history[i].turned = 0U;
+        gram->history[i].run = 0U;
     }
     gram->at = 0U;
-    gram->late = (late < (${earliest})) ? (${earliest}) : ((late > ${latest}) ? ${latest} : late);
-    gram->began = false;
+    gram->delay = (delay < (${min_delay})) ? (${min_delay}) : ((delay > ${max_delay}) ? ${max_delay} : delay);
+    gram->started = false;
 //% endif
 }
 
 //% include "templates/gram_tick.c"
-/* Writes the lowest bytes of a number, the lowest first; returns where the next one goes. */
+/* Writes a number, the lowest byte first; returns the next index. */
 static uint32_t put(uint8_t *message, uint32_t at, uint64_t value, uint32_t bytes)
 {
-    uint64_t rest = value;
+    uint64_t remaining = value;
     for (uint32_t i = 0U; i < bytes; i++) {
-        message[at + i] = (uint8_t)(rest & 0xFFU);
-        rest >>= 8U;
+        message[at + i] = (uint8_t)(remaining & 0xFFU);
+        remaining >>= 8U;
     }
     return at + bytes;
 }
 
-/* CRC-32 as in Ethernet and zlib. */
+/* CRC-32 of Ethernet and zlib. */
 static uint32_t crc_32(const uint8_t *bytes, uint32_t size)
 {
     uint32_t crc = 0xFFFFFFFFU;
@@ -149,46 +149,46 @@ uint32_t ${prefix}_gram_message(const ${prefix}_gram *gram, uint32_t part, const
                                uint64_t start_s, uint8_t *message)
 {
     uint32_t set = 0U;
-    uint32_t place = part;
-    while ((set < SETS) && (place >= gram->used[set])) {
-        place -= gram->used[set];
+    uint32_t index = part;
+    while ((set < SETS) && (index >= gram->used[set])) {
+        index -= gram->used[set];
         set++;
     }
     if (set == SETS) {
         return 0U;
     }
-    const counted_set *const of = &counted[set];
-    const ${prefix}_gram_part *const from = &gram->parts[of->first_part + place];
+    const counted_set *const spec = &counted[set];
+    const ${prefix}_gram_block *const block = &gram->blocks[spec->first_block + index];
 //% for byte in magic
     message[${loop.index0}] = ${byte}U; /* ${"%c"|format(byte)} */
 //% endfor
     uint32_t at = put(message, ${magic|length}U, ${"(set == 0U) ? %sU : %sU"|format(layout, set_layout) if changed else layout ~ "U"}, 2U);
-    at = put(message, at, 0U, 2U); /* the length, below */
-    at = put(message, at, of->definition, 8U);
-    for (uint32_t i = 0U; i < ${longest_vehicle}U; i++) {
+    at = put(message, at, 0U, 2U); /* length, written below */
+    at = put(message, at, spec->definition, 8U);
+    for (uint32_t i = 0U; i < ${max_vehicle}U; i++) {
         at = put(message, at, vehicle[i], 1U);
     }
-    at = put(message, at, place, 2U);
+    at = put(message, at, index, 2U);
     at = put(message, at, gram->used[set], 2U);
     at = put(message, at, start_s, 8U);
-    at = put(message, at, ${"which_of(gram, set, from)" if changed else "from->mask"}, 4U);
-    at = put(message, at, from->rows, 4U);
-    at = put(message, at, gram->lost[set], 4U); /* byte ${header_bytes} is next */
+    at = put(message, at, ${"contents_of(gram, set, block)" if changed else "block->mask"}, 4U);
+    at = put(message, at, block->rows, 4U);
+    at = put(message, at, gram->lost[set], 4U); /* the header ends at byte ${header_bytes} */
 //% if changed
     if (set > 0U) {
-        at = put_columns(message, at, set, from->mask);
+        at = put_columns(message, at, set, block->mask);
     }
 //% endif
-    uint32_t number = of->first_number + (place * numbers_of(of->columns));
-    for (uint32_t i = 0U; i < of->columns; i++) {
-        if (((from->mask >> i) & 1U) != 0U) {
+    uint32_t number = spec->first_number + (index * numbers_of(spec->columns));
+    for (uint32_t i = 0U; i < spec->columns; i++) {
+        if (((block->mask >> i) & 1U) != 0U) {
             at = put(message, at, (uint64_t)gram->numbers[number], 8U);
         }
         number++;
     }
-    for (uint32_t i = 0U; i < of->columns; i++) {
+    for (uint32_t i = 0U; i < spec->columns; i++) {
         for (uint32_t j = 0U; j <= i; j++) {
-            if ((((from->mask >> i) & (from->mask >> j)) & 1U) != 0U) {
+            if ((((block->mask >> i) & (block->mask >> j)) & 1U) != 0U) {
                 at = put(message, at, (uint64_t)gram->numbers[number], 8U);
             }
             number++;

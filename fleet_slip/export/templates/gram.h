@@ -5,13 +5,13 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* A count that is missing; one beyond its range is, too. */
+/* Missing count. A count outside its range is missing, too. */
 #define ${upper}_GRAM_MISSING ${"INT32_MIN" if changed else "INT16_MIN"}
-/* Sets of signals that are kept apart: rows of further ones are lost, and counted. */
-#define ${upper}_GRAM_PARTS ${most_parts}U
-/* Most rows of a drive: no sum of so many products reaches 2^61. */
-#define ${upper}_GRAM_MOST_ROWS ${most_rows}U
-#define ${upper}_GRAM_LONGEST_MESSAGE ${longest_message}U
+/* Blocks of a drive, one for each combination of valid signals. Rows of further ones are lost. */
+#define ${upper}_GRAM_PARTS ${max_blocks}U
+/* Maximum number of rows of a drive: no sum of products reaches 2^61. */
+#define ${upper}_GRAM_MOST_ROWS ${max_rows}U
+#define ${upper}_GRAM_LONGEST_MESSAGE ${max_message}U
 
 /* Counts of one tick: physical = scale * count. */
 typedef struct {
@@ -20,24 +20,24 @@ typedef struct {
 } ${prefix}_gram_sample;
 
 typedef struct {
-    uint32_t mask; /* a bit for each signal that its rows have */
-    uint32_t over; /* which time they change over */
+    uint32_t mask; /* one bit for each valid signal of its rows */
+    uint32_t over; /* index of the time of changes */
     uint32_t rows;
-} ${prefix}_gram_part;
+} ${prefix}_gram_block;
 
 //% if changed
-/* Course and yaw rate of a tick; the sum of the yaw rate, and for how many ticks it was there. */
+/* Course and yaw rate of a tick, sum of the yaw rate, and ticks since it was missing. */
 typedef struct {
     int32_t course;
     int32_t yaw_rate;
     uint32_t turned;
     uint32_t run;
-} ${prefix}_gram_track;
+} ${prefix}_gram_motion;
 
 //% endif
 typedef struct {
-    ${prefix}_gram_part parts[${parts}];
-    int64_t numbers[${numbers}]; /* sums, then products, of each part */
+    ${prefix}_gram_block blocks[${blocks}];
+    int64_t numbers[${numbers}]; /* sums, then products, of each block */
     uint32_t used[${sets|length}];
     uint32_t lost[${sets|length}];
 //% if changed
@@ -45,38 +45,38 @@ typedef struct {
     ${one.declared}
 //% endfor
 //% for number, one in changed
-    int32_t columns_${number}[${one.kept_ticks * one.computed|length}];
+    int32_t columns_${number}[${one.history_ticks * one.computed|length}];
     uint32_t at_columns_${number};
 //% endfor
-    ${prefix}_gram_track track[${track}];
+    ${prefix}_gram_motion history[${history}];
     uint32_t at;
-    int32_t late;
-    bool began;
+    int32_t delay;
+    bool started;
 //% endif
 } ${prefix}_gram;
 
 //% if changed
-/* Begins a drive. late is the delay of the course in ${late_ms} ms, from
- * ${earliest} to ${latest}; 0 where it is not known. */
-void ${prefix}_gram_start(${prefix}_gram *gram, int32_t late);
+/* Starts a drive. delay is the delay of the course in units of ${delay_ms} ms, from
+ * ${min_delay} to ${max_delay}; 0 if it is unknown. */
+void ${prefix}_gram_start(${prefix}_gram *gram, int32_t delay);
 
 //% else
-/* Begins a drive. */
+/* Starts a drive. */
 void ${prefix}_gram_start(${prefix}_gram *gram);
 
 //% endif
-/* Counts a tick that was logged. One without a message is not counted: ${"pass it over" if changed else "do not call it then"}. */
+/* Counts a tick with a message. ${"Call pass for other ticks" if changed else "Do not call it for other ticks"}. */
 void ${prefix}_gram_add(${prefix}_gram *gram, const ${prefix}_gram_sample *sample);
 
 //% if changed
-/* Passes over a tick that was not logged. */
+/* Advances by a tick without a message. */
 void ${prefix}_gram_pass(${prefix}_gram *gram);
 
 //% endif
-/* At the end of a drive, for part = 0, 1, ...: writes a message of at most
- * ${upper}_GRAM_LONGEST_MESSAGE bytes and returns its length, 0 where there is no such part.
- * vehicle is the car's name, ${longest_vehicle} bytes of ASCII with zeros behind it; start_s when
- * the drive began, in seconds since 1970 in UTC. */
+/* Writes the message of a block, for part = 0, 1, ... at the end of a drive. It has at most
+ * ${upper}_GRAM_LONGEST_MESSAGE bytes. Returns its length, or 0 if there is no such block.
+ * vehicle is the name of the car, ${max_vehicle} bytes of ASCII, zero-padded. start_s is the start
+ * of the drive in seconds since 1970 in UTC. */
 uint32_t ${prefix}_gram_message(const ${prefix}_gram *gram, uint32_t part, const uint8_t *vehicle,
                                uint64_t start_s, uint8_t *message);
 

@@ -2,125 +2,125 @@
 #define ${name} ${value}
 //% endfor
 ${""}
-/* What the columns of a feature set change by. */
+/* Changes of the columns of a feature set. */
 typedef struct {
     uint32_t set;
     uint32_t columns;
-    uint32_t length; /* ticks of them that are kept */
+    uint32_t length; /* ticks of stored columns */
     uint32_t times;
-    uint32_t apart[MOST_TIMES]; /* ticks from one fix to another, of each time */
+    uint32_t apart[MAX_TIMES]; /* ticks between two fixes, for each time */
 } changed_set;
 
 static const changed_set changed[CHANGED] = {
 //% for number, one in changed
-    {${number}U, ${one.computed|length}U, ${one.kept_ticks}U, ${one.of.times|length}U, {${one.of.times|map("string")|join("U, ")}U}}${"," if not loop.last}
+    {${number}U, ${one.computed|length}U, ${one.history_ticks}U, ${one.counted.times|length}U, {${one.counted.times|map("string")|join("U, ")}U}}${"," if not loop.last}
 //% endfor
 };
 
-/* The place of so many ticks ago in a ring of so many, whose newest value is at a place. */
-static uint32_t place_of(uint32_t newest, uint32_t length, uint32_t ago)
+/* Index of the value of some ticks ago in a ring. */
+static uint32_t ring_index(uint32_t newest, uint32_t length, uint32_t ago)
 {
     const uint32_t turn = (newest >= ago) ? 0U : length;
     return (newest + turn) - ago;
 }
 
-/* Keeps course and yaw rate of a tick. */
-static void keep_track(${prefix}_gram *gram, int32_t course, int32_t yaw_rate)
+/* Stores course and yaw rate of a tick. */
+static void store_motion(${prefix}_gram *gram, int32_t course, int32_t yaw_rate)
 {
-    const ${prefix}_gram_track *const last = &gram->track[gram->at];
-    const bool there = (yaw_rate != MISSING);
-    const uint32_t turned = last->turned + (there ? (uint32_t)yaw_rate : 0U);
-    const uint32_t run = there ? (last->run + ((last->run < UINT32_MAX) ? 1U : 0U)) : 0U;
-    gram->at = ((gram->at + 1U) == TRACK) ? 0U : (gram->at + 1U);
-    gram->track[gram->at].course = course;
-    gram->track[gram->at].yaw_rate = there ? yaw_rate : 0;
-    gram->track[gram->at].turned = turned;
-    gram->track[gram->at].run = run;
+    const ${prefix}_gram_motion *const last = &gram->history[gram->at];
+    const bool present = (yaw_rate != MISSING);
+    const uint32_t turned = last->turned + (present ? (uint32_t)yaw_rate : 0U);
+    const uint32_t run = present ? (last->run + ((last->run < UINT32_MAX) ? 1U : 0U)) : 0U;
+    gram->at = ((gram->at + 1U) == HISTORY) ? 0U : (gram->at + 1U);
+    gram->history[gram->at].course = course;
+    gram->history[gram->at].yaw_rate = present ? yaw_rate : 0;
+    gram->history[gram->at].turned = turned;
+    gram->history[gram->at].run = run;
 }
 
-/* Twice the integral of the yaw rate, by trapezoids: sums wrap, their difference is small. */
-static int64_t turned_between(const ${prefix}_gram_track *now, const ${prefix}_gram_track *before)
+/* Twice the integral of the yaw rate by trapezoids. Sums wrap, but their difference is small. */
+static int64_t turned_between(const ${prefix}_gram_motion *now, const ${prefix}_gram_motion *before)
 {
     const uint32_t sum = now->turned - before->turned;
     const int64_t wrapped = (sum > (uint32_t)INT32_MAX) ? INT64_C(4294967296) : 0;
     return ((2 * ((int64_t)sum - wrapped)) - now->yaw_rate) + before->yaw_rate;
 }
 
-/* Counts what columns changed by between two fixes, whose ticks are so many ago. */
-static void count_change(${prefix}_gram *gram, const changed_set *of, const int32_t *ring,
-                         uint32_t newest, uint32_t over, int64_t left, int64_t turned,
+/* Counts the changes of columns between two fixes of some ticks ago. */
+static void count_change(${prefix}_gram *gram, const changed_set *spec, const int32_t *ring,
+                         uint32_t newest, uint32_t over, int64_t remainder, int64_t turned,
                          uint32_t now_ago)
 {
-    const uint32_t first = place_of(newest, of->length, now_ago + of->apart[over]) * of->columns;
-    const uint32_t then = place_of(newest, of->length, now_ago) * of->columns;
-    const ${prefix}_gram_track *const now = &gram->track[place_of(gram->at, TRACK, now_ago)];
-    const ${prefix}_gram_track *const before =
-        &gram->track[place_of(gram->at, TRACK, now_ago + of->apart[over])];
+    const uint32_t first = ring_index(newest, spec->length, now_ago + spec->apart[over]) * spec->columns;
+    const uint32_t then = ring_index(newest, spec->length, now_ago) * spec->columns;
+    const ${prefix}_gram_motion *const now = &gram->history[ring_index(gram->at, HISTORY, now_ago)];
+    const ${prefix}_gram_motion *const before =
+        &gram->history[ring_index(gram->at, HISTORY, now_ago + spec->apart[over])];
     const bool slow = (now->yaw_rate <= SLOW) && (now->yaw_rate >= -SLOW) &&
                       (before->yaw_rate <= SLOW) && (before->yaw_rate >= -SLOW) &&
-                      (turned <= UNTURNED) && (turned >= -UNTURNED);
-    const int32_t change = (int32_t)nearest_64(left, DIVISOR);
-    int32_t row[MOST_COLUMNS];
-    for (uint32_t i = 0U; i < of->columns; i++) {
-        const bool there = (ring[first + i] != MISSING) && (ring[then + i] != MISSING);
-        row[i] = there ? (ring[then + i] - ring[first + i]) : MISSING;
+                      (turned <= STRAIGHT) && (turned >= -STRAIGHT);
+    const int32_t change = (int32_t)nearest_64(remainder, DIVISOR);
+    int32_t row[MAX_COLUMNS];
+    for (uint32_t i = 0U; i < spec->columns; i++) {
+        const bool present = (ring[first + i] != MISSING) && (ring[then + i] != MISSING);
+        row[i] = present ? (ring[then + i] - ring[first + i]) : MISSING;
     }
-    row[of->columns] = (int32_t)nearest_64(turned, COARSER);
-    row[of->columns + 1U] = 0;
-    row[of->columns + 2U] = 0;
+    row[spec->columns] = (int32_t)nearest_64(turned, COARSER);
+    row[spec->columns + 1U] = 0;
+    row[spec->columns + 2U] = 0;
     if (slow) {
-        row[of->columns + 1U] = 1;
-        row[of->columns + 2U] = change;
+        row[spec->columns + 1U] = 1;
+        row[spec->columns + 2U] = change;
     }
-    row[of->columns + 3U] = change;
-    count_row(gram, of->set, over, row);
+    row[spec->columns + 3U] = change;
+    count_row(gram, spec->set, over, row);
 }
 
-/* Counts the changes up to the fix of this tick, if there is one: of the moment that it is of. */
-static void count_changes(${prefix}_gram *gram, const changed_set *of, const int32_t *ring,
-                          uint32_t newest, int32_t late)
+/* Counts the changes up to the time of the fix of this tick, if present is one. */
+static void count_changes(${prefix}_gram *gram, const changed_set *spec, const int32_t *ring,
+                          uint32_t newest, int32_t delay)
 {
-    const int32_t whole = (((late + ROUND_LATE) + (LATE_PARTS * EARLIEST)) / LATE_PARTS) - EARLIEST;
-    const int64_t gain = ((int64_t)late - ((int64_t)whole * LATE_PARTS)) * GAIN;
-    const uint32_t now_ago = (whole > 0) ? (uint32_t)whole : 0U;
-    const uint32_t fix_ago = (whole < 0) ? (uint32_t)(-whole) : 0U;
-    for (uint32_t over = 0U; over < of->times; over++) {
-        const uint32_t apart = of->apart[over];
-        const int32_t course = gram->track[place_of(gram->at, TRACK, fix_ago)].course;
-        const int32_t from = gram->track[place_of(gram->at, TRACK, fix_ago + apart)].course;
-        const ${prefix}_gram_track *const now = &gram->track[place_of(gram->at, TRACK, now_ago)];
-        const ${prefix}_gram_track *const before =
-            &gram->track[place_of(gram->at, TRACK, now_ago + apart)];
+    const int32_t ticks = (((delay + ROUND_DELAY) + (DELAY_PARTS * MIN_DELAY)) / DELAY_PARTS) - MIN_DELAY;
+    const int64_t gain = ((int64_t)delay - ((int64_t)ticks * DELAY_PARTS)) * GAIN;
+    const uint32_t now_ago = (ticks > 0) ? (uint32_t)ticks : 0U;
+    const uint32_t fix_ago = (ticks < 0) ? (uint32_t)(-ticks) : 0U;
+    for (uint32_t over = 0U; over < spec->times; over++) {
+        const uint32_t apart = spec->apart[over];
+        const int32_t course = gram->history[ring_index(gram->at, HISTORY, fix_ago)].course;
+        const int32_t from = gram->history[ring_index(gram->at, HISTORY, fix_ago + apart)].course;
+        const ${prefix}_gram_motion *const now = &gram->history[ring_index(gram->at, HISTORY, now_ago)];
+        const ${prefix}_gram_motion *const before =
+            &gram->history[ring_index(gram->at, HISTORY, now_ago + apart)];
         if ((course != MISSING) && (from != MISSING) && (now->run > apart)) {
             const int64_t turned = turned_between(now, before);
-            int64_t left = (TURN * ((int64_t)course - from)) - (COURSE_COUNTS * turned);
-            left += gain * ((int64_t)now->yaw_rate - before->yaw_rate);
-            left -= (COURSE_COUNTS * TURN) * nearest_64(left, COURSE_COUNTS * TURN);
-            if ((left <= LARGEST) && (left >= -LARGEST)) {
-                count_change(gram, of, ring, newest, over, left, turned, now_ago);
+            int64_t remainder = (TURN * ((int64_t)course - from)) - (COURSE_COUNTS * turned);
+            remainder += gain * ((int64_t)now->yaw_rate - before->yaw_rate);
+            remainder -= (COURSE_COUNTS * TURN) * nearest_64(remainder, COURSE_COUNTS * TURN);
+            if ((remainder <= MAX_REMAINDER) && (remainder >= -MAX_REMAINDER)) {
+                count_change(gram, spec, ring, newest, over, remainder, turned, now_ago);
             }
         }
     }
 }
 
-/* Keeps the columns of a tick; returns where. */
-static uint32_t keep_columns(const changed_set *of, int32_t *ring, uint32_t newest,
+/* Stores the columns of a tick; returns their index. */
+static uint32_t store_columns(const changed_set *spec, int32_t *ring, uint32_t newest,
                              const int32_t *columns)
 {
-    const uint32_t place = ((newest + 1U) == of->length) ? 0U : (newest + 1U);
-    for (uint32_t i = 0U; i < of->columns; i++) {
-        ring[(place * of->columns) + i] = columns[i];
+    const uint32_t index = ((newest + 1U) == spec->length) ? 0U : (newest + 1U);
+    for (uint32_t i = 0U; i < spec->columns; i++) {
+        ring[(index * spec->columns) + i] = columns[i];
     }
-    return place;
+    return index;
 }
 
-/* A drive's first tick has no change: so a drive without a course is known to have none. */
-static void count_nothing(${prefix}_gram *gram)
+/* Counts a row without columns at the first tick, so that a drive without a course has a row. */
+static void count_empty_row(${prefix}_gram *gram)
 {
     for (uint32_t i = 0U; i < CHANGED; i++) {
         for (uint32_t over = 0U; over < changed[i].times; over++) {
-            int32_t row[MOST_COLUMNS];
-            for (uint32_t j = 0U; j < MOST_COLUMNS; j++) {
+            int32_t row[MAX_COLUMNS];
+            for (uint32_t j = 0U; j < MAX_COLUMNS; j++) {
                 row[j] = MISSING;
             }
             count_row(gram, changed[i].set, over, row);

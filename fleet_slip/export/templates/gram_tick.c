@@ -15,23 +15,23 @@ static void take_tick(${prefix}_gram *gram, const ${prefix}_gram_sample *sample,
     ${line}
 //% endfor
     if (logged) {
-        if (!gram->began) {
-            count_nothing(gram);
+        if (!gram->started) {
+            count_empty_row(gram);
         }
 //% for one in sets
-//% if not one.of.times
+//% if not one.counted.times
 ${(array("row_%s"|format(loop.index0), rows[loop.index0])|indent(4, true)).rstrip()}
         count_row(gram, ${loop.index0}U, 0U, row_${loop.index0});
 //% endif
 //% endfor
     }
-    gram->began = true;
-    keep_track(gram, ${course}, ${yaw_rate});
+    gram->started = true;
+    store_motion(gram, ${course}, ${yaw_rate});
 //% for number, one in changed
-//% set of = "&changed[%s]"|format(loop.index0)
+//% set spec = "&changed[%s]"|format(loop.index0)
 ${array("row_%s"|format(number), rows[number], "const int32_t").rstrip()}
-    gram->at_columns_${number} = keep_columns(${of}, gram->columns_${number}, gram->at_columns_${number}, row_${number});
-    count_changes(gram, ${of}, gram->columns_${number}, gram->at_columns_${number}, ${"gram->late" if one.of.in_time else "0"});
+    gram->at_columns_${number} = store_columns(${spec}, gram->columns_${number}, gram->at_columns_${number}, row_${number});
+    count_changes(gram, ${spec}, gram->columns_${number}, gram->at_columns_${number}, ${"gram->delay" if one.counted.in_time else "0"});
 //% endfor
 }
 
@@ -42,8 +42,8 @@ void ${prefix}_gram_add(${prefix}_gram *gram, const ${prefix}_gram_sample *sampl
 
 void ${prefix}_gram_pass(${prefix}_gram *gram)
 {
-    const ${prefix}_gram_sample nothing = {${(["MISSING"] * program.signals|length)|join(", ")}};
-    take_tick(gram, &nothing, false);
+    const ${prefix}_gram_sample empty = {${(["MISSING"] * program.signals|length)|join(", ")}};
+    take_tick(gram, &empty, false);
 }
 
 //% else

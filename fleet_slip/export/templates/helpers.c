@@ -1,82 +1,82 @@
-/* The functions that an exported estimator is made of; each is written where it is called. */
+/* Functions of exported estimators. An export contains those that it calls. */
 
 //: within
-/* A value of a range; MISSING beyond it. */
-static int32_t within(int32_t value, int32_t least, int32_t most)
+/* Returns MISSING for a value outside a range. */
+static int32_t within(int32_t value, int32_t low, int32_t high)
 {
-    return ((value < least) || (value > most)) ? MISSING : value;
+    return ((value < low) || (value > high)) ? MISSING : value;
 }
 
 //: clip
 static int32_t clip(int64_t value, int32_t limit)
 {
-    const int64_t most = limit;
-    return (value > most) ? limit : ((value < -most) ? -limit : (int32_t)value);
+    const int64_t bound = limit;
+    return (value > bound) ? limit : ((value < -bound) ? -limit : (int32_t)value);
 }
 
 //: sign
 static int32_t sign(int64_t value)
 {
-    int32_t found = 0;
+    int32_t result = 0;
     if (value > 0) {
-        found = 1;
+        result = 1;
     } else if (value < 0) {
-        found = -1;
+        result = -1;
     } else {
         /* zero */
     }
-    return found;
+    return result;
 }
 
 //: min
-static int32_t smaller(int32_t one, int32_t other)
+static int32_t smaller(int32_t a, int32_t b)
 {
-    return (one < other) ? one : other;
+    return (a < b) ? a : b;
 }
 
 //: max
-static int32_t larger(int32_t one, int32_t other)
+static int32_t larger(int32_t a, int32_t b)
 {
-    return (one > other) ? one : other;
+    return (a > b) ? a : b;
 }
 
 //: max_64
-static int64_t larger_64(int64_t one, int64_t other)
+static int64_t larger_64(int64_t a, int64_t b)
 {
-    return (one > other) ? one : other;
+    return (a > b) ? a : b;
 }
 
 //: power
-/* The least power of two, at least 1, times which most is not below a value. */
-static int32_t power_of_two(int64_t value, int32_t most)
+/* The smallest power of two p, at least 1, with value <= factor * p. */
+static int32_t power_of_two(int64_t value, int32_t factor)
 {
-    int64_t found = 1;
-    for (uint32_t bit = 0U; (bit < 31U) && (value > (found * most)); bit++) {
-        found *= 2;
+    int64_t result = 1;
+    for (uint32_t bit = 0U; (bit < 31U) && (value > (result * factor)); bit++) {
+        result *= 2;
     }
-    return (int32_t)found;
+    return (int32_t)result;
 }
 
 //: nearest_64
-/* value / divisor to the nearest, halves away from zero. */
+/* Quotient to the nearest integer, halves away from zero. */
 static int64_t nearest_64(int64_t value, int64_t divisor)
 {
     const int64_t size = (value < 0) ? -value : value;
-    const int64_t found = ((2 * size) + divisor) / (2 * divisor);
-    return (value < 0) ? -found : found;
+    const int64_t result = ((2 * size) + divisor) / (2 * divisor);
+    return (value < 0) ? -result : result;
 }
 
 //: nearest_32
-/* The same for what fits into 32 bits. */
+/* Quotient of 32 bits to the nearest integer, halves away from zero. */
 static int32_t nearest_32(int32_t value, uint32_t divisor)
 {
     const uint32_t size = (uint32_t)((value < 0) ? -value : value);
-    const uint32_t found = ((2U * size) + divisor) / (2U * divisor);
-    return (value < 0) ? -(int32_t)found : (int32_t)found;
+    const uint32_t result = ((2U * size) + divisor) / (2U * divisor);
+    return (value < 0) ? -(int32_t)result : (int32_t)result;
 }
 
 //: ago_16
-/* The value of so many ticks ago; at is where the next one will be written. */
+/* Value of some ticks ago in a ring; at is the index of the next value. */
 static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
     const uint32_t turn = (at >= ticks) ? 0U : length;
@@ -85,7 +85,7 @@ static int32_t ago_16(const int16_t *ring, uint32_t at, uint32_t length, uint32_
 }
 
 //: ago_32
-/* The value of so many ticks ago; at is where the next one will be written. */
+/* Value of some ticks ago in a ring; at is the index of the next value. */
 static int32_t ago_32(const int32_t *ring, uint32_t at, uint32_t length, uint32_t ticks)
 {
     const uint32_t turn = (at >= ticks) ? 0U : length;
@@ -107,7 +107,7 @@ static void keep_32(int32_t *ring, uint32_t *at, uint32_t length, int32_t value)
 }
 
 //: slide_32
-/* The oldest value leaves a window, the newest comes. */
+/* Removes the oldest value of a window and adds the newest. */
 static void slide_32(int32_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
 {
     if (oldest != MISSING) {
@@ -121,7 +121,7 @@ static void slide_32(int32_t *sum, uint32_t *values, int32_t oldest, int32_t new
 }
 
 //: slide_64
-/* The oldest value leaves a window, the newest comes. */
+/* Removes the oldest value of a window and adds the newest. */
 static void slide_64(int64_t *sum, uint32_t *values, int32_t oldest, int32_t newest)
 {
     if (oldest != MISSING) {
@@ -135,17 +135,17 @@ static void slide_64(int64_t *sum, uint32_t *values, int32_t oldest, int32_t new
 }
 
 //: gather
-/* A value comes to all since the drive began, unless its sum could overflow. */
-static void gather(int64_t *sum, uint32_t *values, uint32_t most, int32_t value)
+/* Adds a value to the sum since the start of a drive, unless it has the maximum number of values. */
+static void gather(int64_t *sum, uint32_t *values, uint32_t limit, int32_t value)
 {
-    if ((value != MISSING) && (*values < most)) {
+    if ((value != MISSING) && (*values < limit)) {
         *sum += value;
         *values += 1U;
     }
 }
 
 //: floor_shift
-/* value / 2^bits, rounded down: a negative number is not shifted, which C leaves open. */
+/* value / 2^bits, rounded down. C does not define the shift of a negative number. */
 static int64_t floor_shift(int64_t value, uint32_t bits)
 {
     const uint64_t size = (uint64_t)((value >= 0) ? value : (-1 - value)) >> bits;

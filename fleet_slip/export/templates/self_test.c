@@ -1,4 +1,4 @@
-/* Self-test of ${version.reference}. It prints nothing but its result. */
+/* Self-test of ${version.reference}. It prints its result only. */
 #include <stdio.h>
 
 #include "${prefix}.h"
@@ -14,7 +14,7 @@ static const int16_t samples_${loop.index0}[${check.samples|length}][${fields.si
 };
 
 static const int32_t angles_${loop.index0}[${check.angles|length}] = {
-    ${check.angles|map("given", "NO_ANGLE")|join(", ")}
+    ${check.angles|map("or_missing", "NO_ANGLE")|join(", ")}
 };
 
 //% endfor
@@ -24,11 +24,11 @@ static uint32_t run_${number}(void)
 {
     static ${prefix}_state state;
     ${prefix}_sample sample;
-//% if knows
-    const ${prefix}_car car = { ${(check.facts + check.numbers)|map("given", "INT32_MIN")|join(", ")} };
+//% if has_car
+    const ${prefix}_car car = { ${(check.facts + check.numbers)|map("or_missing", "INT32_MIN")|join(", ")} };
 //% endif
     uint32_t wrong = 0U;
-    ${prefix}_start(&state${", &car" if knows});
+    ${prefix}_start(&state${", &car" if has_car});
     for (uint32_t i = 0U; i < ${check.angles|length}U; i++) {
         int32_t angle;
 //% for field in fields.signals

@@ -90,7 +90,7 @@ def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_pat
     shutil.copytree(root, copy)
     asked = ("--cohort", "speed_factor > 0.1")
     assert answer(copy, "publish", "fast", *asked, "--models", "table1")["version"] == 1
-    assert fleet_slip.open(copy).model("fast").manifest.trained_on.drives == 8
+    assert fleet_slip.open(copy).models.get("fast").manifest.trained_on.drives == 8
     with pytest.raises(DataError, match="has 2 in the cohort"):  # and not for its test drives
         answer(copy, "monitor", "fast")
     assert answer(copy, "quality", *asked)["drives"] == 8

@@ -99,7 +99,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
-    told = fleet_slip.open(own).evaluate_measured("own", four)
+    told = fleet_slip.open(own).evaluation.evaluate_measured("own", four)
     assert "No filter was evaluated" in str(told)
     assert f"stored as evaluations/measured/{told.number}.json" in str(told)
     found = told.content
@@ -172,11 +172,11 @@ def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_p
     done_on(root, "ingest", tmp_path / "log.csv", "--mapping", tmp_path / "noise.toml")
     done_on(root, "gram")
     fleet = fleet_slip.open(root)
-    search = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
-    fleet.publish("again", fleet.cohort().select(**search), force=True)
-    chosen = fleet_slip.open(root).model("again").manifest.signals
+    search: Any = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
+    fleet.models.publish("again", fleet.cohort().select(**search), force=True)
+    chosen = fleet_slip.open(root).models.get("again").manifest.signals
     done_on(root, "publish", "once", "--model", ",".join(chosen), "--force")
-    found = fleet_slip.open(root).evaluate_measured("again", "true", ["once"]).content
+    found = fleet_slip.open(root).evaluation.evaluate_measured("again", "true", ["once"]).content
     spread_deg = float(np.degrees(np.std(columns["beta"])))
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
     assert errors["once@1"] < 0.7 * spread_deg
@@ -229,7 +229,7 @@ def test_filters_compete_in_the_car_of_a_file_and_in_one_that_is_identified(
         lambda measured, *_: IdentifiedVehicle(measured.vehicle(), ekf.EkfNoise(), 0.0),
     )
     one = "drive_id = 'smoke-2024-05-01-0001'"
-    found = fleet_slip.open(smoke_copy).evaluate_measured("smoke", one).content
+    found = fleet_slip.open(smoke_copy).evaluation.evaluate_measured("smoke", one).content
     assert (found["vehicle"], found["parts_of"]) == ("d_class_sedan", "time")
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
     assert {"kinematic", "ekf_tuned", "ekf_identified", "kalman_identified"} <= {*errors}

@@ -44,7 +44,7 @@ def pages(
 ) -> dict[str, Path]:
     """The report, and a drive that plays."""
     fleet = fleet_slip.open(smoke_root)
-    frames = drive_frames(fleet.warehouse, "smoke-2024-05-01-0000", fleet.model("smoke"))
+    frames = drive_frames(fleet.warehouse, "smoke-2024-05-01-0000", fleet.models.get("smoke"))
     file = tmp_path_factory.mktemp("pages") / "watch.html"
     file.write_text(render_watch(frames), encoding="utf-8")
     return {"report": reported.page, "watch": file}

@@ -23,7 +23,7 @@ DRIVE = "smoke-2024-05-01-0000"
 @pytest.fixture(scope="module")
 def frames(smoke_root: Path) -> DriveFrames:
     fleet = fleet_slip.open(smoke_root)
-    return drive_frames(fleet.warehouse, DRIVE, fleet.model("smoke"))
+    return drive_frames(fleet.warehouse, DRIVE, fleet.models.get("smoke"))
 
 
 def data_of(page: str) -> Any:
@@ -63,7 +63,7 @@ def test_a_drive_on_a_track_whose_file_is_gone_is_drawn_by_its_motion(
 
     monkeypatch.setattr(watch, "load_track", load_track)
     fleet = fleet_slip.open(smoke_root)
-    drawn = drive_frames(fleet.warehouse, DRIVE, fleet.model("smoke"))
+    drawn = drive_frames(fleet.warehouse, DRIVE, fleet.models.get("smoke"))
     assert not drawn.track[0].size
     assert np.hypot(np.diff(drawn.x_m), np.diff(drawn.y_m)).max() < 3
 
@@ -104,9 +104,9 @@ def test_a_part_is_a_part(frames: DriveFrames) -> None:
 def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(UsageError, match="shown as a page"):
-        fleet.watch(DRIVE, "smoke", tmp_path / "film.mp4")
+        fleet.evaluation.watch(DRIVE, "smoke", tmp_path / "film.mp4")
     with pytest.raises(QuestionError, match="neither a drive nor a scenario"):
-        fleet.watch("nobody's", "smoke", tmp_path / "page.html")
+        fleet.evaluation.watch("nobody's", "smoke", tmp_path / "page.html")
 
 
 def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(
@@ -116,7 +116,7 @@ def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(
     scenario.write_text(
         'name = "brief"\ndescription = "x"\nbase = "traffic"\ntraffic.duration_s = 13'
     )
-    model = fleet_slip.open(smoke_root).model("smoke")
+    model = fleet_slip.open(smoke_root).models.get("smoke")
     frames = scenario_frames(str(scenario), model).part(1.0, 12.0)
     data = data_of(render_watch(frames))
     assert len(data["others"]) == len(data["t"])

@@ -144,7 +144,7 @@ def test_a_model_is_published_scored_and_asked(filled: Warehouse) -> None:
     chosen = fleet.cohort("true").select(
         order="ay_mean_16,curvature_mean_16,ay_offset_alone,understeer_ay", features="fleet"
     )
-    version = fleet.publish("calibrated", chosen, force=True).version
+    version = fleet.models.publish("calibrated", chosen, force=True).version
     manifest = version.manifest
     used = {one.number.name for one in manifest.definitions.values() if one.number}
     assert used

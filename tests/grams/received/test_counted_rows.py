@@ -58,7 +58,7 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path:
     found = fleet.cohort().select(model="ax,ay")
     assert (found.cohort.rows, found.cohort.count_onboard_with()) == (3000, 6)
     assert "sent Gram rows of logged signals" in fleet.cohort().select().remark
-    assert not fleet.verify(full=True).findings
+    assert not fleet.maintenance.verify(full=True).findings
 
 
 def test_the_same_file_counts_once_and_is_forgotten_for_good(
@@ -70,7 +70,7 @@ def test_the_same_file_counts_once_and_is_forgotten_for_good(
     before = gram_rows(fleet)
     assert not fleet.import_onboard_grams(path).new
     assert gram_rows(fleet) == before
-    fleet.forget(vehicle="VIN1")
+    fleet.maintenance.forget(vehicle="VIN1")
     assert [row["vehicle_id"] for row in gram_rows(fleet)] == ["VIN2"]
     again = write_counted(tmp_path / "again", [row_of(gram_of(3), "VIN1", START_S + DAY_S)])
     with pytest.raises(InputError, match=r"row 1 \(drive VIN1-.*\) was forgotten"):
@@ -214,7 +214,7 @@ def test_an_erased_car_does_not_come_back_under_a_similar_name(
 ) -> None:
     rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
     fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
-    fleet.forget(vehicle="VIN1")
+    fleet.maintenance.forget(vehicle="VIN1")
     with pytest.raises(InputError, match="was forgotten"):
         fleet.import_onboard_grams(
             write_counted(tmp_path / "again", [row_of(gram_of(3), name, drive_id="a")])
@@ -236,12 +236,12 @@ def test_an_erased_drive_is_refused_under_another_name_until_it_is_allowed(
 ) -> None:
     rows = [row_of(gram_of(1)), row_of(gram_of(2), "VIN2")]
     fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
-    assert fleet.forget(**subject).drives == 1
+    assert fleet.maintenance.forget(**subject).drives == 1
     again = row_of(gram_of(1), "pseudonym", START_S + DAY_S)
     path = write_counted(tmp_path / "again", [again])
     with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
         fleet.import_onboard_grams(path)
-    fleet.allow(**subject)
+    fleet.maintenance.allow(**subject)
     assert fleet.import_onboard_grams(path).new
 
 
@@ -250,7 +250,7 @@ def test_an_erased_drive_with_a_log_does_not_come_back_as_gram_rows(
 ) -> None:
     fleet = fleet_slip.open(smoke_copy)
     same, drive = renamed(fleet, "other")
-    fleet.forget(drive=drive)
+    fleet.maintenance.forget(drive=drive)
     again = write_counted(tmp_path / "rows", [same | {"vehicle_id": "pseudonym"}])
     with pytest.raises(InputError, match="has the counts of a drive that was forgotten"):
         fleet.import_onboard_grams(again)

@@ -93,7 +93,7 @@ def test_gram_rows_of_several_times_are_sums_of_the_plain_changes(
     drives = {name: hostile_drive(name, 2000, seed) for seed, name in enumerate("ab")}
     land(warehouse, "one", *drives.values())
     files = warehouse.logs.snapshot().files
-    rows = aggregate(warehouse, files, feature_set="three", late={"car-1": late})
+    rows = aggregate(warehouse, files, feature_set="three", delays={"car-1": late})
     assert set(rows["course_late"].to_pylist()) == {late}
     found = defaultdict[tuple[str, str], Any](int)
     for row in rows.filter(pc.match_substring(rows["signals"], TURNED)).to_pylist():

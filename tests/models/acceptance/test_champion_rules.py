@@ -163,7 +163,7 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
     ):
         publish_from(champion)
     with pytest.raises(StorageError, match="checksum"):
-        fleet_slip.open(str(champion.root)).publish(
+        fleet_slip.open(str(champion.root)).models.publish(
             "beta", run_selection(champion, SelectionRequest(order="ay,yaw_rate"))
         )
     assert publish_from(champion, force=True).new

@@ -1,0 +1,234 @@
+"""The drives that satisfy a predicate, and what their Gram rows answer."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.errors import UsageError
+
+if TYPE_CHECKING:
+    from fleet_slip.grams.cohort import Cohort
+    from fleet_slip.grams.folding import FoldKey
+    from fleet_slip.models.diagnose import Diagnosis
+    from fleet_slip.models.registry import ModelVersion
+    from fleet_slip.models.request import Label, SelectionRequest
+    from fleet_slip.models.select import Selection
+    from fleet_slip.operations.sensor_screen import SensorScreen
+    from fleet_slip.regression.drives import ClusterUnit
+    from fleet_slip.warehouse.warehouse import Warehouse
+
+WINDOW_ROWS = 4_000_000
+"""Maximum number of log rows whose window columns `select` computes: they take seconds."""
+
+
+@dataclass(frozen=True)
+class FleetCohort:
+    """The drives that satisfy an SQL predicate on the view `drives`; see `Fleet.cohort`.
+
+    Each call reads the Gram rows of the newest commits. It raises `QuestionError` for an invalid
+    predicate, feature set or input, `DataError` if there are no drives or no Gram rows (see
+    `Fleet.gram`), and `RefusedError` for drives of evaluation scenarios.
+    """
+
+    warehouse: "Warehouse"
+    predicate: str
+    include_faulty: bool = False
+
+    def __repr__(self) -> str:
+        return f"FleetCohort({str(self.warehouse.root)!r}, {self.predicate!r})"
+
+    def examine(self) -> "SensorScreen":
+        """Find the drives that may train a model.
+
+        Simulated drives are not checked. Results are cached until the data change. Missing Gram
+        rows of the logged signals are computed if that takes seconds.
+
+        Raises
+        ------
+        NotScreenedError
+            If computing the missing Gram rows would take longer.
+        """
+        from fleet_slip.operations.sensor_screen import SensorScreen, screen_drives
+
+        if self.include_faulty:
+            return SensorScreen(self.predicate)
+        return screen_drives(self.warehouse, self.predicate)
+
+    def select(
+        self,
+        *,
+        models: str | None = None,
+        model: str | None = None,
+        order: str | None = None,
+        features: str | None = None,
+        label: "Label | None" = None,
+        group_by: "FoldKey | None" = None,
+        folds: int | str | None = None,
+        ranking: str | None = None,
+        criterion: str | None = None,
+        tolerance: str | None = None,
+        all_subsets: bool = False,
+        robust: bool = False,
+        cluster: "ClusterUnit | None" = None,
+        intercept: bool = True,
+        search: str | None = None,
+        max_features: int | None = None,
+        half_life: int | None = None,
+        prior: str | None = None,
+    ) -> "Selection":
+        """Compare models by cross-validation and choose one; `FleetModels.publish` takes it.
+
+        Without options the models of the list `estimator` are compared. Drives with faulty sensors
+        are left out; see `examine`. Missing Gram rows of the default list are computed first if
+        that takes seconds; the view `runs` records this as `ensure_grams`.
+
+        Parameters
+        ----------
+        models
+            A model list of `configs/models`, or a TOML file.
+        model
+            The inputs of one model, separated by commas, instead of a list.
+        order
+            Inputs, separated by commas, whose first 1, 2, ... form nested models. `catalogue` means
+            all inputs; the name of a family means its columns.
+        features
+            Feature set of `configs/features.toml`. Default: the list's, else the logged signals.
+        label
+            `course` learns from changes of the course over ground, without a reference sensor.
+        group_by
+            What defines the folds: `drive`, `vehicle`, `track`, `day`, ... Default: the list's.
+        folds
+            Number of folds, or `each` for one fold per group. Default: the list's.
+        ranking
+            Ranking of the inputs of `order`.
+        criterion
+            Rule for the number of ranked inputs: `cv` or an information criterion.
+        tolerance
+            Smallest gain that justifies another signal: an angle such as `0.025deg`, or a share of
+            the RMSE such as `2%`.
+        all_subsets
+            Search all subsets of the inputs of `order`.
+        robust
+            Down-weight outlier drives, with an error above three times the median.
+        cluster
+            Unit of independent evidence, `vehicle` or `drive`.
+        intercept
+            False forces models through the origin.
+        search
+            Search method among the inputs of `order`, or all, repeated in every fold.
+        max_features
+            Maximum number of columns of `search`.
+        half_life
+            Days after which a drive counts half as much.
+        prior
+            A campaign whose simulated drives join the training with the weight that serves the
+            held-out drives best.
+
+        Raises
+        ------
+        UsageError
+            If options exclude each other, or the list is invalid.
+        DataError
+            If no model can be fitted.
+        """
+        from fleet_slip.models.request import SelectionRequest
+
+        return self.run_request(
+            SelectionRequest(
+                models=models,
+                model=model,
+                order=order,
+                features=features,
+                label=label,
+                group_by=group_by,
+                folds=folds,
+                ranking=ranking,
+                criterion=criterion,
+                tolerance=tolerance,
+                all_subsets=all_subsets,
+                robust=robust,
+                cluster=cluster,
+                intercept=intercept,
+                search=search,
+                max_features=max_features,
+                half_life=half_life,
+                prior=prior,
+            )
+        )
+
+    def run_request(self, request: "SelectionRequest") -> "Selection":
+        """Select as `select` does, with the options of a request."""
+        from fleet_slip.grams.update import ensure_grams
+        from fleet_slip.models.line import with_line_fitted
+        from fleet_slip.models.request import DEFAULT_MODELS
+        from fleet_slip.models.select import SelectionPlan, run_selection
+
+        examined = self.examine()
+        with examined.explaining():
+            request = with_line_fitted(self.warehouse, request, self.predicate, examined.cohort)
+            plan = SelectionPlan.of(self.warehouse.catalog, request)
+            if plan.request.models == DEFAULT_MODELS:
+                ensure_grams(
+                    self.warehouse,
+                    plan.feature_set,
+                    examined.cohort,
+                    reason=f"model list {DEFAULT_MODELS} needs them",
+                    max_rows=WINDOW_ROWS,
+                )
+            selection = run_selection(self.warehouse, request, examined.cohort)
+        return replace(selection, examined=str(examined))
+
+    def diagnose(
+        self,
+        model: "str | ModelVersion | None" = None,
+        *,
+        signals: str | None = None,
+        features: str | None = None,
+        cluster: "ClusterUnit | None" = None,
+    ) -> "Diagnosis":
+        """Fit the signals of a model to the cohort and examine the fit.
+
+        Parameters
+        ----------
+        model
+            A reference `NAME`, `NAME@VERSION` or `NAME@ALIAS`, or a version. Default: the only
+            published model, unless `signals` is given.
+        signals
+            Signals to fit instead, separated by commas; `catalogue` means all inputs.
+        features
+            Feature set of `signals`. Default: the logged signals.
+        cluster
+            Unit of independent evidence, `vehicle` or `drive`.
+
+        Raises
+        ------
+        UsageError
+            If both a model and signals are given.
+        QuestionError
+            If there is no such model.
+        """
+        from fleet_slip.models.diagnose import diagnose
+        from fleet_slip.models.registry import ModelVersion, Registry
+        from fleet_slip.models.request import WHOLE_SET, inputs_of
+
+        if signals is not None or features is not None:
+            if model is not None:
+                raise UsageError("name a published model or signals (of a feature set), not both.")
+            cohort = self._load(features or PLAIN)
+            return diagnose(cohort, inputs_of(cohort, signals or WHOLE_SET), cluster=cluster)
+        registry = Registry.of(self.warehouse)
+        if model is None:
+            model = registry.only(", or signals")
+        version = model if isinstance(model, ModelVersion) else registry.resolve(model)
+        manifest = version.manifest
+        return diagnose(
+            self._load(self.warehouse.catalog.name_of(manifest.trained_on.feature_set)),
+            manifest.signals,
+            cluster=cluster,
+            intercept=not manifest.through_origin,
+        )
+
+    def _load(self, feature_set: str) -> "Cohort":
+        from fleet_slip.grams.cohort import load_cohort
+
+        return load_cohort(self.warehouse, self.predicate, feature_set)

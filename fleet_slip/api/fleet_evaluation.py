@@ -1,0 +1,338 @@
+"""Accuracy of published models: scores, evaluations, reports and pages of drives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Unpack
+
+from fleet_slip.api.calls import (
+    CarMeasures,
+    ShowProgress,
+    open_workers,
+    record_call,
+    total_progress,
+)
+from fleet_slip.api.fleet_models import FleetModels
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.errors import UsageError
+from fleet_slip.models.registry import ModelVersion
+
+if TYPE_CHECKING:
+    from fleet_slip.evaluation.evaluation_document import Evaluation
+    from fleet_slip.evaluation.identify import IdentifiedVehicle
+    from fleet_slip.evaluation.report import WrittenReport
+    from fleet_slip.models.score import Score
+    from fleet_slip.warehouse.warehouse import Warehouse
+
+WATCH_PAGE = Path("watch.html")
+
+
+@dataclass(frozen=True)
+class FleetEvaluation:
+    """What evaluates the published models of a data root; see `Fleet.evaluation`.
+
+    Models are references or versions, as in `FleetModels`, with the same errors.
+    """
+
+    warehouse: "Warehouse"
+
+    @property
+    def _models(self) -> FleetModels:
+        return FleetModels(self.warehouse)
+
+    def score(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str | None = None,
+        *,
+        include_faulty: bool = False,
+    ) -> "Score":
+        """Evaluate a model on the log rows of a cohort; angles are in degrees.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        cohort
+            SQL predicate on the view `drives`. Default: all drives that the model was not trained
+            on, or all drives if there are no others.
+        include_faulty
+            Include drives with faulty sensors.
+
+        Raises
+        ------
+        DataError
+            If no row has the signals of the model.
+        QuestionError
+            If the predicate is invalid.
+        """
+        from fleet_slip.models.score import cohort_of_rows, find_seen, score
+        from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
+
+        version = self._models.get(model)
+        predicate = ALL_DRIVES if cohort is None else cohort
+        signals = self.warehouse.catalog.signals
+        rows = cohort_of_rows(signals, predicate)
+        if include_faulty:
+            examined = SensorScreen(predicate)
+        else:
+            examined = screen_computed_drives(self.warehouse, predicate)
+        rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
+        with examined.explaining():
+            seen = find_seen(self.warehouse, self._models.registry, version.manifest, rows)
+            result = score(self.warehouse, version.manifest, rows if cohort else seen.others)
+        all_seen = seen.trained == seen.drives
+        return replace(
+            result,
+            drives=seen.drives,
+            drives_trained=seen.trained,
+            drives_left_out=0 if cohort or all_seen else seen.trained,
+            examined=str(examined),
+            model=version.reference,
+            cohort=predicate,
+        )
+
+    @record_call
+    def evaluate(
+        self,
+        model: str | ModelVersion | None = None,
+        challengers: Sequence[str | ModelVersion] = (),
+        *,
+        scenarios: Sequence[str] = (),
+        threads: int | None = None,
+        progress: ShowProgress | None = None,
+    ) -> "Evaluation":
+        """Evaluate models on simulated test drives: those of the paper, and others.
+
+        The models of the paper's Table I are fitted on the cohort of each model and evaluated
+        beside it. The document is stored in `evaluations/` of the data root.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        challengers
+            Other models to compare with it.
+        scenarios
+            Scenarios of `configs/scenarios`, or TOML files. Default: all. Missing ones are
+            simulated.
+        threads
+            Threads. None means one per core.
+        progress
+            Called with the simulated rows so far and in total.
+
+        Raises
+        ------
+        ConfigError
+            If a scenario is invalid.
+        RefusedError
+            If a scenario changed since it was simulated.
+        DataError
+            If the models cannot be compared.
+        """
+        from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
+        from fleet_slip.evaluation.scenario_evaluation import evaluate_scenarios
+        from fleet_slip.evaluation.test_drives import simulate_scenarios
+        from fleet_slip.simulation.scenario import load_scenario, load_scenarios
+
+        configs = self.warehouse.configs
+        chosen = tuple(load_scenario(name, configs) for name in scenarios)
+        chosen = chosen or load_scenarios(configs)
+        first, *others = self._versions(model, challengers)
+        with open_workers(self.warehouse.root, threads) as executor:
+            simulate_scenarios(self.warehouse, chosen, executor, total_progress(progress))
+            content = evaluate_scenarios(self.warehouse, chosen, first, others, executor)
+        return store_evaluation(evaluations_of(self.warehouse), content)
+
+    @record_call
+    def evaluate_measured(
+        self,
+        model: str | ModelVersion | None = None,
+        cohort: str = TRAINING_DRIVES,
+        challengers: Sequence[str | ModelVersion] = (),
+        *,
+        vehicle: str | None = None,
+        threads: int | None = None,
+        **measures: Unpack[CarMeasures],
+    ) -> "Evaluation":
+        """Evaluate models on measured drives with a label, beside Table I and filters.
+
+        Everything is selected, fitted, tuned and identified without the drives that it is evaluated
+        on. Each drive is left out in turn, or each quarter of the time of one or two drives, and
+        each kind of driving. The document is stored in `evaluations/measured/` of the data root.
+
+        Parameters
+        ----------
+        model, challengers, threads
+            As in `evaluate`.
+        cohort
+            SQL predicate on the view `drives`.
+        vehicle
+            A vehicle of `configs/vehicles`, or a TOML file, for filters. Without it and without
+            measures no filter is evaluated, unless a file ships for the class of the drives.
+        **measures
+            Measured data of the car, as keys of `CarMeasures`, instead of `vehicle`.
+
+        Raises
+        ------
+        DataError
+            If the drives have no label.
+        ConfigError
+            If there is no such vehicle.
+        UsageError
+            If the measures are impossible for a car, or `vehicle` is given as well.
+        """
+        from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
+        from fleet_slip.evaluation.identify import VehicleMeasures, measures_of
+        from fleet_slip.evaluation.measured_evaluation import evaluate_measured
+        from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+
+        versions = self._versions(model, challengers)
+        car: VehicleParameters | VehicleMeasures | None = None
+        if vehicle:
+            car = load_vehicle(vehicle, self.warehouse.configs)
+        if any(measures.values()):
+            if car is not None:
+                raise UsageError("give a vehicle file or measurements of the car, not both.")
+            car = measures_of("measured", measures)
+        with open_workers(self.warehouse.root, threads) as executor:
+            content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
+        return store_evaluation(evaluations_of(self.warehouse, "measured"), content)
+
+    def evaluate_blind(
+        self,
+        model: str | ModelVersion | None = None,
+        challengers: Sequence[str | ModelVersion] = (),
+        *,
+        threads: int | None = None,
+    ) -> "Evaluation":
+        """Evaluate models on random test drives that depend on the version of the first.
+
+        Roads, cars, weather and noise are drawn from the hash of the version, so they were unknown
+        before it was published (`configs/blind.toml`). Nothing is written. Arguments, result and
+        errors are those of `evaluate`.
+        """
+        from fleet_slip.evaluation.evaluation_document import Evaluation
+        from fleet_slip.evaluation.scenario_evaluation import evaluate_blind
+
+        first, *others = self._versions(model, challengers)
+        with open_workers(self.warehouse.root, threads) as executor:
+            return Evaluation(evaluate_blind(self.warehouse, first, others, executor))
+
+    def identify(
+        self,
+        name: str,
+        cohort: str = TRAINING_DRIVES,
+        *,
+        threads: int | None = None,
+        **measures: Unpack[CarMeasures],
+    ) -> "IdentifiedVehicle":
+        """Identify the tyres and the yaw inertia of a car from labelled drives.
+
+        An extended Kalman filter in the car is fitted to the labels of up to 24 drives. The result
+        contains its error on drives that were left out.
+
+        Parameters
+        ----------
+        name
+            Name of the car in the result.
+        cohort
+            SQL predicate on the view `drives`: the drives of the car.
+        threads
+            Threads. None means one per core.
+        **measures
+            Measured data of the car, as keys of `CarMeasures`; mass and axle distances are
+            required.
+
+        Raises
+        ------
+        DataError
+            If the drives lack the label or a signal of the filter.
+        UsageError
+            If the name or a measure is impossible for a car.
+        """
+        from fleet_slip.catalog.features import PLAIN
+        from fleet_slip.evaluation.filters import TuningDrives
+        from fleet_slip.evaluation.identify import identify_held_out, measures_of
+        from fleet_slip.grams.cohort import load_cohort
+
+        car = measures_of(name, measures)
+        rows = load_cohort(self.warehouse, cohort, PLAIN)
+        chosen = TuningDrives.choose(self.warehouse, rows, with_mass=False)
+        with open_workers(self.warehouse.root, threads) as executor:
+            return identify_held_out(car, chosen.drives, executor)
+
+    def report(
+        self, model: str | ModelVersion | None = None, output: Path | None = None
+    ) -> "WrittenReport":
+        """Write a page that compares the latest evaluation with the figures of the paper.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        output
+            Folder to write into. Default: `report/` in the data root.
+
+        Raises
+        ------
+        DataError
+            If there is no evaluation of the model on the current data.
+        """
+        from fleet_slip.evaluation.report import write_report
+        from fleet_slip.storage.local import LocalFolder
+
+        folder = LocalFolder(output) if output else self.warehouse.root / "report"
+        return write_report(self.warehouse, self._models.get(model), folder)
+
+    @record_call
+    def watch(
+        self,
+        drive: str,
+        model: str | ModelVersion | None = None,
+        output: Path = WATCH_PAGE,
+        *,
+        from_s: float = 0.0,
+        until_s: float | None = None,
+    ) -> Path:
+        """Write an animation of a drive as one HTML page; return the file.
+
+        Parameters
+        ----------
+        drive
+            A scenario of `configs/scenarios`, the path of a scenario file, or a `drive_id`.
+        model
+            A reference or a version.
+        output
+            The page, `.html`.
+        from_s, until_s
+            First and last second of the drive. None means its end.
+
+        Raises
+        ------
+        UsageError
+            If the file has another suffix, or the interval is empty.
+        QuestionError
+            If there is no such drive.
+        """
+        from fleet_slip.evaluation.watch import (
+            drive_frames,
+            is_scenario,
+            scenario_frames,
+            write_page,
+        )
+
+        if output.suffix != ".html":
+            raise UsageError(f"{output}: a drive is shown as a page. Choose a name in .html.")
+        version = self._models.get(model)
+        if is_scenario(drive, self.warehouse.configs):
+            frames = scenario_frames(drive, version)
+        else:
+            frames = drive_frames(self.warehouse, drive, version)
+        write_page(frames.part(from_s, until_s), output)
+        return output
+
+    def _versions(
+        self, model: str | ModelVersion | None, challengers: Sequence[str | ModelVersion]
+    ) -> list[ModelVersion]:
+        return [self._models.get(reference) for reference in (model, *challengers)]

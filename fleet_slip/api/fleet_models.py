@@ -1,0 +1,294 @@
+"""Published models: publish, list, compare, promote and export them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from fleet_slip.api.calls import record_call
+from fleet_slip.errors import RefusedError
+from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from fleet_slip.api.fleet_cohort import FleetCohort
+    from fleet_slip.export.program import Target
+    from fleet_slip.export.stepping import Estimator
+    from fleet_slip.models.publish import DryRun, Publication
+    from fleet_slip.models.registry import Difference
+    from fleet_slip.models.select import Selection
+    from fleet_slip.warehouse.warehouse import Warehouse
+
+
+@dataclass(frozen=True)
+class FleetModels:
+    """The published models of a data root; see `Fleet.models`.
+
+    A reference is `NAME@VERSION`, `NAME@ALIAS`, or `NAME` for the champion. None means the only
+    published model. Calls that take a reference also take a `ModelVersion`. They raise
+    `QuestionError` for an unknown reference, `StorageError` for a damaged version, and
+    `RefusedError` for a version without a required signature.
+    """
+
+    warehouse: "Warehouse"
+
+    @property
+    def registry(self) -> Registry:
+        """The registry that stores the versions and aliases."""
+        return Registry.of(self.warehouse)
+
+    def get(self, model: str | ModelVersion | None = None) -> ModelVersion:
+        """Return the version of a reference; a version is returned as it is."""
+        return model if isinstance(model, ModelVersion) else self.registry.resolve(model)
+
+    def versions(self, name: str | None = None) -> "pa.Table":
+        """List published versions, as the view `models` does.
+
+        Parameters
+        ----------
+        name
+            Name of a model. None means all models.
+
+        Returns
+        -------
+        pyarrow.Table
+            One row per version. `trained_on_forgotten` is true if a training drive of the version
+            was erased since.
+        """
+        from fleet_slip.operations.marked_models import marked_models
+
+        self.warehouse.require()
+        if name is not None:
+            self.registry.require(name)
+        table = self.registry.as_table(name)
+        marked = marked_models(self.warehouse)
+        pairs = zip(table["name"].to_pylist(), table["version"].to_pylist(), strict=True)
+        return table.append_column(
+            "trained_on_forgotten", [[f"{name}@{version}" in marked for name, version in pairs]]
+        )
+
+    @record_call
+    def publish(
+        self,
+        name: str,
+        choice: "Selection | FleetCohort | None" = None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
+    ) -> "Publication":
+        """Publish the winner of a selection as the next version of a model, and its champion.
+
+        Parameters
+        ----------
+        name
+            Name of the model, such as `sideslip`.
+        choice
+            The result of `FleetCohort.select`. Or a cohort, None for the cohort of the current
+            champion: the model is then selected again with the options of its champion.
+        force
+            Publish even if the winner is worse than the champion.
+        candidate
+            Publish as a candidate, which becomes champion by `promote`. A winner also becomes a
+            candidate while the champion is pinned.
+
+        Raises
+        ------
+        RefusedError
+            If the winner is worse than the champion on the same cohort and folds, its course label
+            is delayed or wrong, or the first measured drives contradict any car.
+        UsageError
+            If the name is invalid.
+        FleetSlipError
+            What `FleetCohort.select` raises.
+        """
+        from fleet_slip.models.publish import build_challenger, publish_challenger
+
+        options = {"force": force, "candidate": candidate}
+        registry, selection = self.registry, self._selection(name, choice)
+        manifest = build_challenger(self.warehouse, registry, selection, name, **options)
+        return publish_challenger(registry, manifest, selection, **options)
+
+    def preview(
+        self,
+        name: str,
+        choice: "Selection | FleetCohort | None" = None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
+    ) -> "DryRun":
+        """Return what `publish` with these arguments would do, also a refusal; write nothing."""
+        from fleet_slip.models.publish import DryRun, build_challenger, would_publish
+
+        options = {"force": force, "candidate": candidate}
+        registry = self.registry
+        try:
+            selection = self._selection(name, choice)
+            manifest = build_challenger(self.warehouse, registry, selection, name, **options)
+            return would_publish(registry, manifest, selection, **options)
+        except RefusedError as error:
+            return DryRun(name, False, str(error), refused=True)
+
+    def _selection(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
+        """Return a selection, by the recipe of the model if none is given."""
+        from fleet_slip.api.fleet_cohort import FleetCohort
+        from fleet_slip.models.manifest import require_model_name
+        from fleet_slip.models.publish import recipe_for
+        from fleet_slip.models.request import SelectionRequest
+
+        require_model_name(name)
+        if choice is not None and not isinstance(choice, FleetCohort):
+            return choice
+        predicate, include_faulty = (
+            (choice.predicate, choice.include_faulty) if choice else (None, False)
+        )
+        recipe = recipe_for(self.registry, name, SelectionRequest(), predicate)
+        cohort = FleetCohort(self.warehouse, recipe.cohort, include_faulty)
+        return cohort.run_request(recipe.request)
+
+    @record_call
+    def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias, by default `champion`, at a version; return the version.
+
+        Raises
+        ------
+        UsageError
+            If the alias is no valid name.
+        """
+        from fleet_slip.models.manifest import require_model_name
+
+        require_model_name(alias)
+        version = self.get(reference)
+        self.registry.promote(version.manifest.name, version.version, alias)
+        return version
+
+    @record_call
+    def rollback(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Point an alias at its previous version and pin it there; return the version.
+
+        Raises
+        ------
+        UsageError
+            If `name` has a version or alias.
+        RefusedError
+            If the alias never pointed at another version.
+        """
+        from fleet_slip.models.manifest import require_model_name
+
+        require_model_name(name)
+        self.registry.require(name)
+        return self.registry.load(name, self.registry.rollback(name, alias))
+
+    @record_call
+    def pin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Keep an alias at its version until `promote` or `unpin`; return the version."""
+        return self.registry.load(name, self.registry.hold(name, alias, "pin"))
+
+    @record_call
+    def unpin(self, name: str, alias: str = CHAMPION) -> ModelVersion:
+        """Let publications move an alias again; return its version."""
+        return self.registry.load(name, self.registry.hold(name, alias, "unpin"))
+
+    def diff(self, first: str | ModelVersion, second: str | ModelVersion) -> "Difference":
+        """Compare the manifests and training drives of two versions."""
+        from fleet_slip.models.registry import compare_versions
+
+        return compare_versions(self.registry, self.get(first), self.get(second))
+
+    def estimator(
+        self, model: str | ModelVersion, car: Mapping[str, Any] | None = None
+    ) -> "Estimator":
+        """Return a version as an estimator that takes one sample at a time, as a car does.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        car
+            Constants of the car by name, in SI units: drive columns such as `mass_kg`, and
+            parameters of `FleetMaintenance.calibrate`.
+
+        Raises
+        ------
+        InputError
+            If `car` has a constant that the version does not use.
+        """
+        from fleet_slip.export.stepping import Estimator
+
+        version = self.get(model)
+        return Estimator(version.catalog, version.manifest, car)
+
+    def export(
+        self,
+        model: str | ModelVersion | None,
+        to: "Target",
+        output: Path = Path(),
+        *,
+        with_gram: bool = False,
+    ) -> list[Path]:
+        """Export a version as a program.
+
+        Exports contain the checksum of the version, the hash of its training drives, and synthetic
+        test vectors. They contain no logged data.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        to
+            `c`, `sql`, `onnx`, `fmu`, `dbc` or `json`.
+        output
+            Folder to write into. Files of the same names are replaced.
+        with_gram
+            With `c`: also export the code that computes Gram rows on board.
+
+        Returns
+        -------
+        list of Path
+            The files that were written.
+
+        Raises
+        ------
+        RefusedError
+            If the error of the angle has no bound, or the scales of the counts changed since.
+        UsageError
+            If there is no such target.
+        ConfigError
+            If the target needs something that the configs lack.
+        """
+        from fleet_slip.export.files import export_files
+        from fleet_slip.storage.local import LocalFolder
+
+        folder = LocalFolder(output)
+        files = export_files(self.get(model), self.warehouse, to, with_gram=with_gram)
+        for name, content in files.items():
+            folder.put(name, content)
+        return [output / name for name in files]
+
+    def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:
+        """Register a version in an MLflow server, once, as a pyfunc model.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        uri
+            URI of the MLflow server, without a password.
+
+        Returns
+        -------
+        str
+            The version number in MLflow.
+
+        Raises
+        ------
+        ConfigError
+            If MLflow is not installed.
+        UsageError
+            If the URI has a password.
+        StorageError
+            If the server does not accept the model.
+        """
+        from fleet_slip.export.files import log_version
+
+        return log_version(self.get(model), self.warehouse, uri)

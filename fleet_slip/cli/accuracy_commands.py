@@ -1,0 +1,297 @@
+"""Commands that evaluate models and show drives: score, evaluate, identify, report, watch."""
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleet_slip.api.calls import CarMeasures
+from fleet_slip.base import require_extra
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.cli.options import (
+    Cohort,
+    FrontAxle,
+    FrontDrive,
+    Height,
+    IncludeFaulty,
+    Json,
+    Mass,
+    Model,
+    Radius,
+    RearAxle,
+    Threads,
+    TrackWidth,
+    fleet_of,
+    recorded,
+)
+from fleet_slip.cli.output import print_answer, progress, say
+from fleet_slip.errors import UsageError
+
+
+def score(
+    context: typer.Context,
+    model: Model = None,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL predicate on the view drives. Default: the drives that the model was not "
+            "trained on, or all if there are no others.",
+            show_default=False,
+        ),
+    ] = None,
+    include_faulty: IncludeFaulty = False,
+    json: Json = False,
+) -> None:
+    """Evaluate a model on the rows of a cohort: RMSE, largest error and percentiles.
+
+    Example: fleet-slip score waterford --cohort "speed_factor > 0.9"
+    """
+    result = fleet_of(context).evaluation.score(model, cohort, include_faulty=include_faulty)
+    print_answer(result, json)
+
+
+@recorded
+def evaluate(
+    context: typer.Context,
+    model: Model = None,
+    compare: Annotated[
+        list[str] | None,
+        typer.Option(help="Another model to evaluate beside it. May be repeated."),
+    ] = None,
+    scenario: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all.",
+            show_default=False,
+        ),
+    ] = None,
+    blind: Annotated[
+        bool,
+        typer.Option(
+            "--blind",
+            help="Evaluate on random roads, cars, weather and drivers, drawn from the hash of the "
+            "model's version: unknown before it was published.",
+        ),
+    ] = False,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL predicate on the view drives: evaluate on measured drives with a label "
+            "instead. Models and filters are trained without the drives, or parts, that they are "
+            "evaluated on.",
+            show_default=False,
+        ),
+    ] = None,
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            help="With --cohort: vehicle file for filters, instead of --mass and axles.",
+            show_default=False,
+        ),
+    ] = None,
+    mass: Mass = None,
+    front_axle: FrontAxle = None,
+    rear_axle: RearAxle = None,
+    track_width: TrackWidth = None,
+    height: Height = None,
+    radius: Radius = None,
+    front_drive: FrontDrive = None,
+    threads: Threads = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Evaluate models on the paper's test drives and on others; simulate those that are missing.
+
+    The models of Table I, trained on the cohort of the model, are evaluated beside it. Prints the
+    best estimator of each test drive. The results are stored as a JSON document in evaluations/ of
+    the data root; --json prints it.
+
+    Example: fleet-slip evaluate waterford --scenario nominal
+    """
+    measures = CarMeasures(
+        mass_kg=mass,
+        front_axle_m=front_axle,
+        rear_axle_m=rear_axle,
+        track_m=track_width,
+        height_m=height,
+        rolling_radius_m=radius,
+        front_drive_share=front_drive,
+    )
+    has_car = vehicle or any(measures.values())
+    if (cohort is None and has_car) or (cohort is not None and (scenario or blind)):
+        raise UsageError(
+            "--cohort evaluates on measured drives, with filters in the car of --vehicle or "
+            "--mass: leave out --scenario and --blind, and name a cohort."
+        )
+    if blind and scenario:
+        raise UsageError("--blind has drives of its own: leave out --scenario.")
+    evaluation = fleet_of(context).evaluation
+    challengers = compare or ()
+    if blind:
+        result = evaluation.evaluate_blind(model, challengers, threads=threads)
+    elif cohort is not None:
+        result = evaluation.evaluate_measured(
+            model, cohort, challengers, vehicle=vehicle, threads=threads, **measures
+        )
+    else:
+        with progress("simulate scenarios") as show:
+            result = evaluation.evaluate(
+                model, challengers, scenarios=scenario or (), threads=threads, progress=show
+            )
+    print_answer(result, json, everything=everything)
+
+
+def identify(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Name of the car.", show_default=False)],
+    cohort: Cohort = TRAINING_DRIVES,
+    mass: Mass = None,
+    front_axle: FrontAxle = None,
+    rear_axle: RearAxle = None,
+    track_width: TrackWidth = None,
+    height: Height = None,
+    radius: Radius = None,
+    front_drive: FrontDrive = None,
+    threads: Threads = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Vehicle file to write.", show_default=False)
+    ] = None,
+    campaign: Annotated[
+        Path | None,
+        typer.Option(
+            help="Campaign file with the car to write, for publish --prior.", show_default=False
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
+
+    An extended Kalman filter in the car, of measured mass and axle distances at least, is fitted to
+    the label. The result contains its error on drives that were left out. A logged steering wheel
+    angle suffices where no road wheel angle is logged.
+
+    Example: fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44
+    """
+    from fleet_slip.storage.storage_errors import storage_errors
+
+    car = fleet_of(context).evaluation.identify(
+        name,
+        cohort,
+        threads=threads,
+        mass_kg=mass,
+        front_axle_m=front_axle,
+        rear_axle_m=rear_axle,
+        track_m=track_width,
+        height_m=height,
+        rolling_radius_m=radius,
+        front_drive_share=front_drive,
+    )
+    print_answer(car, json)
+    train = f". Train with it: fleet-slip publish NAME --prior {campaign}"
+    for file, text, remark in (
+        (output, car.as_toml(), ": a vehicle file, as in configs/vehicles."),
+        (campaign, car.as_campaign(), train),
+    ):
+        if file is not None:
+            with storage_errors(file):
+                file.write_text(text, encoding="utf-8")
+            if not json:
+                say(f"written to {file}{remark}")
+
+
+def report(
+    context: typer.Context,
+    model: Model = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to write into. Default: report/ in the data root.", show_default=False
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Write a page that compares the latest evaluation with the paper's figures.
+
+    The page is self-contained; its figures are also written as SVG and PNG files.
+
+    Example: fleet-slip report waterford
+    """
+    from fleet_slip.cli.output import print_json
+
+    result = fleet_of(context).evaluation.report(model, output)
+    if json:
+        print_json(result)
+        return
+    say(
+        f"{result.page}: {result.size_bytes / 1e6:.1f} MB, {result.figures} figures, "
+        f"which are in {result.figures_folder} too"
+    )
+
+
+@recorded
+def watch(
+    context: typer.Context,
+    drive: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|DRIVE",
+            help="Scenario of configs/scenarios, a TOML file, or the drive_id of a logged drive.",
+            show_default=False,
+        ),
+    ],
+    model: Model = None,
+    output: Annotated[
+        Path, typer.Option(help="Page to write, .html. It plays in a browser.")
+    ] = Path("watch.html"),
+    from_s: Annotated[float, typer.Option("--from", help="First second of the drive.")] = 0.0,
+    until_s: Annotated[
+        float | None,
+        typer.Option("--until", help="Last second. Default: the end.", show_default=False),
+    ] = None,
+) -> None:
+    """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
+
+    The page is one file and needs no server.
+
+    Example: fleet-slip watch adhesion_0_4 --output slippery.html
+    """
+    file = fleet_of(context).evaluation.watch(drive, model, output, from_s=from_s, until_s=until_s)
+    say(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+
+
+def explore(
+    context: typer.Context,
+    edit: Annotated[bool, typer.Option("--edit", help="Show the code, for editing.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="Port on this machine.", show_default=False),
+    ] = None,
+    headless: Annotated[
+        bool, typer.Option("--headless", help="Print the address, and open no browser.")
+    ] = False,
+) -> None:
+    """Explore a data root in the browser: cohorts by mouse, error maps, coefficients, drift.
+
+    Starts a marimo notebook, which runs until it is interrupted.
+
+    Example: fleet-slip explore --headless
+    """
+    with require_extra("explore", "the notebook"):
+        import altair  # noqa: F401 - an extra
+        import marimo  # noqa: F401
+        import numba  # noqa: F401
+    from fleet_slip.resources import folder
+
+    fleet = fleet_of(context)
+    fleet.warehouse.require()
+    words = ["edit" if edit else "run", str(folder("jobs") / "explore.py")]
+    words += [*(["--port", str(port)] if port else []), *(["--headless"] if headless else [])]
+    options = ["--root", str(fleet.root)]
+    if config := fleet.warehouse.configs.folder:
+        options += ["--config", str(config)]
+    command = [sys.executable, "-m", "marimo", *words, "--", *options]
+    os.execv(command[0], command)  # noqa: S606 - the notebook replaces this process

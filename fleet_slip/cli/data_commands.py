@@ -1,0 +1,352 @@
+"""Commands that fill the data root: simulate, ingest, mapping, gram."""
+
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleet_slip.api.calls import open_workers
+from fleet_slip.base import last_day, pluralize
+from fleet_slip.cli.options import (
+    CampaignDays,
+    Cluster,
+    Json,
+    Threads,
+    Through,
+    fleet_of,
+    recorded,
+)
+from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
+from fleet_slip.errors import AlarmError, UsageError
+from fleet_slip.rendering import TextTable
+
+if TYPE_CHECKING:
+    from fleet_slip.catalog.signals import SignalCatalog
+    from fleet_slip.grams.update import GramReport
+    from fleet_slip.ingest.draft import Draft
+    from fleet_slip.ingest.load import IngestReport, Preview
+
+ALL_SETS = "all"
+"""Name that stands for every feature set."""
+
+
+@recorded
+def simulate(
+    context: typer.Context,
+    campaign: Annotated[str, typer.Argument(help="Campaign of configs/campaigns, or a TOML file.")],
+    days: CampaignDays = None,
+    through: Through = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Simulate the missing drives of a campaign and write them to the logs.
+
+    Example: fleet-slip simulate waterford --days 2
+    """
+    with progress(f"simulate {campaign}") as show:
+        report = fleet_of(context).simulate(
+            campaign,
+            days=days,
+            through=last_day(through),
+            workers=cluster or threads,
+            progress=show,
+        )
+    print_answer(report, json)
+
+
+@recorded
+def ingest(
+    context: typer.Context,
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            help="Log files (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO) or folders. "
+            "Of folders, files that were ingested before are skipped.",
+            show_default=False,
+        ),
+    ],
+    mapping: Annotated[
+        str | None,
+        typer.Option(
+            help="Mapping of configs/mappings, or a TOML file. Without it, the files are tables of "
+            "Gram rows.",
+            show_default=False,
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Store nothing; show the result and what looks wrong (exit code 10)."
+        ),
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Replace the drives of the same recordings, such as after a correction of the "
+            "mapping.",
+        ),
+    ] = False,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Bring measured logs into the data root through a mapping of columns, units and axes.
+
+    Without a mapping, files are tables of Gram rows that cars computed on board (docs/export.md).
+
+    Rows that cannot be used go to the quarantine with a reason: fleet-slip sql "FROM quarantine"
+
+    Example: fleet-slip ingest drive.csv --mapping logger.toml --dry-run
+    """
+    fleet = fleet_of(context)
+    if mapping is None:
+        if dry_run or replace:
+            raise UsageError("give --mapping: only tables of Gram rows (docs/export.md) have none.")
+        imports = [fleet.import_onboard_grams(file) for file in files]
+        if json:
+            print_json(imports)
+        else:
+            print_parts(part for report in imports for part in report.parts())
+        return
+    if dry_run:
+        _print_previews(fleet.preview(files, mapping), json)
+        return
+
+    from fleet_slip.ingest.log_files import names_several
+
+    folders = any(map(names_several, files))
+    warned: set[tuple[str, tuple[str, ...]]] = set()
+
+    def print_report(report: "IngestReport") -> None:
+        if not (json or folders):
+            say(_ingested(report.file, [report]))
+        for suspicion in report.suspicions:
+            if (suspicion.kind, suspicion.signals) not in warned:
+                warned.add((suspicion.kind, suspicion.signals))
+                say(f"{report.file}: looks wrong: {suspicion}", logging.WARNING)
+
+    with progress("ingest") as show:
+        reports = fleet.ingest(
+            files,
+            mapping,
+            replace="all" if replace else "no",
+            workers=cluster,
+            on_report=print_report,
+            progress=show,
+        )
+    if json:
+        print_json(reports)
+    elif folders:
+        new = sum(report.new for report in reports)
+        say(_ingested(pluralize(new, "new file"), reports) if new else "nothing new")
+    _require_no_alarm(reports)
+
+
+def _require_no_alarm(reports: "list[IngestReport]") -> None:
+    """Raise `AlarmError` for the first alarm of a file."""
+    for report in reports:
+        for alarm in report.alarms:
+            raise AlarmError(
+                f"{report.file}: {alarm} Its rows are stored. Correct the mapping and repeat the "
+                "command with --replace."
+            )
+
+
+def _ingested(subject: str, reports: "Sequence[IngestReport]") -> str:
+    """Summarise the reports of files in a sentence."""
+    from fleet_slip.warehouse.erasure_log import skipped_drives
+
+    new = [report for report in reports if report.new or report.drives_forgotten]
+    if not new:
+        return f"{subject}: nothing to do, it was ingested before"
+    rejected: Counter[str] = Counter()
+    for report in new:
+        rejected.update(report.counts.quarantined)
+    reasons = ", ".join(f"{rows:,} {reason}" for reason, rows in rejected.items())
+    excluded = sum(report.counts.rows_left_out for report in new)
+    ticks, drives = (sum(getattr(r.counts, name) for r in new) for name in ("ticks", "drives"))
+    text = f"{subject}: {pluralize(ticks, 'row')} in {pluralize(drives, 'drive')}"
+    if excluded:
+        text += f"; excluded by the mapping's conditions: {pluralize(excluded, 'row')}"
+    if rejected:
+        text += f"; in quarantine: {pluralize(rejected.total(), 'row')} ({reasons})"
+    if replaced := sum(report.drives_replaced for report in new):
+        text += f"; {pluralize(replaced, 'drive')} replaced"
+    return text + skipped_drives(sum(report.drives_forgotten for report in new))
+
+
+def _print_previews(previews: "list[Preview]", json: bool) -> None:
+    """Print previews. Raises `AlarmError` if anything looks wrong."""
+    if json:
+        print_json(previews)
+    else:
+        for preview in previews:
+            print_parts(preview.parts())
+    if suspicions := sum(len(preview.alarms) for preview in previews):
+        raise AlarmError(f"{pluralize(suspicions, 'suspicion')}, see above. Nothing was stored.")
+
+
+# Mappings.
+
+mapping_app = typer.Typer(no_args_is_help=True)
+
+
+@mapping_app.callback()
+def mapping() -> None:
+    """Draft and list mappings, which describe the columns, units and axes of logs.
+
+    Example: fleet-slip mapping suggest drive.mf4
+    """
+
+
+@mapping_app.command()
+def suggest(
+    context: typer.Context,
+    file: Annotated[str, typer.Argument(help="A measured log.", show_default=False)],
+    output: Annotated[
+        Path | None,
+        typer.Option(help="File to write the draft to, instead of stdout.", show_default=False),
+    ] = None,
+    can: Annotated[
+        Path | None,
+        typer.Option(help="Database of a CAN trace: DBC, KCD or SYM.", show_default=False),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """List the channels of a measured log, and draft a mapping for it.
+
+    Channels are guessed by name, unit and values. Each guess has its reason as a comment; check it.
+    A dry run of ingest shows signs, and which wheel is which.
+
+    Example: fleet-slip mapping suggest drive.mf4
+    """
+    from fleet_slip.storage.storage_errors import storage_errors
+
+    if output is not None and output.exists():
+        raise UsageError(f"{output} exists. Choose another name, or remove it.")
+    draft, text = _draft(fleet_of(context).warehouse.catalog.signals, file, can)
+    signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
+    channels = [
+        {
+            "channel": profile.channel.name,
+            "unit": profile.channel.unit,
+            "rate_hz": profile.rate_hz or draft.time.rate_hz,
+            "least": profile.range[0] if profile.is_number else None,
+            "most": profile.range[1] if profile.is_number else None,
+            "missing": profile.missing if profile.is_number else None,
+            "texts": profile.texts,
+            "signal": signals.get(profile.channel.name),
+        }
+        for profile in draft.profile.profiles
+    ]
+    if json:
+        print_json({"channels": channels, "mapping": text})
+    else:
+        header = "channel|unit|guess|Hz|least|most|missing"
+        row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
+        title = f"{file}: {len(channels)} channels"
+        print_parts([TextTable(title, header, channels, row, left=3)])
+    if output is not None:
+        with storage_errors(output):
+            output.write_text(text, encoding="utf-8")
+        say(f"draft written to {output}")
+    elif not json:
+        print_parts(["\n" + text])
+
+
+@mapping_app.command(name="list")
+def list_mappings(context: typer.Context, json: Json = False) -> None:
+    """List the mappings of configs/mappings.
+
+    Example: fleet-slip mapping list
+    """
+    configs = fleet_of(context).warehouse.configs
+    files = {name: str(configs.find("mappings", name)) for name in configs.names("mappings")}
+    if json:
+        print_json(files)
+    else:
+        print_parts([TextTable("", "mapping|file", files.items(), left=2)])
+
+
+def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
+    """Return the draft of a mapping for a log, and its text."""
+    from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft
+    from fleet_slip.ingest.formats.can import CanBus, read_can_database
+    from fleet_slip.ingest.log_files import find_logs
+    from fleet_slip.ingest.profile import profile_file
+
+    bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
+    logs = find_logs([file])
+    if len(logs) > 1:
+        raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
+    draft = draft_mapping(signals, logs[0], profile_file(logs[0], bus))
+    return draft, write_draft(draft, name_of(logs[0].stem))
+
+
+# Gram rows.
+
+
+@recorded
+def gram(
+    context: typer.Context,
+    features: Annotated[
+        str,
+        typer.Option(
+            help="Feature set of configs/features.toml, or all; signals is the logged signals."
+        ),
+    ] = "signals",
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL predicate on the view drives: read only log files with such a drive. "
+            "Default: all files.",
+            show_default=False,
+        ),
+    ] = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    sql: Annotated[
+        bool, typer.Option("--sql", help="Print the SQL statement, and compute nothing.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
+
+    The first run for a feature set reads all logs; later runs read new files.
+
+    Every set: fleet-slip gram --features all
+
+    Example: fleet-slip gram --features windows
+    """
+    fleet = fleet_of(context)
+    names = fleet.warehouse.feature_sets() if features == ALL_SETS else (features,)
+    if sql:
+        from fleet_slip.grams.compute import gram_statement, has_statement
+
+        catalog = fleet.warehouse.catalog
+        for name in names:
+            if features != ALL_SETS or has_statement(catalog, name):
+                typer.echo(gram_statement(catalog, name))
+        return
+    reports: list[GramReport] = []
+    with open_workers(fleet.root, cluster or threads) as executor:
+        if cohort:  # the Gram rows of the logged signals tell which files have its drives
+            with progress("gram signals") as show:
+                fleet.gram(workers=executor, progress=show)
+        for name in names:
+            with progress(f"gram {name}") as show:
+                reports.append(fleet.gram(name, cohort=cohort, workers=executor, progress=show))
+    if json:
+        print_json(reports if features == ALL_SETS else reports[0])
+        return
+    for report in reports:
+        print_parts(report.parts())
+    if not (any(report.gram_rows for report in reports) or fleet.warehouse.logs.snapshot().files):
+        say(
+            f"{fleet.root}: no logs yet. Load some with fleet-slip ingest, or simulate with "
+            "fleet-slip run"
+        )

@@ -1,0 +1,248 @@
+"""Commands of operations: status, quality, calibrate, monitor, verify, compact, forget, migrate."""
+
+import logging
+from typing import Annotated
+
+import typer
+
+from fleet_slip.base import date_of
+from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.cli.options import Cluster, Cohort, Json, Model, Threads, fleet_of, recorded
+from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
+from fleet_slip.errors import UsageError
+
+
+def status(
+    context: typer.Context,
+    max_age_hours: Annotated[
+        float | None,
+        typer.Option(
+            min=0, help="Maximum age of data or of a backlog, in hours.", show_default=False
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Report the health of the data root: freshness, backlog, last runs, disk, champions.
+
+    Exit code 10 if something needs attention.
+
+    Example: fleet-slip status --max-age-hours 26
+    """
+    report = fleet_of(context).maintenance.status(max_age_hours)
+    if json:
+        print_json(report)
+    else:
+        print_parts(report.parts())
+    for problem in report.problems:
+        say(f"- {problem}", logging.ERROR)
+    if report.problem:
+        raise report.problem
+
+
+def quality(context: typer.Context, cohort: Cohort = TRAINING_DRIVES, json: Json = False) -> None:
+    """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
+
+    Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
+
+    Example: fleet-slip quality --cohort "day >= '2024-05-02'"
+    """
+    print_answer(fleet_of(context).maintenance.quality(cohort), json)
+
+
+def calibrate(
+    context: typer.Context,
+    cohort: Cohort = ALL_DRIVES,
+    car: Annotated[
+        str | None,
+        typer.Option(
+            help="vehicle_id: print the parameters of this car, also as on-board constants.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Estimate the sensor errors of each car from its own drives, without label or log rows.
+
+    Offsets of gyroscope, accelerometer and steering, tyre radius, steering ratio and understeer,
+    each with its uncertainty. Reads the Gram rows of: fleet-slip gram --features calibration.
+
+    Example: fleet-slip calibrate
+    """
+    print_answer(fleet_of(context).maintenance.calibrate(cohort), json, car=car)
+
+
+def monitor(
+    context: typer.Context,
+    model: Model = None,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL predicate on the view drives. Default: the predicate of the training.",
+            show_default=False,
+        ),
+    ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            help="First new day, YYYY-MM-DD. Default: the day after the training data.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Chart a model's error on each day since its training, with control limits.
+
+    Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
+
+    Example: fleet-slip monitor waterford --since 2024-05-03
+    """
+    day = date_of(since, "--since")
+    print_answer(fleet_of(context).maintenance.monitor(model, cohort, since=day), json)
+
+
+def verify(
+    context: typer.Context,
+    full: Annotated[
+        bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
+    ] = False,
+    grams: Annotated[
+        bool,
+        typer.Option(
+            "--grams", help="Also compute some Gram rows in several ways and compare the bits."
+        ),
+    ] = False,
+    repair: Annotated[
+        bool, typer.Option("--repair", help="Rebuild damaged Gram rows from the logs.")
+    ] = False,
+    accept_loss: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Lost document without a backup to give up: FOLDER/NUMBER.json, or FOLDER for all "
+            "its documents. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    json: Json = False,
+) -> None:
+    """Verify every byte against its checksum, and all tables against each other.
+
+    Exit code 9 if there is damage that was not repaired.
+
+    Example: fleet-slip verify --full
+    """
+    with progress("verify") as show:
+        verification = fleet_of(context).maintenance.verify(
+            full=full,
+            grams=grams,
+            repair=repair,
+            accept_loss=accept_loss or (),
+            workers=cluster or threads,
+            progress=show,
+        )
+    print_answer(verification, json)
+
+
+@recorded
+def compact(
+    context: typer.Context,
+    target_rows: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Maximum number of rows of a file. Default: 2,000,000.", show_default=False
+        ),
+    ] = None,
+    retention_hours: Annotated[
+        float | None,
+        typer.Option(
+            min=1,
+            max=168,
+            help="Hours for which files of replaced versions are kept. Default: 168, a week.",
+            show_default=False,
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the files to be removed; change nothing.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Merge the small log files of each day, and remove files that are out of use.
+
+    Replaced files and leftovers of killed jobs are removed when they are old enough. Readers and
+    jobs are not disturbed.
+
+    Example: fleet-slip compact
+    """
+    with progress("compact") as show:
+        report = fleet_of(context).maintenance.compact(
+            target_rows, retention_hours=retention_hours, dry_run=dry_run, progress=show
+        )
+    print_answer(report, json)
+
+
+@recorded
+def forget(
+    context: typer.Context,
+    vehicle: Annotated[
+        str | None, typer.Option(help="vehicle_id to erase.", show_default=False)
+    ] = None,
+    drive: Annotated[
+        str | None, typer.Option(help="drive_id to erase.", show_default=False)
+    ] = None,
+    now: Annotated[
+        bool, typer.Option("--now", help="Delete old files at once, instead of by compact.")
+    ] = False,
+    allow: Annotated[
+        bool, typer.Option("--allow", help="Accept new rows of the vehicle or drive again.")
+    ] = False,
+    expired: Annotated[
+        bool, typer.Option("--expired", help="Erase drives older than the retention period.")
+    ] = False,
+    retention: Annotated[
+        str | None,
+        typer.Option(
+            help="Retention file of --expired. Default: retention.toml of the configs.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Erase a vehicle or a drive from logs, Gram rows and quarantine; mark models it trained.
+
+    Jobs that are running leave its rows out, too, until --allow. Train the models again with:
+    fleet-slip publish NAME. With --now the exit code is 12 while rows may remain: repeat it.
+
+    Example: fleet-slip forget --vehicle car-7 --now
+    """
+    maintenance = fleet_of(context).maintenance
+    if expired or retention is not None:
+        if not expired or allow or now or vehicle or drive:
+            raise UsageError("give --expired alone, or with --retention.")
+        with progress("retain") as show:
+            print_answer(maintenance.apply_retention(retention, progress=show), json)
+    elif allow:
+        if now:
+            raise UsageError("give one of --allow and --now.")
+        changed = maintenance.allow(vehicle=vehicle, drive=drive)
+        if json:
+            print_json({"allowed": True, "changed": changed})
+        else:
+            say("its new rows are accepted again from now on; what was forgotten stays forgotten")
+    else:
+        with progress("forget") as show:
+            report = maintenance.forget(vehicle=vehicle, drive=drive, now=now, progress=show)
+        print_answer(report, json)
+        if now:
+            report.require_all()
+
+
+@recorded
+def migrate(context: typer.Context, json: Json = False) -> None:
+    """Bring the data root to this program and to the signal catalog: add columns.
+
+    It can be repeated after any interruption.
+
+    Example: fleet-slip migrate
+    """
+    print_answer(fleet_of(context).maintenance.migrate(), json)

@@ -1,0 +1,239 @@
+"""Commands that run several steps: run, learn, nightly."""
+
+import os
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleet_slip.base import date_of, last_day, pluralize
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.cli.options import (
+    All,
+    CampaignDays,
+    Cluster,
+    Cohort,
+    Json,
+    Mapping,
+    ModelList,
+    ModelName,
+    Threads,
+    Through,
+    Tolerance,
+    fleet_of,
+    recorded,
+)
+from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
+from fleet_slip.errors import FleetSlipError
+from fleet_slip.storage.data_root import data_root
+
+if TYPE_CHECKING:
+    from fleet_slip.api.fleet import Fleet
+
+
+@recorded
+def run(
+    context: typer.Context,
+    campaign: Annotated[
+        str, typer.Option(help="Campaign of configs/campaigns, or a TOML file.")
+    ] = "waterford",
+    days: CampaignDays = None,
+    through: Through = None,
+    name: Annotated[
+        str | None,
+        typer.Option(help="Name of the model. Default: the campaign's.", show_default=False),
+    ] = None,
+    models: ModelList = None,
+    tolerance: Tolerance = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Simulate a campaign, update Gram rows, select a model, publish it if it is not worse.
+
+    It can be repeated at any time, also after an interruption: completed work is not repeated. A
+    second run of the campaign at the same time waits for the first. A nightly run appends the next
+    day with --through today.
+
+    Example: fleet-slip run --campaign smoke
+    """
+    fleet = fleet_of(context)
+    with progress_of_steps() as show:
+        report = fleet.run(
+            campaign,
+            days=days,
+            through=last_day(through),
+            name=name,
+            models=models,
+            tolerance=tolerance,
+            workers=cluster or threads,
+            progress=show,
+        )
+    print_answer(report, json, everything=everything)
+    if json or not (report.publication and report.publication.new):
+        return
+    version = report.publication.version
+    _report_lost_control(fleet, report.campaign, version.manifest.name)
+    if version.version == 1:
+        say("next:")
+        for line in next_steps(fleet, report.campaign, version.manifest.name):
+            say(f"  {line}")
+
+
+@recorded
+def learn(
+    context: typer.Context,
+    name: ModelName,
+    logs: Annotated[
+        list[str],
+        typer.Argument(
+            help="Log files or folders. Files that were ingested before are skipped.",
+            show_default=False,
+        ),
+    ],
+    mapping: Mapping,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Train a model on measured logs: ingest, gram, select, publish. Repeat it for new logs.
+
+    The label is the side-slip angle of the mapping, else the course over ground. The command ends
+    with its assumptions and the next commands. Draft the mapping with: fleet-slip mapping suggest
+
+    Example: fleet-slip learn golf logs/ --mapping golf.toml
+    """
+    fleet = fleet_of(context)
+    with progress_of_steps() as show:
+        report = fleet.learn(name, logs, mapping, workers=cluster or threads, progress=show)
+    if json:
+        print_json(report)
+    else:
+        print_parts(report.parts(everything))
+        if report.changed and report.publication:
+            begin = f"{program()}{_root_option(fleet)}"
+            say("next:")
+            say(f"  {begin} show {name}")
+            say(f"  {begin} export {name} --to c --output {name}")
+            if not report.publication.version.manifest.learned_from:
+                say(f"  {begin} evaluate {name} --cohort \"campaign = '{report.mapping}'\"")
+    if report.problem:
+        raise report.problem
+
+
+@recorded
+def nightly(
+    context: typer.Context,
+    inbox: Annotated[
+        str,
+        typer.Option(help="Folder of logs; new logs in it are ingested.", show_default=False),
+    ],
+    mapping: Mapping,
+    model: Annotated[str, typer.Option(help="Name of the model.", show_default=False)],
+    cohort: Cohort = TRAINING_DRIVES,
+    models: ModelList = None,
+    tolerance: Tolerance = None,
+    candidate: Annotated[
+        bool, typer.Option("--candidate", help="Publish as a candidate, even if it is not worse.")
+    ] = False,
+    retention: Annotated[
+        str | None,
+        typer.Option(
+            help="Retention file. Default: retention.toml of the configs.", show_default=False
+        ),
+    ] = None,
+    night: Annotated[
+        str | None,
+        typer.Option(help="Date of the night, YYYY-MM-DD. Default: today.", show_default=False),
+    ] = None,
+    threads: Threads = None,
+    cluster: Cluster = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for the summary: NIGHT.txt and NIGHT.json. The files name drives; forget "
+            "does not change them.",
+            show_default=False,
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Run the nightly job: ingest new logs, check their sensors, train again, verify.
+
+    Drives with faulty sensors train no model. The winner becomes champion if it is not worse, else
+    a candidate. A night that was killed and is repeated ends where it would have ended. Exit code
+    10 if something needs attention, else the code of the first step that failed.
+
+    Example: fleet-slip nightly --inbox /srv/logs --mapping logger.toml --model fleet
+    """
+    date = date_of(night, "--night")
+    with progress_of_steps() as show:
+        report = fleet_of(context).nightly(
+            inbox,
+            mapping,
+            model,
+            cohort=cohort,
+            models=models,
+            tolerance=tolerance,
+            candidate=candidate,
+            retention=retention,
+            night=date,
+            workers=cluster or threads,
+            progress=show,
+        )
+    if output is not None:
+        from fleet_slip.operations.night import write_summary
+
+        write_summary(report, output)
+    print_answer(report, json)
+
+
+def next_steps(fleet: "Fleet", campaign: str, model: str) -> list[str]:
+    """Return command lines to continue with: a query, the model, a cohort, the test drives."""
+    begin = f"{program()}{_root_option(fleet)}"
+    query = "SELECT drive_id, max(abs(degrees(sideslip_rad))) AS beta_deg FROM log GROUP BY ALL"
+    lines = [f'{begin} sql "{query}"', f"{begin} show {model}"]
+    medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
+    speed = dict(medians).get(campaign)
+    if speed is not None:
+        lines.append(f'{begin} select --cohort "speed_factor > {speed:.2f}"')
+    lines.append(f"{begin} evaluate {model} && {begin} report {model}")
+    return lines
+
+
+def _report_lost_control(fleet: "Fleet", campaign: str, model: str) -> None:
+    """Report how many training drives ended in a loss of control."""
+    query = "SELECT campaign, count(lost_control_s), count(*) FROM drives GROUP BY ALL"
+    counts = {name: (lost, drives) for name, lost, drives in fleet.sql(query).fetchall()}
+    lost, drives = counts.get(campaign, (0, 0))
+    if lost:
+        cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
+        say(
+            f"in {lost:,} of {pluralize(drives, 'drive')} the car lost control; the model was "
+            "trained on these, too. Without them:"
+        )
+        say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')
+
+
+def program() -> str:
+    """Return the command that starts this program: its name if it is on the path, else a path."""
+    started = Path(sys.argv[0])
+    on_path = shutil.which(started.name)
+    if on_path and os.path.realpath(on_path) == os.path.realpath(started):
+        return started.name
+    folder, path = Path.cwd(), started.absolute()
+    return shlex.quote(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
+
+
+def _root_option(fleet: "Fleet") -> str:
+    """Return the option that names the data root, empty for the default root."""
+    try:
+        default = str(data_root())
+    except FleetSlipError:
+        default = ""
+    return "" if str(fleet.root) == default else f" --root {shlex.quote(str(fleet.root))}"

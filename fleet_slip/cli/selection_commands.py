@@ -1,0 +1,245 @@
+"""Commands that choose a model: select, publish, diagnose."""
+
+from typing import Annotated
+
+import typer
+
+from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.cli.options import (
+    All,
+    AllSubsets,
+    ClusterUnit,
+    Cohort,
+    Criterion,
+    Features,
+    Folds,
+    GroupBy,
+    HalfLife,
+    IncludeFaulty,
+    Intercept,
+    Json,
+    Label,
+    MaxFeatures,
+    Model,
+    ModelList,
+    ModelName,
+    OneModel,
+    Order,
+    Prior,
+    Ranking,
+    Robust,
+    Search,
+    Tolerance,
+    fleet_of,
+    recorded,
+)
+from fleet_slip.cli.output import print_answer, print_json, print_parts, say
+from fleet_slip.storage.runs import step
+
+
+def select(
+    context: typer.Context,
+    cohort: Cohort = TRAINING_DRIVES,
+    include_faulty: IncludeFaulty = False,
+    models: ModelList = None,
+    model: OneModel = None,
+    order: Order = None,
+    features: Features = None,
+    label: Label = None,
+    group_by: GroupBy = None,
+    folds: Folds = None,
+    ranking: Ranking = None,
+    criterion: Criterion = None,
+    tolerance: Tolerance = None,
+    all_subsets: AllSubsets = False,
+    robust: Robust = False,
+    cluster: ClusterUnit = None,
+    intercept: Intercept = True,
+    search: Search = None,
+    max_features: MaxFeatures = None,
+    half_life: HalfLife = None,
+    prior: Prior = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
+
+    Compare a list of models: fleet-slip select --models table1
+
+    Find an order and a place to stop: fleet-slip select --ranking backward --criterion bic
+
+    Choose among many columns: fleet-slip select --features windows --search exchange
+
+    Search all subsets: fleet-slip select --all-subsets --criterion cv
+    """
+    selection = (
+        fleet_of(context)
+        .cohort(cohort, include_faulty=include_faulty)
+        .select(
+            models=models,
+            model=model,
+            order=order,
+            features=features,
+            label=label,
+            group_by=group_by,
+            folds=folds,
+            ranking=ranking,
+            criterion=criterion,
+            tolerance=tolerance,
+            all_subsets=all_subsets,
+            robust=robust,
+            cluster=cluster,
+            intercept=intercept,
+            search=search,
+            max_features=max_features,
+            half_life=half_life,
+            prior=prior,
+        )
+    )
+    print_answer(selection, json, everything=everything)
+
+
+@recorded
+def publish(
+    context: typer.Context,
+    name: ModelName,
+    cohort: Annotated[
+        str | None,
+        typer.Option(
+            help="SQL predicate on the view drives. Default: the cohort of the model's champion; "
+            "all drives, for a new model.",
+            show_default=False,
+        ),
+    ] = None,
+    include_faulty: IncludeFaulty = False,
+    models: ModelList = None,
+    model: OneModel = None,
+    order: Order = None,
+    features: Features = None,
+    label: Label = None,
+    group_by: GroupBy = None,
+    folds: Folds = None,
+    ranking: Ranking = None,
+    criterion: Criterion = None,
+    tolerance: Tolerance = None,
+    all_subsets: AllSubsets = False,
+    robust: Robust = False,
+    cluster: ClusterUnit = None,
+    intercept: Intercept = True,
+    search: Search = None,
+    max_features: MaxFeatures = None,
+    half_life: HalfLife = None,
+    prior: Prior = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Publish even a model that is worse than the champion.")
+    ] = False,
+    candidate: Annotated[
+        bool,
+        typer.Option("--candidate", help="Publish as a candidate; promote makes it champion."),
+    ] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print what would be published; publish nothing.")
+    ] = False,
+    mlflow: Annotated[
+        str | None,
+        typer.Option(help="URI of an MLflow server to register the version in, too."),
+    ] = None,
+    everything: All = False,
+    json: Json = False,
+) -> None:
+    """Select on a cohort and publish the winner as the next version of a model, its champion.
+
+    A model that exists is trained again with the options of its champion; options that are given
+    replace them.
+
+    Try it first: fleet-slip publish waterford --dry-run
+
+    Example: fleet-slip publish wet --cohort "adhesion < 0.8"
+    """
+    from fleet_slip.models.manifest import require_model_name
+    from fleet_slip.models.publish import DryRun, Publication, recipe_for
+    from fleet_slip.models.request import SelectionRequest
+
+    fleet = fleet_of(context)
+    request = SelectionRequest(
+        models=models,
+        model=model,
+        order=order,
+        features=features,
+        label=label,
+        group_by=group_by,
+        folds=folds,
+        ranking=ranking,
+        criterion=criterion,
+        tolerance=tolerance,
+        all_subsets=all_subsets,
+        robust=robust,
+        cluster=cluster,
+        intercept=intercept,
+        search=search,
+        max_features=max_features,
+        half_life=half_life,
+        prior=prior,
+    )
+    recipe = recipe_for(fleet.models.registry, require_model_name(name), request, cohort)
+    if recipe.told:
+        say(f"{name}: {recipe.told}")
+    drives = fleet.cohort(recipe.cohort, include_faulty=include_faulty)
+    with step("select"):
+        selection = drives.run_request(recipe.request)
+    publish_or_preview = fleet.models.preview if dry_run else fleet.models.publish
+    answer: DryRun | Publication = publish_or_preview(
+        name, selection, force=force, candidate=candidate
+    )
+    if json:
+        if selection.examined:
+            say(selection.examined)
+        print_json(answer)
+    else:
+        print_parts(selection.parts(everything))
+        print_parts(answer.parts())
+    if mlflow and isinstance(answer, Publication):
+        number = fleet.models.log_to_mlflow(answer.version, mlflow)
+        if not json:
+            say(f"in MLflow: {name}, version {number}")
+    if answer.problem:
+        raise answer.problem
+
+
+def diagnose(
+    context: typer.Context,
+    model: Model = None,
+    cohort: Cohort = TRAINING_DRIVES,
+    signals: Annotated[
+        str | None,
+        typer.Option(
+            help="Signals to fit instead of a published model, separated by commas; 'catalogue' is "
+            "all inputs.",
+            show_default=False,
+        ),
+    ] = None,
+    features: Annotated[
+        str | None,
+        typer.Option(
+            help="Feature set of --signals. Default: the logged signals.", show_default=False
+        ),
+    ] = None,
+    cluster: ClusterUnit = None,
+    json: Json = False,
+) -> None:
+    """Fit a model's signals to a cohort and examine the fit, from Gram rows.
+
+    Believe the standard errors by drives, or by cars where there are several: at 100 Hz the rows of
+    a drive are not independent, and the drives of a car share its biases.
+
+    Example: fleet-slip diagnose waterford
+    """
+    diagnosis = (
+        fleet_of(context)
+        .cohort(cohort)
+        .diagnose(model, signals=signals, features=features, cluster=cluster)
+    )
+    if json:
+        print_json({"cohort": cohort, **diagnosis.as_dict()})
+    else:
+        print_answer(diagnosis, json)
