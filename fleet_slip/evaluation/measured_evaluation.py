@@ -4,13 +4,13 @@ Without the held-out segments, columns are chosen by each model's own recipe and
 tuned and a car is identified: neither a fit nor a choice saw the rows that an error is taken on.
 """
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version as package_version
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluator import (
+    MIN_SPEED_MPS,
     Estimator,
+    MissingSignalError,
     evaluate,
     pooled_statistics,
     variation_between_drives,
@@ -54,7 +56,6 @@ from fleet_slip.evaluation.single_track import (
     LabelledDrive,
     follow,
     measured_speed_mps,
-    without_rest,
 )
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort
@@ -100,10 +101,8 @@ def evaluate_measured(
     pooled = pooled_statistics(runs)
     errors = {name: row for name, row in pooled.items() if row.rmse_deg is not None}
     competition.warn_of_missing(pooled, errors)
-    of_kinds = {}
-    if kinds:
-        by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
-        of_kinds = pooled_statistics(evaluate(competition.drives, by_kind))
+    by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
+    of_kinds = pooled_statistics(evaluate(competition.drives, by_kind))
     order = sorted(errors, key=lambda name: errors[name].rmse_deg or 0.0)
     whole_drives = len({quarter for _, quarter in folds[0]}) > 1
     units = runs
@@ -153,18 +152,10 @@ def evaluate_measured(
     }
 
 
-@dataclass(frozen=True)
-class FittedEstimator:
+class FittedEstimator(NamedTuple):
     """An estimator that was fitted without held-out segments.
 
-    Attributes
-    ----------
-    source
-        Its source of knowledge, in words.
-    estimate
-        Estimator of a drive.
-    parameters
-        Result of the fit, for the document.
+    It has its source of knowledge in words, and the fitted columns or parameters.
     """
 
     source: str
@@ -257,29 +248,25 @@ class Competition:
         measured = VehicleMeasures.of_vehicle(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
-            drives = [_moving(with_acceleration(drive, measured), measured) for drive in drives]
+            drives = [prepare_drive(drive, measured.vehicle()) for drive in drives]
         return cls(catalog, drives, published, learners, vehicle, measured, cars, executor)
 
     def fit(self, held_out: Segments) -> FittedFold:
         """Fit, tune and identify without the held-out segments."""
-        identified = self._identify(held_out)
-        return {
-            **{
-                name: FittedEstimator("as published", partial(predict_drive, model, self.cars))
-                for name, model in self.published.items()
-            },
-            **dict(self._train(held_out, identified)),
-            **dict(self._tune(held_out, identified)),
+        drives = self._training_drives(held_out)
+        identified = self._identify(drives)
+        published = {
+            name: FittedEstimator("as published", partial(predict_drive, model, self.cars))
+            for name, model in self.published.items()
         }
+        return {**published, **self._train(held_out, identified), **self._tune(drives, identified)}
 
-    def _identify(self, held_out: Segments) -> IdentifiedVehicle | None:
+    def _identify(self, drives: Sequence[LabelledDrive]) -> IdentifiedVehicle | None:
         """Identify the car; None without measures of it, or if the drives lack a signal."""
-        if self.measured is None:
-            return None
         try:
-            return identify(self.measured, self._training_drives(held_out), self.executor)
+            return identify(self.measured, drives, self.executor) if self.measured else None
         except DataError as error:
-            LOGGER.warning("no car identified: %s", error)
+            self._failures["ekf_identified"] = str(error)
             return None
 
     def _training_drives(self, held_out: Segments) -> list[LabelledDrive]:
@@ -292,18 +279,18 @@ class Competition:
 
     def _train(
         self, held_out: Segments, identified: IdentifiedVehicle | None
-    ) -> Iterator[tuple[str, FittedEstimator]]:
-        """Train the learners; warn of those that cannot be trained."""
+    ) -> dict[str, FittedEstimator]:
+        """Train the learners that can be trained."""
+        fitted = {}
         for name, (source, learner) in self.learners.items():
             try:
                 columns, model = learner.train(held_out, self._prior(learner, identified))
             except (DataError, QuestionError) as error:
                 self._failures[name] = str(error)
             else:
-                yield (
-                    name,
-                    FittedEstimator(source, partial(predict_drive, model, self.cars), columns),
-                )
+                estimate = partial(predict_drive, model, self.cars)
+                fitted[name] = FittedEstimator(source, estimate, columns)
+        return fitted
 
     def warn_of_missing(self, estimators: Collection[str], evaluated: Collection[str]) -> None:
         """Warn of models without a fit for some segments, and of estimators without an estimate."""
@@ -330,48 +317,38 @@ class Competition:
         return self._priors[key]
 
     def _tune(
-        self, held_out: Segments, identified: IdentifiedVehicle | None
-    ) -> Iterator[tuple[str, FittedEstimator]]:
+        self, drives: Sequence[LabelledDrive], identified: IdentifiedVehicle | None
+    ) -> dict[str, FittedEstimator]:
         """Tune filters in the car of the file and in the identified car."""
         if self.measured is None:
-            return
+            return {}
         rolling = on_signals(rolling_sideslip, self.measured.vehicle())
-        yield "kinematic", FittedEstimator("geometry", rolling)
+        fitted = {"kinematic": FittedEstimator("geometry", rolling)}
         cars: dict[str, tuple[str, VehicleParameters]] = {}
-        if self.vehicle is not None and (
-            identified is None or self.vehicle.description != IDENTIFIED
-        ):
+        if self.vehicle and (identified is None or self.vehicle.description != IDENTIFIED):
             cars["tuned"] = ("the vehicle's file", self.vehicle)
         if identified is not None:
             cars["identified"] = ("the identified car", identified.car)
-            yield (
-                "ekf_identified",
-                FittedEstimator(
-                    "geometry, and a car identified from the other folds",
-                    on_signals(identified.estimate),
-                    identified.as_dict()["found"],
-                ),
+            fitted["ekf_identified"] = FittedEstimator(
+                "geometry, and a car identified from the other folds",
+                on_signals(identified.estimate),
+                identified.as_dict()["found"],
             )
-        drives = self._training_drives(held_out)
         has_gps = any(np.isfinite(drive.signals.gps_vx_mps).any() for drive in drives)
-        for kind in FILTERS:
-            for suffix, (knowledge, car) in cars.items():
-                name = f"{kind.module}_{suffix}"
-                if kind.informed or name == "ekf_identified" or (kind.gps and not has_gps):
-                    continue
-                try:
-                    tuned = kind.tune(drives, car, self.executor).parameters
-                except DataError as error:
-                    LOGGER.warning("%s left out: %s", name, error)
-                    continue
-                yield (
-                    name,
-                    FittedEstimator(
-                        f"{knowledge}, tuned on labels",
-                        on_signals(kind.estimate, car, tuned),
-                        tuned.model_dump(mode="json"),
-                    ),
-                )
+        kinds = [kind for kind in FILTERS if not kind.informed and (has_gps or not kind.gps)]
+        for kind, (suffix, (source, car)) in product(kinds, cars.items()):
+            name = f"{kind.module}_{suffix}"
+            if name in fitted:
+                continue
+            try:
+                tuned = kind.tune(drives, car, self.executor).parameters
+            except DataError as error:
+                self._failures[name] = str(error)
+            else:
+                estimate = on_signals(kind.estimate, car, tuned)
+                content = tuned.model_dump(mode="json")
+                fitted[name] = FittedEstimator(f"{source}, tuned on labels", estimate, content)
+        return fitted
 
 
 def prior_of(version: ModelVersion) -> Campaign | None:
@@ -403,21 +380,14 @@ WHEELS_LAG = 0.1
 """Share of a new sample in the acceleration from wheel speeds."""
 
 
-def with_acceleration(drive: HeldOutDrive, car: VehicleMeasures) -> HeldOutDrive:
-    """Derive ax from wheel speeds where none is logged."""
-    signals = drive.signals
-    if np.isfinite(signals.ax_mps2).any():
-        return drive
+def prepare_drive(drive: HeldOutDrive, car: VehicleParameters) -> HeldOutDrive:
+    """Derive ax from wheel speeds where it is not logged, and drop labels of rows at rest."""
     try:
-        speed = measured_speed_mps(signals, car.vehicle())
-    except DataError:
+        speed_mps = measured_speed_mps(drive.signals, car)
+    except MissingSignalError:
         return drive
-    ax_mps2 = follow(np.diff(speed, prepend=speed[:1]) / STEP_S, WHEELS_LAG)
-    return replace(drive, signals=replace(signals, ax_mps2=ax_mps2))
-
-
-def _moving(drive: HeldOutDrive, car: VehicleMeasures) -> HeldOutDrive:
-    """Drop the labels of rows in which the wheels show that the car rests."""
-    with suppress(DataError):
-        return without_rest(drive, car.vehicle())
-    return drive
+    if not np.isfinite(drive.signals.ax_mps2).any():
+        ax_mps2 = follow(np.diff(speed_mps, prepend=speed_mps[:1]) / STEP_S, WHEELS_LAG)
+        drive = replace(drive, signals=replace(drive.signals, ax_mps2=ax_mps2))
+    label = np.where(speed_mps > MIN_SPEED_MPS, drive.sideslip_rad, np.nan)
+    return replace(drive, sideslip_rad=label)

@@ -19,8 +19,8 @@ from fleet_slip.evaluation.held_out import (
     folds_of,
     read_measured_drives,
 )
-from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures
-from fleet_slip.evaluation.measured_evaluation import with_acceleration
+from fleet_slip.evaluation.identify import IdentifiedVehicle
+from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.evaluation.single_track import DriveSignals
 from fleet_slip.evaluation.tuning import TuningResult
 from fleet_slip.grams.cohort import load_cohort
@@ -77,14 +77,12 @@ def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
     car, still = load_vehicle("d_class_sedan", SHIPPED_CONFIGS), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
-    logged, measured = replace(a_drive(0), signals=signals), VehicleMeasures.of_vehicle(car)
-    assert with_acceleration(logged, measured) is logged
+    logged = replace(a_drive(0), signals=signals)
+    assert prepare_drive(logged, car).signals is signals
     missing = replace(logged, signals=replace(signals, ax_mps2=np.full(ROWS, np.nan)))
-    assert with_acceleration(missing, measured).signals.ax_mps2[100:] == pytest.approx(
-        2.0, abs=0.01
-    )
+    assert prepare_drive(missing, car).signals.ax_mps2[100:] == pytest.approx(2.0, abs=0.01)
     blind = replace(logged, signals=NO_SIGNALS)
-    assert with_acceleration(blind, measured) is blind
+    assert prepare_drive(blind, car) is blind
 
 
 @pytest.fixture(scope="module")

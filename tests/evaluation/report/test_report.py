@@ -329,7 +329,7 @@ def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
     judged: tuple[Path, Finished],
 ) -> None:
     _, done = judged
-    assert "kalman left untuned: no GPS fix" in done.stderr
+    assert "kalman left untuned: the drive has no GPS fix" in done.stderr
     assert "ekf_class left untuned" in done.stderr
     assert "nominal" in done.stdout
 
@@ -340,6 +340,6 @@ def test_the_report_has_what_is_left(judged: tuple[Path, Finished]) -> None:
     done_on(root, "evaluate", "own", "--cohort", "source = 'measured'")
     done_on(root, "report", "own")
     page = (root / "report" / "report.html").read_text()
-    assert "A car of one&#39;s own: measured drives" in page
+    assert "Measured drives with a label" in page
     assert "on the nominal drive; of model 1" in page
     assert "lack signals of model 2, 3, 4 and 5 of Table I" in page
