@@ -9,18 +9,17 @@ from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
-from fleet_slip.warehouse.warehouse import (
+from fleet_slip.warehouse.table_views import (
     TABLE_VIEWS,
-    Warehouse,
     add_table,
     describe_columns,
     lock,
     open_tables,
-    open_warehouse,
     paths_of,
     table_snapshots,
     views_in,
 )
+from fleet_slip.warehouse.warehouse import Warehouse, open_warehouse
 
 VIEWS = frozenset({*TABLE_VIEWS, "runs", "models", "dictionary"})
 

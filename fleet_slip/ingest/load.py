@@ -22,7 +22,8 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, pluralize
-from fleet_slip.catalog.signals import SignalCatalog, as_arrow
+from fleet_slip.catalog.counts import as_arrow
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id

@@ -29,7 +29,8 @@ from fleet_slip.storage.table import (
     retry_conflicts,
 )
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Replace: TypeAlias = Literal["no", "corrected", "all"]

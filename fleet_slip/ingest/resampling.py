@@ -17,7 +17,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks
+from fleet_slip.catalog.counts import round_chunks
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
 from fleet_slip.quality.plausibility import RADIUS_M, SECOND, wrapped

@@ -38,7 +38,7 @@ from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import Fault
-from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
 """Short drives in one file. With more, time or the drive's column is not what the mapping says."""
@@ -288,7 +288,7 @@ class MeasuredStream:
             "signal",
             "value",
         )
-        return frame.to_arrow().cast(QUARANTINE_SCHEMA)
+        return frame.to_arrow().cast(quarantine_schema())
 
     def suspicions(self) -> tuple[Fault, ...]:
         """Return what looks wrong in the file as a whole, once all drives were taken."""

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.catalog.signals import as_arrow
+from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows as checking
 from fleet_slip.ingest import time_bases
