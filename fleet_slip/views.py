@@ -27,6 +27,8 @@ _ABOUT_ALL_VIEWS = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
 )
 
+_READS_TABLE = re.compile(r"\b(?:from|join|describe|summarize|pivot|unpivot|table)\b", re.I)
+
 _SOURCE = re.compile(r"\bsource\b", re.I)
 
 
@@ -75,6 +77,11 @@ def open_views(
 
 
 def needed_views(query: str) -> frozenset[str]:
-    """Return the views that a query may need; all, if it names none or asks about tables."""
-    named = views_in(query, VIEWS)
-    return VIEWS if not named or _ABOUT_ALL_VIEWS.search(query) else named
+    """Return the views that a query may need.
+
+    All if it is about tables, or reads a table of another name: its error suggests one of them.
+    """
+    if _ABOUT_ALL_VIEWS.search(query):
+        return VIEWS
+    views = views_in(query, VIEWS)
+    return VIEWS if not views and _READS_TABLE.search(query) else views

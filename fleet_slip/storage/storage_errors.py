@@ -104,10 +104,10 @@ def storage_errors(path: object) -> Iterator[None]:
         reason = meaning_of(error) if "://" in str(path) else _reason(error)
         raise StorageError(f"{path}: {reason}") from None
     except Exception as error:
-        reason = _library_reason(error, "://" in str(path))
-        if reason is None:
+        library_reason = _library_reason(error, "://" in str(path))
+        if library_reason is None:
             raise
-        raise StorageError(f"{path}: {reason}") from None
+        raise StorageError(f"{path}: {library_reason}") from None
 
 
 def _library_reason(error: Exception, is_store: bool) -> str | None:

@@ -106,6 +106,8 @@ def open_tables(
         active = [file.path for file in tables["logs"].files]
         database.execute("SET VARIABLE active_log_files = $active", {"active": active})
     read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
+    if not read:
+        return database
     signals = warehouse.catalog.signals
     sources = {f"stored_{name}": _source(database, tables[name], signals) for name in read}
     if of != ALL_DRIVES:
