@@ -21,7 +21,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
-from fleet_slip.warehouse.warehouse import CONFIG_VARIABLE, QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.warehouse import CONFIG_VARIABLE, Warehouse, quarantine_schema
 from tests.support.commands import COMMAND, PATIENCE_S, run_here
 
 KINDS = {
@@ -196,8 +196,8 @@ def _require_done(ended: Ended) -> None:
 
 def _add_what_is_rare(root: Path) -> None:
     warehouse = Warehouse(LocalFolder(root))
-    refused = [{name: "1" if name != "row" else 1 for name in QUARANTINE_SCHEMA.names}]
-    rows = QUARANTINE_SCHEMA.empty_table().from_pylist(refused, schema=QUARANTINE_SCHEMA)
+    refused = [{name: "1" if name != "row" else 1 for name in quarantine_schema().names}]
+    rows = quarantine_schema().empty_table().from_pylist(refused, schema=quarantine_schema())
     written = warehouse.quarantine.write_file("refused", rows)
     warehouse.quarantine.snapshot().commit(Change(add=[written]))
     DocumentFolder(warehouse.root, "evaluations").append({"format": 1, "values": [1, 2.5]})

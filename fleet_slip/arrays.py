@@ -1,4 +1,4 @@
-"""Types of numpy arrays, by what they hold."""
+"""Types of numpy arrays, by their content."""
 
 from typing import TYPE_CHECKING
 
@@ -19,8 +19,15 @@ ObjectArray = NDArray[np.object_]
 """Python objects, such as integers that never overflow."""
 
 
+Hashes = NDArray[np.uint64]
+"""The first 8 bytes of SHA-256 hashes of names."""
+
+
 def is_finite(values: FloatArray) -> bool:
-    """Whether neither NaN nor infinity is among values, nor their sum, by which it is told."""
+    """Return True if all values are finite.
+
+    Tests the sum only, so an overflowing sum of finite values also returns False.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         return bool(np.isfinite(values.sum()))
 

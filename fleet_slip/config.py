@@ -28,7 +28,7 @@ from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 class Config(BaseModel):
     """Base of all config models: immutable, and no key that is not declared."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 ConfigT = TypeVar("ConfigT", bound=Config)

@@ -9,24 +9,25 @@ from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
-from fleet_slip.warehouse.warehouse import (
+from fleet_slip.warehouse.table_views import (
     TABLE_VIEWS,
-    Warehouse,
     add_table,
     describe_columns,
     lock,
     open_tables,
-    open_warehouse,
     paths_of,
     table_snapshots,
     views_in,
 )
+from fleet_slip.warehouse.warehouse import Warehouse, open_warehouse
 
 VIEWS = frozenset({*TABLE_VIEWS, "runs", "models", "dictionary"})
 
 _ABOUT_ALL_VIEWS = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
 )
+
+_READS_TABLE = re.compile(r"\b(?:from|join|describe|summarize|pivot|unpivot|table)\b", re.I)
 
 _SOURCE = re.compile(r"\bsource\b", re.I)
 
@@ -76,6 +77,11 @@ def open_views(
 
 
 def needed_views(query: str) -> frozenset[str]:
-    """Return the views that a query may need; all, if it names none or asks about tables."""
-    named = views_in(query, VIEWS)
-    return VIEWS if not named or _ABOUT_ALL_VIEWS.search(query) else named
+    """Return the views that a query may need.
+
+    All if it is about tables, or reads a table of another name: its error suggests one of them.
+    """
+    if _ABOUT_ALL_VIEWS.search(query):
+        return VIEWS
+    views = views_in(query, VIEWS)
+    return VIEWS if not views and _READS_TABLE.search(query) else views

@@ -297,7 +297,7 @@ class Fleet:
             figures.rows = 0
             warehouse = for_workers(self.warehouse, executor)
             uses_cache = from_folders or replace == "corrected"
-            cache = IngestCache.of(self.warehouse, mapping) if uses_cache else None
+            cache = IngestCache.load(self.warehouse, mapping) if uses_cache else None
             new_logs = logs if cache is None else cache.without_landed(logs, warehouse)
             if skipped := len(logs) - len(new_logs):
                 count(skipped, len(logs))

@@ -17,7 +17,7 @@ from fleet_slip.models.registry import CANDIDATE
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, NightStep, State
 from fleet_slip.storage.runs import step
 from fleet_slip.warehouse.predicate import hash_drive
-from fleet_slip.warehouse.warehouse import connect_tables, gram_snapshots
+from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet

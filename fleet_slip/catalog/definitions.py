@@ -384,10 +384,6 @@ class Definition(Config):
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
 
-for one in (Gate, ParameterFactor, Combination, Product, Equation, Slope):
-    one.model_rebuild()
-
-
 def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition:
     """Return the definition of a signal, or of a feature of so many bits, as a column itself."""
     return Definition.model_construct(of=name, sql=sql, of_bits=bits, bits=bits)

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray, Hashes, IntArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
@@ -33,7 +33,6 @@ from fleet_slip.grams.folding import (
     assign_folds,
     require_blocks,
 )
-from fleet_slip.grams.gram_files import Hashes
 from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.drives import (
     ClusterUnit,

@@ -11,9 +11,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
-from numpy.typing import NDArray
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray, Hashes, IntArray
 from fleet_slip.catalog.course import COURSE_LATE
 from fleet_slip.catalog.drive_sources import RECEIVED_FILES
 from fleet_slip.catalog.features import PLAIN
@@ -31,9 +30,6 @@ from fleet_slip.warehouse.gram_rows import (
     rows_of_set,
 )
 from fleet_slip.warehouse.warehouse import Warehouse
-
-Hashes = NDArray[np.uint64]
-"""The first 8 bytes of the SHA-256 of ids of drives or cars."""
 
 
 def hash_names(ids: pa.Array | pa.ChunkedArray) -> Hashes:

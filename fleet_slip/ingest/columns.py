@@ -61,12 +61,12 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
         name = _POWER.sub(r"^\1", name)
     try:
         root = registry.Quantity(1.0, name).to_root_units()
-        wanted = registry.Quantity(1.0, si_unit).to_root_units()
+        target = registry.Quantity(1.0, si_unit).to_root_units()
     except (pint.PintError, ValueError, TypeError, AttributeError):
         raise ValueError(f"has the unknown unit {unit!r}; {needs}") from None
-    if root.units != wanted.units:
+    if root.units != target.units:
         raise ValueError(f"is in {unit!r}, {needs}")
-    return float(root.magnitude) / float(wanted.magnitude)
+    return float(root.magnitude) / float(target.magnitude)
 
 
 def measures(unit: str, si_unit: str) -> bool:
@@ -183,8 +183,13 @@ def split_components(signals: Any) -> Any:
 
 def require_satellites(signals: Named[str, SignalColumn]) -> None:
     """Raise `ValueError` unless the course, if there is one, comes with all that it needs."""
-    for name, one in signals.items():
-        keys = (one.clockwise_from_north, one.antenna_x_m, one.antenna_y_m, one.component)
+    for name, signal in signals.items():
+        keys = (
+            signal.clockwise_from_north,
+            signal.antenna_x_m,
+            signal.antenna_y_m,
+            signal.component,
+        )
         if name not in {COURSE, SATELLITE_SPEED} and any(key is not None for key in keys):
             raise ValueError(f"signals.{name}: antenna and direction are keys of the course")
     course = signals.get(COURSE)
@@ -395,8 +400,8 @@ class RowCondition(Config):
     @property
     def bounds(self) -> dict[str, float]:
         """The limits that are given, by their key."""
-        given = {key: getattr(self, key) for key in _BOUNDS}
-        return {key: bound for key, bound in given.items() if bound is not None}
+        bounds = {key: getattr(self, key) for key in _BOUNDS}
+        return {key: bound for key, bound in bounds.items() if bound is not None}
 
     def is_met(self, value: pl.Expr) -> pl.Expr:
         """Return whether a row meets it, given a text where it is one of some, else a number."""
@@ -409,8 +414,8 @@ class RowCondition(Config):
 def describe(conditions: Sequence[RowCondition]) -> str:
     """Return conditions as a message shows them."""
     texts = []
-    for one in conditions:
-        said = one.model_dump(exclude_defaults=True, exclude={"column", "signal"})
-        parts = [f"{key.replace('_', ' ')} {value}" for key, value in said.items()]
-        texts.append(f"{one.column or one.signal!r} is {' and '.join(parts)}")
+    for condition in conditions:
+        fields = condition.model_dump(exclude_defaults=True, exclude={"column", "signal"})
+        parts = [f"{key.replace('_', ' ')} {value}" for key, value in fields.items()]
+        texts.append(f"{condition.column or condition.signal!r} is {' and '.join(parts)}")
     return " and ".join(texts)

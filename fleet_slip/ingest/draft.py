@@ -220,6 +220,6 @@ def _table(name: str, keys: dict[str, Any]) -> str:
 def _value(value: object) -> str:
     """Return a TOML value; its strings are those of JSON."""
     if isinstance(value, dict):
-        text = ", ".join(f"{key} = {_value(one)}" for key, one in value.items())
+        text = ", ".join(f"{key} = {_value(item)}" for key, item in value.items())
         return f"{{ {text} }}"
     return json.dumps(value, ensure_ascii=False)

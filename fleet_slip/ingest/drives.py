@@ -12,9 +12,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.catalog.counts import digest_counts, round_chunks
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.drive_sources import MEASURED
-from fleet_slip.catalog.signals import digest_counts, round_chunks
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.formats.source import EARLIEST_S
@@ -113,10 +113,10 @@ class DriveCutter:
         first, end = _ends(group)
         before = np.concatenate([[np.nan], time[:-1]])
         before[first] = self._state["last"][group[first]]
-        far = ~(np.abs(time - before) <= self._gap_s)
-        far_next = np.concatenate([far[1:], [True]])
+        is_far = ~(np.abs(time - before) <= self._gap_s)
+        far_next = np.concatenate([is_far[1:], [True]])
         far_next[end] = True
-        alone = far & far_next
+        alone = is_far & far_next
         waiting = np.zeros(alone.size, dtype=np.bool_)
         if not last:
             waiting[end] = alone[end]
@@ -126,7 +126,7 @@ class DriveCutter:
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
         known_at = np.concatenate([number[1:], [np.inf]])
         known_at[end] = np.inf
-        return alone, waiting, np.where(far, known_at, number)
+        return alone, waiting, np.where(is_far, known_at, number)
 
     def _number_parts(
         self, rows: pl.DataFrame, known_at: FloatArray
@@ -177,12 +177,12 @@ def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
     """Return the median time between two rows of each time base; the only one is number 0."""
     several = "base" in rows.columns
     bases = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
-    found = {}
+    intervals_s = {}
     for (number,), base in bases.items():
         step_s, part = np.diff(base["time"].to_numpy()), base["part"].to_numpy()
         median = pl.Series(step_s[part[1:] == part[:-1]]).median()
-        found[number] = median if isinstance(median, float) and median else STEP_S
-    return found
+        intervals_s[number] = median if isinstance(median, float) and median else STEP_S
+    return intervals_s
 
 
 def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
@@ -212,10 +212,10 @@ _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "co
 
 @dataclass(frozen=True)
 class MeasuredDrive:
-    """One uninterrupted stretch of a file on ticks.
+    """An uninterrupted segment of a file on ticks.
 
     Attributes:
-        metadata: what is known of it, by column of `logs`.
+        metadata: values by column of `logs`.
         counts: an int16 array for each signal.
     """
 
@@ -227,14 +227,14 @@ class MeasuredDrive:
 
     @cached_property
     def counts_digest(self) -> str:
-        """Fingerprint of its counts."""
+        """The digest of its counts."""
         car, day = str(self.metadata["vehicle_id"]), str(self.metadata["day"])
         return digest_counts(car, day, self.ticks, self.counts)
 
 
-def drive_id(prefix: str, group: int, stretch: int = 1) -> str:
-    """Return the name of the n-th stretch (from 1) of the drive with this number (from 0)."""
-    return f"{prefix}-{group + 1}" + (f"-{stretch}" if stretch > 1 else "")
+def drive_id(prefix: str, group: int, segment: int = 1) -> str:
+    """Return the name of the n-th segment (from 1) of the drive with this number (from 0)."""
+    return f"{prefix}-{group + 1}" + (f"-{segment}" if segment > 1 else "")
 
 
 def to_ticks(
@@ -242,16 +242,16 @@ def to_ticks(
     mapping: Mapping,
     intervals_s: dict[int, float],
     name: str,
-    known: dict[str, Any],
+    metadata_of_drive: dict[str, Any],
 ) -> MeasuredDrive:
     """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
 
     Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
-    the samples of each time base; `known` is what is known of the drive, by column of `logs`.
-    Raises `InputError` for what nobody says.
+    the samples of each time base; `metadata_of_drive` has values by column of `logs`. Raises
+    `InputError` for missing metadata.
     """
     start_s = rows.start_s
-    resampler = _resampler_of(rows, intervals_s, whole=COURSE in mapping.signals)
+    resampler = _resampler_of(rows, intervals_s, fill_gaps=COURSE in mapping.signals)
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
@@ -261,8 +261,8 @@ def to_ticks(
             values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
         else:
             samples = rows.samples(signal)
-            own = _on_own_times(rows, signal, samples, resampler, intervals_s)
-            values = [_resample(samples[signal].to_numpy(), own, signal, mapping)]
+            on_own_times = _on_own_times(rows, signal, samples, resampler, intervals_s)
+            values = [_resample(samples[signal].to_numpy(), on_own_times, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, mapping.signal_catalog[signal])
     if COURSE in mapping.signals:
@@ -280,10 +280,10 @@ def to_ticks(
         elif not somewhere.all():
             somewhere |= pl.Series(counts[signal]).is_not_null().to_numpy()
     if not somewhere.all():
-        kept = pl.Series(somewhere).to_arrow()
-        counts = {key: array.filter(kept) for key, array in counts.items()}
+        is_present = pl.Series(somewhere).to_arrow()
+        counts = {key: array.filter(is_present) for key, array in counts.items()}
         ticks = ticks[somewhere]
-    metadata = _metadata(name, known, start_s, mapping)
+    metadata = _metadata(name, metadata_of_drive, start_s, mapping)
     if len(ticks):
         metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
     return MeasuredDrive(name, metadata, method, ticks, counts)
@@ -324,17 +324,17 @@ def _resample(
     return _on_the_circle(resample, values) if is_label else resample(values)
 
 
-def _resampler_of(rows: DriveRows, intervals_s: dict[int, float], *, whole: bool) -> Resampler:
-    """Return what says the ticks of a drive, and brings its signals there if they share times.
+def _resampler_of(rows: DriveRows, intervals_s: dict[int, float], *, fill_gaps: bool) -> Resampler:
+    """Return the resampler that has the ticks of a drive; it resamples signals of one time base.
 
-    A `whole` drive is one without missing ticks where gaps are short: a lost sample, of which some
-    loggers have one in a hundred, would leave no seconds in which the yaw rate adds up.
+    With `fill_gaps` ticks in short gaps are interpolated: some loggers lose one sample in a
+    hundred, which would leave no whole second over which to integrate the yaw rate.
     """
     if len(intervals_s) == 1:
         (interval_s,) = intervals_s.values()
         time_s = rows.column("time").to_numpy() - rows.start_s
         resampler = build_resampler(time_s, choose_method(time_s, interval_s))
-        if whole and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
+        if fill_gaps and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
             return build_resampler(time_s, "interpolate")
         return resampler
     return build_resampler(np.array([0.0, rows.end_s - rows.start_s]), "interpolate")
@@ -347,8 +347,12 @@ def _on_own_times(
     ticks: Resampler,
     intervals_s: dict[int, float],
 ) -> Resampler:
-    """Return what brings the samples of a signal, of one of several bases, onto a drive's ticks."""
-    of_base = (intervals_s[base] for base, some in rows.bases.items() if signal in some.columns)
+    """Return the resampler from a signal's own times to the ticks of its drive."""
+    of_base = (
+        intervals_s[base]
+        for base, rows_of_base in rows.bases.items()
+        if signal in rows_of_base.columns
+    )
     fast = next(of_base, STEP_S) < STEP_S - SNAP_TOLERANCE_S
     time_s = samples["time"].to_numpy() - rows.start_s
     return replace(ticks, time_s=time_s, method="average" if fast else "interpolate")
@@ -366,20 +370,20 @@ def _on_the_circle(resample: Callable[[FloatArray], FloatArray], angle: FloatArr
 def _metadata(
     name: str, of_drive: dict[str, Any], start_s: float, mapping: Mapping
 ) -> dict[str, Any]:
-    """Return what is known of a drive, by column of `logs`. Raises `InputError`."""
-    given = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
-    known = {key: value for key, value in given.items() if not isinstance(value, FromColumn)}
-    if given["day"] is None:  # then time is in timestamps, or those of the file's own clock
+    """Return the metadata of a drive, by column of `logs`. Raises `InputError`."""
+    stated = {key: getattr(mapping.drive, key) for key in _FROM_MAPPING}
+    metadata = {key: value for key, value in stated.items() if not isinstance(value, FromColumn)}
+    if stated["day"] is None:  # then time is in timestamps, or those of the file's own clock
         if mapping.time.own_clock and start_s < EARLIEST_S:
             raise InputError("its clock has no date. Give it in the mapping: drive.day.")
-        known["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
-    known |= of_drive
+        metadata["day"] = date.fromordinal(_EPOCH.toordinal() + int(start_s // _SECONDS_PER_DAY))
+    metadata |= of_drive
     dated = mapping.time.is_dated and start_s >= EARLIEST_S
     return {
-        **known,
+        **metadata,
         "started_at": _EPOCH + timedelta(seconds=start_s) if dated else None,  # to the microsecond
         "drive_id": name,
         "source": MEASURED,
         "campaign": mapping.name,
-        "saturated": 0,  # what is outside its range is quarantined, not clipped
+        "saturated": 0,  # values outside their range are quarantined, not clipped
     }

@@ -127,8 +127,8 @@ def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, G
         yield score + fits, replace(guess, is_weak=weak)
 
 
-def _same_values(one: Guess, other: Guess) -> bool:
-    a, b = one.profile.values, other.profile.values
+def _same_values(first: Guess, second: Guess) -> bool:
+    a, b = first.profile.values, second.profile.values
     if a.size != b.size:
         return False
     both = np.isfinite(a) & np.isfinite(b)
@@ -138,32 +138,34 @@ def _same_values(one: Guess, other: Guess) -> bool:
 
 def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
     """Return the guesses with the course as a mapping has it, or without it."""
-    found = dict(guesses)
-    north, east = found.pop("north", None), found.pop("east", None)
-    course, speed = found.get(COURSE), found.get(SATELLITE_SPEED)
+    result = dict(guesses)
+    north, east = result.pop("north", None), result.pop("east", None)
+    course, speed = result.get(COURSE), result.get(SATELLITE_SPEED)
     if north and east and north.keys == east.keys:
-        found[COURSE] = replace(north, signal=COURSE, keys={**north.keys, "component": "north"})
+        result[COURSE] = replace(north, signal=COURSE, keys={**north.keys, "component": "north"})
         keys = {**east.keys, "component": "east"}
-        found[SATELLITE_SPEED] = replace(east, signal=SATELLITE_SPEED, keys=keys)
+        result[SATELLITE_SPEED] = replace(east, signal=SATELLITE_SPEED, keys=keys)
     elif course and speed:
         reason = "clockwise from north, as receivers give it"
-        found[COURSE] = course.because(reason, clockwise_from_north=True)
-    if "yaw_rate" not in found or not {COURSE, SATELLITE_SPEED} <= set(found):
-        found.pop(COURSE, None)
-        alone = found.pop(SATELLITE_SPEED, None)
+        result[COURSE] = course.because(reason, clockwise_from_north=True)
+    if "yaw_rate" not in result or not {COURSE, SATELLITE_SPEED} <= set(result):
+        result.pop(COURSE, None)
+        alone = result.pop(SATELLITE_SPEED, None)
         if alone and not alone.component:
-            found.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
-    return found
+            result.setdefault("vehicle_speed", replace(alone, signal="vehicle_speed"))
+    return result
 
 
 def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
     """Return a magnitude with the column of its sign, where another is called so."""
     if guess.signal not in TURNING or guess.profile.range[0] < 0:
         return guess
-    own = sorted(parts_of(split_unit(guess.column)[0]))
+    words_of_name = sorted(parts_of(split_unit(guess.column)[0]))
     for other in profiles:
         parts = parts_of(split_unit(other.channel.name)[0])
-        if sorted(p for p in parts if p not in _SIGN_WORDS) != own or len(parts) == len(own):
+        if sorted(p for p in parts if p not in _SIGN_WORDS) != words_of_name or len(parts) == len(
+            words_of_name
+        ):
             continue
         values = sorted({float(v) for v in np.unique(other.values[np.isfinite(other.values)])[:3]})
         if len(values) == 2 and all(value.is_integer() for value in values):
@@ -263,19 +265,19 @@ class TimeGuess:
 
 def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], NDArray[np.int64]]:
     """Return the columns of cars and trips by key of `[drive]`, and a number for each row's."""
-    found: dict[str, dict[str, str]] = {}
+    keys: dict[str, dict[str, str]] = {}
     group = np.zeros(0, dtype=np.int64)
     for key, words in vocabulary()["cars"].items():
-        for one in profiles:
-            if not one.keys.size or not is_called(words, one.channel.name):
+        for profile in profiles:
+            if not profile.keys.size or not is_called(words, profile.channel.name):
                 continue
-            if np.unique(one.keys).size > min(_MOST_CARS, max(one.keys.size // 20, 1)):
+            if np.unique(profile.keys).size > min(_MOST_CARS, max(profile.keys.size // 20, 1)):
                 continue
-            found[key] = {"drive" if key == "column" else "column": one.channel.name}
-            if not group.size or group.size == one.keys.size:
-                group = one.keys + (one.keys.max() + 1) * (group if group.size else 0)
+            keys[key] = {"drive" if key == "column" else "column": profile.channel.name}
+            if not group.size or group.size == profile.keys.size:
+                group = profile.keys + (profile.keys.max() + 1) * (group if group.size else 0)
             break
-    return found, group
+    return keys, group
 
 
 def guess_time(
@@ -284,21 +286,25 @@ def guess_time(
     """Return where time is from; of several cars in turns, that of the first is looked at."""
     if profile.has_clock:
         return TimeGuess({"own_clock": True}, "the file says when each sample was taken", None)
-    found, known = [], set(vocabulary()["time"]["words"])
-    for one in profile.profiles:
-        values = one.values[group == group[0]] if group.size == one.values.size > 0 else one.values
-        words = parts_of(split_unit(one.channel.name)[0]) if one.is_number else ()
-        named = one.time_format is not None or not known.isdisjoint(words)
-        if not named or one.channel.name in taken or one.channel.base not in bases:
+    candidates, time_words = [], set(vocabulary()["time"]["words"])
+    for candidate in profile.profiles:
+        values = (
+            candidate.values[group == group[0]]
+            if group.size == candidate.values.size > 0
+            else candidate.values
+        )
+        words = parts_of(split_unit(candidate.channel.name)[0]) if candidate.is_number else ()
+        named = candidate.time_format is not None or not time_words.isdisjoint(words)
+        if not named or candidate.channel.name in taken or candidate.channel.base not in bases:
             continue
         values = values[np.isfinite(values)]
         steps = np.diff(values)
         if steps.size and (steps >= 0).mean() >= _LEAST_RISING:
-            found.append((float((steps > 0).mean()), one, values))
-    if found:
-        _, one, values = max(found, key=lambda some: round(some[0], 2))
-        is_text = one.time_format is not None
-        guess = _timestamps(one, values) if is_text else _numbers(one, values)
+            candidates.append((float((steps > 0).mean()), candidate, values))
+    if candidates:
+        _, candidate, values = max(candidates, key=lambda item: round(item[0], 2))
+        is_text = candidate.time_format is not None
+        guess = _timestamps(candidate, values) if is_text else _numbers(candidate, values)
         written = guess.keys.get("format")
         if written and reads_clock(written):
             beside = (other for other in profile.profiles if other.channel.name not in taken)
@@ -312,16 +318,19 @@ def guess_time(
 def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:
     """Return a time of the day with the column of dates beside it, if there is one."""
     words = set(vocabulary()["time"]["date_words"])
-    for one in profiles:
-        if words.isdisjoint(parts_of(one.channel.name)) or one.channel.name == guess.keys["column"]:
+    for profile in profiles:
+        if (
+            words.isdisjoint(parts_of(profile.channel.name))
+            or profile.channel.name == guess.keys["column"]
+        ):
             continue
-        numbers = one.values[np.isfinite(one.values)]
-        texts = one.texts or tuple(f"{number:06.0f}" for number in np.unique(numbers)[:3])
+        numbers = profile.values[np.isfinite(profile.values)]
+        texts = profile.texts or tuple(f"{number:06.0f}" for number in np.unique(numbers)[:3])
         fits = [written for written in vocabulary()["time"]["dates"] if _are_dates(texts, written)]
-        if not fits or (one.time_format and "%d" in one.time_format):
+        if not fits or (profile.time_format and "%d" in profile.time_format):
             continue
-        dates = {"column": one.channel.name, "format": fits[0]}
-        reason = f"{guess.reason}, and {one.channel.name} the date"
+        dates = {"column": profile.channel.name, "format": fits[0]}
+        reason = f"{guess.reason}, and {profile.channel.name} the date"
         if len(fits) > 1:
             reason += f"; if the month comes first, write {fits[1]}"
         return replace(guess, keys={**guess.keys, "date": dates}, reason=reason)
@@ -334,35 +343,35 @@ def _are_dates(texts: tuple[str, ...], written: str) -> bool:
     return bool(texts) and all(day and date(1990, 1, 1) <= day < date(2100, 1, 1) for day in days)
 
 
-def _timestamps(one: Profile, values: FloatArray) -> TimeGuess:
+def _timestamps(profile: Profile, values: FloatArray) -> TimeGuess:
     rate_hz = sample_rate_hz(values)
-    keys: dict[str, Any] = {"column": one.channel.name}
-    if one.time_format:
-        keys["format"] = one.time_format
+    keys: dict[str, Any] = {"column": profile.channel.name}
+    if profile.time_format:
+        keys["format"] = profile.time_format
     keys |= _gaps(rate_hz)
     reason = "it has timestamps"
-    if not one.time_format or "%z" not in one.time_format:
+    if not profile.time_format or "%z" not in profile.time_format:
         reason += '; without a zone they are UTC, else write zone = "Europe/Berlin"'
     return TimeGuess(keys, reason, rate_hz)
 
 
-def _numbers(one: Profile, present: FloatArray) -> TimeGuess:
-    name, in_brackets = split_unit(one.channel.name)
+def _numbers(profile: Profile, present: FloatArray) -> TimeGuess:
+    name, in_brackets = split_unit(profile.channel.name)
     if _is_clock(present):
         seconds = present // 10000 * 3600 + present // 100 % 100 * 60 + present % 100
         rate_hz = sample_rate_hz(seconds)
-        clock = {"column": one.channel.name, "format": "%H%M%S%.f", **_gaps(rate_hz)}
+        clock = {"column": profile.channel.name, "format": "%H%M%S%.f", **_gaps(rate_hz)}
         return TimeGuess(clock, "its digits are hours, minutes and seconds of the day", rate_hz)
     step = float(np.median(np.diff(present)))
     ends = parts_of(name)[-1]
-    named = _UNITS.get((one.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
+    named = _UNITS.get((profile.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
     since_1970 = [u for u, s in _SECONDS.items() if _EPOCH_S[0] < present[0] * s < _EPOCH_S[1]]
     likely = [*since_1970, *(name for limit, name in _STEPS if step < limit)]
     unit = named or likely[0]
     reason = f"its name; it increases in steps of {step:g}"
     reason += f"; its unit is {named}" if named else ""
     rate_hz = sample_rate_hz(present * _SECONDS[unit])
-    keys: dict[str, Any] = {"column": one.channel.name, "unit": unit}
+    keys: dict[str, Any] = {"column": profile.channel.name, "unit": unit}
     if unit in since_1970:
         keys["epoch"] = True
         day = datetime.fromtimestamp(float(present[0]) * _SECONDS[unit], UTC).date()

@@ -22,7 +22,8 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, pluralize
-from fleet_slip.catalog.signals import SignalCatalog, as_arrow
+from fleet_slip.catalog.counts import as_arrow
+from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.drives import MeasuredDrive, drive_id
@@ -379,7 +380,7 @@ class _Writer:
         is_new = self._lacks("logs", digest)
         for name, data in self.data.items():
             data.begin_log(digest, is_new=is_new and self._lacks(name, digest))
-        fingerprints = {f"{PREFIX}{stream.content[:16]}": SourceRef.of(digest).number}
+        fingerprints = {f"{PREFIX}{stream.content[:16]}": SourceRef.of_file(digest).number}
         left_out, ticks = set[str](), 0
         for drives in _groups(stream.drives()):
             accepted = drop_erased_drives(
@@ -405,8 +406,10 @@ class _Writer:
             written.fingerprints = fingerprints if ticks else {}
             is_there = task.earlier and self._landed["logs"](FILES + task.earlier)
             earlier = task.earlier if is_there else None
-            found = self._same.find(task.file, digest, written.fingerprints, stream.name, earlier)
-            written.same, written.replaced, report.drives_replaced = found
+            duplicates = self._same.find(
+                task.file, digest, written.fingerprints, stream.name, earlier
+            )
+            written.same, written.replaced, report.drives_replaced = duplicates
         return written
 
 

@@ -21,19 +21,19 @@ class StrayLink(PosixPath):
     """A file found behind a link out of a folder: who fills it may not choose what is read."""
 
 
-def find_logs(given: Iterable[Path | str]) -> list[Path]:
+def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     """Return files as they are given, and those in folders that have the suffix of a log, sorted.
 
     What is not a path may be a pattern such as `2024-*/*.mf4`, given in quotes. Hidden files and
     folders are passed over. Raises `InputError` for a folder or a pattern without any.
     """
-    for place in given:
+    for place in paths:
         if "://" in str(place):
             raise InputError(
                 "logs are files of this machine. Copy those of an object store first, such as by: "
                 "aws s3 sync URL FOLDER"
             )
-    return [file for place in given for file in _files_of(Path(place))]
+    return [file for place in paths for file in _files_of(Path(place))]
 
 
 def _files_of(path: Path) -> list[Path]:
@@ -43,7 +43,7 @@ def _files_of(path: Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     real = path.resolve()
-    tables = [path / "logs", *(one for one in (real, *real.parents) if one.name == "logs")]
+    tables = [path / "logs", *(parent for parent in (real, *real.parents) if parent.name == "logs")]
     if any((table / "_delta_log").is_dir() for table in tables):
         raise InputError(
             f"{quote_name(path)}: part of a data root, whose logs are stored already. Name the "

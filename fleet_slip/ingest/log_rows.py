@@ -97,8 +97,8 @@ def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     raw = pl.col(RAW + column)
     text = raw.cast(pl.String)
     if schema[RAW + column] == pl.Float64:
-        whole = raw.cast(pl.Int64, strict=False)
-        text = pl.when(whole == raw).then(whole.cast(pl.String)).otherwise(text)
+        integer = raw.cast(pl.Int64, strict=False)
+        text = pl.when(integer == raw).then(integer.cast(pl.String)).otherwise(text)
     return without_missing(text, mapping)
 
 
@@ -237,21 +237,21 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
 
 def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
-    met = []
+    predicates = []
     for condition in mapping.where:
-        of = condition.signal
+        signal = condition.signal
         name = find_held(
-            str(condition.column if of is None else mapping.signals[of].column), schema
+            str(condition.column if signal is None else mapping.signals[signal].column), schema
         )
-        if of is not None:
-            source = mapping.signals[of]
-            value = _si_value(mapping, of, source, _signed(source, name, schema, mapping)[0])
+        if signal is not None:
+            source = mapping.signals[signal]
+            value = _si_value(mapping, signal, source, _signed(source, name, schema, mapping)[0])
         elif condition.one_of:
             value = as_text(name, schema, mapping)
         else:
             value = as_number(name, schema, mapping)[0]
-        met.append(condition.is_met(value))
-    return pl.all_horizontal(met)
+        predicates.append(condition.is_met(value))
+    return pl.all_horizontal(predicates)
 
 
 def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> RowField:
@@ -263,9 +263,9 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
-    (signal, least, most), value = count_range(mapping.signal_catalog, name, source), pl.col(name)
+    (signal, low, high), value = count_range(mapping.signal_catalog, name, source), pl.col(name)
     count = value / float(signal.scale)
-    outside = (count <= least - 0.5) | (count >= most + 0.5)
+    outside = (count <= low - 0.5) | (count >= high + 0.5)
     problem = _number_problems(name, present, (outside, "out_of_range"))
     return RowField(name, "signal", raw, _si_value(mapping, name, source, number), problem)
 
@@ -442,22 +442,22 @@ class DriveKeys:
 def _split(batch: pl.DataFrame, fields: list[RowField]) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split a batch into good rows, in SI units, and bad ones, by the first problem of each."""
     values = [field.name for field in fields if field.kind in {"time", "signal"}]
-    kept = ["row", "group", *({"base"} & set(batch.columns)), *values]
+    columns = ["row", "group", *({"base"} & set(batch.columns)), *values]
     codes = pl.coalesce(field.problem + len(REASONS) * i for i, field in enumerate(fields))
     checked = batch.with_columns(codes.alias(_PROBLEM))
     if checked[_PROBLEM].null_count() == checked.height:
-        return batch.select(kept), no_rows()
-    good = checked.filter(pl.col(_PROBLEM).is_null()).select(kept)
+        return batch.select(columns), no_rows()
+    good = checked.filter(pl.col(_PROBLEM).is_null()).select(columns)
     bad = checked.filter(pl.col(_PROBLEM).is_not_null())
     explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
     return good, pl.concat([no_rows(), *explained])
 
 
-def describe_refused(rows: pl.DataFrame, which: BoolArray | None, reason: str) -> pl.DataFrame:
+def describe_refused(rows: pl.DataFrame, mask: BoolArray | None, reason: str) -> pl.DataFrame:
     """Return rows as bad ones, because of their time: those of a mask, or all."""
-    if which is not None and not which.any():
+    if mask is not None and not mask.any():
         return no_rows()
-    bad = rows if which is None else rows.filter(pl.Series(which))
+    bad = rows if mask is None else rows.filter(pl.Series(mask))
     return bad.select(
         pl.col("row"),
         pl.col("group"),

@@ -278,20 +278,26 @@ class Mapping(Config):
 
     def for_file(self, file: Path) -> "Mapping":
         """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
-        given = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
-        found = {name: one.find(file) for name, one in given.items() if isinstance(one, FromPath)}
-        if not found:
+        stated = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
+        from_path = {
+            name: item.find(file) for name, item in stated.items() if isinstance(item, FromPath)
+        }
+        if not from_path:
             return self
         try:
-            drive = DriveMetadata.model_validate({**given, **found}, context=self._signal_catalog)
+            drive = DriveMetadata.model_validate(
+                {**stated, **from_path}, context=self._signal_catalog
+            )
         except ValidationError as error:
             raise InputError(f"{quote_name(file)}: drive: {faults_of(error)}") from None
         return self.model_copy(update={"drive": drive})
 
     def time_bases(self) -> dict[str | None, list[str]]:
         """Return the columns that the mapping uses, each once, by the column of their times."""
-        own = {s.column for s in self.signals.values() if s.time not in {None, self.time.column}}
-        common = [name for name in self.common_columns() if name not in own]
+        with_own_time = {
+            s.column for s in self.signals.values() if s.time not in {None, self.time.column}
+        }
+        common = [name for name in self.common_columns() if name not in with_own_time]
         bases = {self.time.column: [self.time.column, *common]}
         for signal in self.signals.values():
             time = self.time.column if signal.time is None else signal.time
@@ -308,8 +314,8 @@ class Mapping(Config):
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
         names += [self.time.date.column] if self.time.date else []
         for condition in self.where:
-            of = condition.signal
-            names.append(condition.column if of is None else self.signals[of].column)
+            signal = condition.signal
+            names.append(condition.column if signal is None else self.signals[signal].column)
         names += [signal.sign.column for signal in self.signals.values() if signal.sign]
         return list(dict.fromkeys(name for name in names if name is not None))
 
@@ -377,7 +383,9 @@ ASSUMPTIONS = "assumptions"
 def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return what stands for whatever a mapping does not say, each with the key that says it."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
-    wheels = {name: one.radius_m for name, one in signals.items() if name.startswith(WHEEL_PREFIX)}
+    wheels = {
+        name: signal.radius_m for name, signal in signals.items() if name.startswith(WHEEL_PREFIX)
+    }
     label, course = signals.get(mapping.signal_catalog.label), signals.get(COURSE)
     labelled = mapping.signal_catalog.label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere
@@ -403,9 +411,9 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
 
 def keep_assumptions(root: Folder, mapping: Mapping) -> None:
     """Write down what a mapping of drives leaves open, unless it was the same before."""
-    kept, found = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
-    if found != _newest(kept):
-        kept.append({"assumed": found})
+    folder, assumed = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
+    if assumed != _newest(folder):
+        folder.append({"assumed": assumed})
 
 
 def kept_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:

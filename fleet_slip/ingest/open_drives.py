@@ -55,11 +55,11 @@ class DriveRows:
 
     def samples(self, name: str) -> pl.DataFrame:
         """Return `time` and a signal where it has a value, by time."""
-        some = [rows.select("time", name) for rows in self.bases.values() if name in rows.columns]
-        if not some:
+        frames = [rows.select("time", name) for rows in self.bases.values() if name in rows.columns]
+        if not frames:
             return pl.DataFrame(schema={"time": pl.Float64, name: pl.Float64})
-        found = pl.concat(some).drop_nulls(name)
-        return found if found["time"].is_sorted() else found.sort("time", maintain_order=True)
+        samples = pl.concat(frames).drop_nulls(name)
+        return samples if samples["time"].is_sorted() else samples.sort("time", maintain_order=True)
 
 
 class OpenDrives:
@@ -96,25 +96,25 @@ class OpenDrives:
 
     def _take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
         for start in range(0, len(parts), MOST_PARTS):
-            some = parts[start : start + MOST_PARTS]
-            found = self._let_go(some)
-            for part in some:
+            chunk = parts[start : start + MOST_PARTS]
+            rows_in_memory = self._let_go(chunk)
+            for part in chunk:
                 self._group_of.pop(part, None)
                 put_aside = map(pl.read_ipc_stream, self._spool.take(part))
-                if pieces := [*put_aside, *found[part]]:
+                if pieces := [*put_aside, *rows_in_memory[part]]:
                     yield DriveRows(_by_base(pieces))
 
     def _let_go(self, parts: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
         """Take the rows of parts out of memory."""
-        found = defaultdict[int, list[pl.DataFrame]](list)
-        mine = pl.col("part").is_in(parts)
+        rows_of_part = defaultdict[int, list[pl.DataFrame]](list)
+        is_taken = pl.col("part").is_in(parts)
         for _ in range(len(self._blocks)):
             rows = self._blocks.pop(0)
-            for run in rows.filter(mine).partition_by("part", maintain_order=True):
-                found[run["part"][0]].append(run)
+            for run in rows.filter(is_taken).partition_by("part", maintain_order=True):
+                rows_of_part[run["part"][0]].append(run)
             self._in_memory -= rows.height * rows.width
-            self.add(rows.filter(~mine))
-        return found
+            self.add(rows.filter(~is_taken))
+        return rows_of_part
 
     def _unbundled(self) -> Iterator[DriveRows]:
         """Yield the rows of all parts, bundle by bundle, and in each as the parts ended."""
@@ -161,6 +161,6 @@ def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
     bases = defaultdict[int, list[pl.DataFrame]](list)
     for piece in pieces:
         for rows in piece.drop("part").partition_by("base", maintain_order=True):
-            some = rows.select(column for column in rows if column.null_count() < rows.height)
-            bases[rows["base"][0]].append(some)
-    return {one: pl.concat(bases[one], how="diagonal") for one in sorted(bases)}
+            filled = rows.select(column for column in rows if column.null_count() < rows.height)
+            bases[rows["base"][0]].append(filled)
+    return {base: pl.concat(bases[base], how="diagonal") for base in sorted(bases)}

@@ -45,18 +45,18 @@ def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
     lines = first_lines(file, CsvFormat(encoding=encoding), _LINES)
     if not lines:
         return CsvFormat(encoding=encoding), {}
-    separator = max(_SEPARATORS, key=lambda one: _regularity(lines, one))
+    separator = max(_SEPARATORS, key=lambda candidate: _regularity(lines, candidate))
     rows = [_split(line, separator) for line in lines]
     header, data = _header_and_data(rows)
     fields = [field for row in rows[data:] for field in row]
-    given = CsvFormat(
+    layout = CsvFormat(
         separator=separator,
         decimal_comma=separator != "," and any(_DECIMAL_COMMA.fullmatch(f) for f in fields),
         encoding=encoding,
         header_line=header + 1,
         data_line=data + 1 if data > header + 1 else None,
     )
-    return given, _units(rows[header], rows[header + 1 : data])
+    return layout, _units(rows[header], rows[header + 1 : data])
 
 
 def _guess_encoding(file: Path) -> Encoding | None:
@@ -107,22 +107,22 @@ def _header_and_data(rows: list[list[str]]) -> tuple[int, int]:
     data = next((i for i, row in enumerate(rows) if len(row) == width and _is_data(row)), None)
     if not data:
         return 0, 1
-    header, found = data, 0
+    header, count = data, 0
     for place in range(data - 1, -1, -1):
         row = rows[place]
         if len(row) == width and sum(bool(field.strip()) for field in row) > width / 2:
-            header, found = place, found + 1
+            header, count = place, count + 1
         elif "".join(row).strip() and not re.fullmatch(r"\s*\[.*\]\s*", "".join(row)):
             break
-        if found == 3:
+        if count == 3:
             break
-    return (header, data) if found else (0, 1)
+    return (header, data) if count else (0, 1)
 
 
 def _is_data(row: list[str]) -> bool:
-    some = [field for field in row if field.strip()]
-    numbers = sum(_NUMBER.fullmatch(field) is not None for field in some)
-    return bool(some) and numbers >= max(len(some) / 2, 1)
+    filled = [field for field in row if field.strip()]
+    numbers = sum(_NUMBER.fullmatch(field) is not None for field in filled)
+    return bool(filled) and numbers >= max(len(filled) / 2, 1)
 
 
 def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
@@ -147,17 +147,19 @@ def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[f
     All as text, as a mapping has it under `missing`; and the numbers among them. A number that is a
     value in some channel is none of them.
     """
-    known = vocabulary()["missing"]
-    texts = [text for one in profiles for text in one.texts if text.lower() in known["texts"]]
+    markers = vocabulary()["missing"]
+    texts = [
+        text for profile in profiles for text in profile.texts if text.lower() in markers["texts"]
+    ]
     means_none: dict[float, bool] = {}
-    for one in profiles:
-        present = one.values[np.isfinite(one.values)]
-        is_known = np.isin(present, known["numbers"])
-        others = present[~is_known]
+    for profile in profiles:
+        present = profile.values[np.isfinite(profile.values)]
+        is_known = np.isin(present, markers["numbers"])
+        values = present[~is_known]
         for number in map(float, np.unique(present[is_known])):
-            is_none = others.size >= _FEWEST
+            is_none = values.size >= _FEWEST
             if is_none:
-                low, high = float(others.min()), float(others.max())
+                low, high = float(values.min()), float(values.max())
                 margin = _FAR * max(high - low, 1e-6)
                 is_none = number > high + margin or number < low - margin
             means_none[number] = is_none and means_none.get(number, True)
@@ -232,15 +234,17 @@ def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
             source.bases([channel.name for channel in channels])
         bases: dict[str, list[Channel]] = defaultdict(list)
         for channel in channels:
-            known = replace(channel, unit=channel.unit or units.get(channel.name, ""))
-            bases[channel.base].append(known)
+            with_unit = replace(channel, unit=channel.unit or units.get(channel.name, ""))
+            bases[channel.base].append(with_unit)
         refused: list[str] = []
-        found = tuple(
-            p for of in bases.values() for p in _profile_base(source, of, formats.csv, refused)
+        profiles = tuple(
+            p
+            for channels in bases.values()
+            for p in _profile_base(source, channels, formats.csv, refused)
         )
-        missing, numbers = find_absent([p for p in found if p.is_number])
-        without = (np.where(np.isin(p.values, numbers), np.nan, p.values) for p in found)
-        cleaned = tuple(replace(p, values=v) for p, v in zip(found, without, strict=True))
+        missing, numbers = find_absent([p for p in profiles if p.is_number])
+        without = (np.where(np.isin(p.values, numbers), np.nan, p.values) for p in profiles)
+        cleaned = tuple(replace(p, values=v) for p, v in zip(profiles, without, strict=True))
         reasons = tuple(dict.fromkeys(refused))
         return FileProfile(source.has_clock, formats, cleaned, missing, reasons)
 
@@ -288,10 +292,12 @@ def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: Cs
             return Profile(
                 channel, rate_hz, numbers.fill_null(np.nan).to_numpy(), tuple(odd), _keys(texts)
             )
-        some = tuple(texts.drop_nulls().unique(maintain_order=True)[:3])
+        examples = tuple(texts.drop_nulls().unique(maintain_order=True)[:3])
         if written := _time_format(texts):
-            return Profile(channel, rate_hz, _read_times(texts, written), some, time_format=written)
-        return Profile(channel, rate_hz, np.zeros(0), some, _keys(texts))
+            return Profile(
+                channel, rate_hz, _read_times(texts, written), examples, time_format=written
+            )
+        return Profile(channel, rate_hz, np.zeros(0), examples, _keys(texts))
     values = column.cast(pl.Float64).fill_null(np.nan)
     return Profile(channel, rate_hz, values.to_numpy(), keys=_keys(values))
 
@@ -305,9 +311,12 @@ def _keys(column: pl.Series) -> NDArray[np.int64]:
 
 def _time_format(texts: pl.Series) -> str | None:
     """Return the first format that all texts at the beginning have."""
-    some = texts.drop_nulls().head(_LOOKED_AT)
-    formats: list[str] = vocabulary()["time"]["formats"] if some.len() else []
-    return next((one for one in formats if np.isfinite(_read_times(some, one)).all()), None)
+    examples = texts.drop_nulls().head(_LOOKED_AT)
+    formats: list[str] = vocabulary()["time"]["formats"] if examples.len() else []
+    return next(
+        (candidate for candidate in formats if np.isfinite(_read_times(examples, candidate)).all()),
+        None,
+    )
 
 
 def _read_times(texts: pl.Series, written: str) -> FloatArray:

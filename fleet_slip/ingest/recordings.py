@@ -29,7 +29,8 @@ from fleet_slip.storage.table import (
     retry_conflicts,
 )
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 TableName: TypeAlias = Literal["quarantine", "logs"]
 Replace: TypeAlias = Literal["no", "corrected", "all"]
@@ -110,7 +111,7 @@ class SourceRef(NamedTuple):
     drive: int = 0
 
     @classmethod
-    def of(cls, digest: str) -> "SourceRef":
+    def of_file(cls, digest: str) -> "SourceRef":
         """Return the reference to a file with this digest."""
         return cls(digest[:DIGEST_CHARACTERS])
 
@@ -169,7 +170,7 @@ class Fingerprints:
             for name, number in self._numbers.items()
             if (source := SourceRef.of_number(number)) in sources or source.file in files
         ]
-        of_files = [n for n in self._files if SourceRef.of(n.removeprefix(FILES)) in files]
+        of_files = [n for n in self._files if SourceRef.of_file(n.removeprefix(FILES)) in files]
         return [AppTransaction(name, WITHDRAWN) for name in (*of_drives, *of_files)]
 
 
@@ -204,7 +205,7 @@ class IngestCache:
     digests: dict[str, tuple[int, int, str]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, warehouse: Warehouse, mapping: Mapping) -> "IngestCache":
+    def load(cls, warehouse: Warehouse, mapping: Mapping) -> "IngestCache":
         """Read the cache of a data root and a mapping."""
         about = sha256(f"{warehouse.root.uri}\n{mapping.canonical_json()}".encode()).hexdigest()
         cache = cache_folder("ingested") / f"{about[:32]}.json"
@@ -295,7 +296,7 @@ class DuplicateDetector:
         sources = self._logs_have.find(fingerprints)
         changed = earlier is not None and earlier != digest
         if earlier is not None and changed:
-            sources |= {SourceRef.of(earlier)}
+            sources |= {SourceRef.of_file(earlier)}
         stored = _drives_of(self._warehouse, {source.file for source in sources})
         replaced = _replaced(stored, sources, name)
         drives = [drive for drive in stored if is_from(drive, replaced)]
@@ -316,7 +317,7 @@ class DuplicateDetector:
                 f"{drives[0]}"
             )
         self._batch.update(fingerprints)
-        self._files[SourceRef.of(digest).digest] = log
+        self._files[SourceRef.of_file(digest).digest] = log
         return sources, replaced if drives else frozenset(), len(drives)
 
 
@@ -334,7 +335,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
     def attempt(table: Table) -> None:
         snapshot = table.snapshot()
-        if _drives_of(warehouse, {SourceRef.of(digest)}):
+        if _drives_of(warehouse, {SourceRef.of_file(digest)}):
             return
         if snapshot.landed(f"{FILES}{digest}") not in {None, WITHDRAWN}:
             transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
@@ -348,7 +349,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 def is_fully_erased(warehouse: Warehouse, digest: str) -> bool:
     """Return True if there are erasures and no drive of an ingested file is stored."""
     return bool(ErasureLog(warehouse.root).entries()) and not _drives_of(
-        warehouse, {SourceRef.of(digest)}
+        warehouse, {SourceRef.of_file(digest)}
     )
 
 

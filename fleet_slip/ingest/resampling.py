@@ -17,7 +17,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks
+from fleet_slip.catalog.counts import round_chunks
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
 from fleet_slip.quality.plausibility import RADIUS_M, SECOND, wrapped
@@ -66,8 +67,8 @@ def is_backwards(
     """
     second = np.ones(2 * round(0.5 / STEP_S) + 1)
     squares, products = (
-        np.convolve(np.nan_to_num(one), second)[second.size // 2 :][place]
-        for one in (yaw_rate**2, yaw_rate * ay)
+        np.convolve(np.nan_to_num(signal), second)[second.size // 2 :][place]
+        for signal in (yaw_rate**2, yaw_rate * ay)
     )
     turning = squares > second.size * LEAST_TURNING_RAD_S**2
     backwards: BoolArray = turning & (speed < BACKWARDS_MPS) & (products < -0.5 * speed * squares)
@@ -93,45 +94,45 @@ def on_grid(
     usual = float(np.median(np.diff(ticks[fixes])))
     spacing = min(GRIDS, key=lambda grid: abs(np.log(grid / usual)))
     chosen = ticks % spacing == 0
-    found = []
+    gridded = []
     for values in (slip, speed):
         placed = np.full(values.size, np.nan)
         placed[chosen] = _between(ticks, values, ticks[chosen])
-        found.append(placed)
-    return found[0] + heading, found[1]
+        gridded.append(placed)
+    return gridded[0] + heading, gridded[1]
 
 
 def find_ticks(
-    ticks: IntArray, wanted: IntArray | FloatArray
+    ticks: IntArray, values: IntArray | FloatArray
 ) -> tuple[NDArray[np.intp], BoolArray]:
     """Return where ticks are among others, which are in order, and whether they are at all."""
-    place = np.searchsorted(ticks, wanted)
-    found: BoolArray = place < ticks.size
-    found[found] = ticks[place[found]] == wanted[found]
-    return place, found
+    place = np.searchsorted(ticks, values)
+    exists: BoolArray = place < ticks.size
+    exists[exists] = ticks[place[exists]] == values[exists]
+    return place, exists
 
 
 def _is_regular(fixes: IntArray) -> bool:
     """Return whether most fixes that have one about a second later have one exactly then."""
     later = find_ticks(fixes, fixes + SECOND)[1]
     next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
-    there = next_one < fixes.size
-    there[there] = fixes[next_one[there]] <= fixes[there] + SECOND + SECOND // 10
-    return not there.any() or bool(later[there].mean() >= REGULAR)
+    has_next = next_one < fixes.size
+    has_next[has_next] = fixes[next_one[has_next]] <= fixes[has_next] + SECOND + SECOND // 10
+    return not has_next.any() or bool(later[has_next].mean() >= REGULAR)
 
 
 def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
     """Return values at ticks, by straight lines between near samples, else beside a nearer one."""
-    known = np.flatnonzero(~np.isnan(values))
-    times, found = ticks[known], values[known]
+    present = np.flatnonzero(~np.isnan(values))
+    times, present_values = ticks[present], values[present]
     right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
-    left = np.maximum(right - 1, 0)
-    bridged = (times[right] >= at) & (times[right] - times[left] <= LONGEST_BETWEEN)
-    bridged &= times[left] <= at
-    nearer = np.where(at - times[left] < times[right] - at, left, right)
+    before = np.maximum(right - 1, 0)
+    bridged = (times[right] >= at) & (times[right] - times[before] <= LONGEST_BETWEEN)
+    bridged &= times[before] <= at
+    nearer = np.where(at - times[before] < times[right] - at, before, right)
     beside = np.abs(times[nearer] - at) <= LONGEST_BESIDE
-    line = np.where(bridged, np.interp(at, times, found), np.nan)
-    return np.where(bridged | ~beside, line, found[nearer])
+    line = np.where(bridged, np.interp(at, times, present_values), np.nan)
+    return np.where(bridged | ~beside, line, present_values[nearer])
 
 
 Method = Literal["snap", "interpolate", "average"]
@@ -192,18 +193,20 @@ class Resampler:
         time_s, values = _present(self.time_s - delay_s, values)
         last = np.searchsorted(time_s, self.at_s + TIME_EPSILON_S, side="right") - 1
         held = np.full(self.at_s.size, np.nan)
-        known = last >= 0
-        known[known] = (self.at_s[known] - time_s[last[known]]) <= longest_gap_s + TIME_EPSILON_S
-        held[known] = values[last[known]]
+        is_known = last >= 0
+        is_known[is_known] = (
+            self.at_s[is_known] - time_s[last[is_known]]
+        ) <= longest_gap_s + TIME_EPSILON_S
+        held[is_known] = values[last[is_known]]
         return held
 
     def place(self, values: FloatArray, delay_s: float = 0.0) -> FloatArray:
         """Return a signal with each sample at its nearest tick, the last of several, else NaN."""
         present = np.flatnonzero(~np.isnan(values))
         nearest = np.rint((self.time_s[present] - delay_s - self.at_s[0]) / STEP_S)
-        place, found = find_ticks(self.ticks, nearest)
+        place, exists = find_ticks(self.ticks, nearest)
         placed = np.full(self.ticks.size, np.nan)
-        placed[place[found]] = values[present[found]]
+        placed[place[exists]] = values[present[exists]]
         return placed
 
 
@@ -229,11 +232,11 @@ def interpolate(
     if not time_s.size:
         return np.full(at_s.shape, np.nan)
     right = np.clip(np.searchsorted(time_s, at_s), 0, time_s.size - 1)
-    left = np.maximum(right - 1, 0)
-    to_left, to_right = np.abs(at_s - time_s[left]), np.abs(at_s - time_s[right])
+    before = np.maximum(right - 1, 0)
+    to_left, to_right = np.abs(at_s - time_s[before]), np.abs(at_s - time_s[right])
     measured = np.minimum(to_left, to_right) <= TIME_EPSILON_S
     inside = (at_s >= time_s[0]) & (at_s <= time_s[-1])
-    bridged = time_s[right] - time_s[left] <= longest_gap_s + TIME_EPSILON_S
+    bridged = time_s[right] - time_s[before] <= longest_gap_s + TIME_EPSILON_S
     return np.where(measured | (inside & bridged), np.interp(at_s, time_s, values), np.nan)
 
 
@@ -263,9 +266,9 @@ def average(
         return np.asarray(area[i] + into * (values[i] + slope[i] * into / 2), dtype=np.float64)
 
     width = end - start
-    whole = (width >= STEP_S - 2 * TIME_EPSILON_S) & (gaps[last + 1] == gaps[first])
-    mean = (integral(last, end) - integral(first, start)) / np.where(whole, width, 1.0)
-    return np.where(whole, mean, np.nan)
+    is_complete = (width >= STEP_S - 2 * TIME_EPSILON_S) & (gaps[last + 1] == gaps[first])
+    mean = (integral(last, end) - integral(first, start)) / np.where(is_complete, width, 1.0)
+    return np.where(is_complete, mean, np.nan)
 
 
 def _present(time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -299,12 +302,12 @@ def fixes_on_ticks(
     new = np.flatnonzero(_is_new(course, speed))
     since = resampler.time_s[new] - source.delay_s - resampler.start_s
     nearest = np.rint(since / STEP_S)
-    place, found = find_ticks(resampler.ticks, nearest)
-    place, late_s = place[found], (nearest * STEP_S - since)[found]
+    place, exists = find_ticks(resampler.ticks, nearest)
+    place, late_s = place[exists], (nearest * STEP_S - since)[exists]
     courses, speeds = (np.full(resampler.ticks.size, np.nan) for _ in range(2))
     if not place.size:
         return courses, speeds
-    course, speed, r = course[new[found]], speed[new[found]], yaw_rate[place]
+    course, speed, r = course[new[exists]], speed[new[exists]], yaw_rate[place]
     across = r * (source.antenna_x_m or 0.0)
     along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
     turned = course - np.arctan2(across, along) + r * late_s
@@ -319,11 +322,11 @@ def fixes_on_ticks(
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
     """Return where a sample is there and is not the one before again."""
-    there = np.flatnonzero(~np.isnan(course) & ~np.isnan(speed))
-    same = np.zeros(there.size, dtype=np.bool_)
-    same[1:] = (np.diff(course[there]) == 0) & (np.diff(speed[there]) == 0)
+    complete = np.flatnonzero(~np.isnan(course) & ~np.isnan(speed))
+    same = np.zeros(complete.size, dtype=np.bool_)
+    same[1:] = (np.diff(course[complete]) == 0) & (np.diff(speed[complete]) == 0)
     new = np.zeros(course.size, dtype=np.bool_)
-    new[there[~same]] = True
+    new[complete[~same]] = True
     return new
 
 

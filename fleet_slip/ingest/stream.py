@@ -38,7 +38,7 @@ from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import Fault
-from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
 """Short drives in one file. With more, time or the drive's column is not what the mapping says."""
@@ -187,14 +187,14 @@ class MeasuredStream:
         if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
             trip_id = name
         self._trips[group] = trip_id, rows.end_s
-        known = dict(self.checker.keys.metadata[group])
-        known["drive_name"] = known.pop("drive", self._stem)
-        known |= {"source_file": self.name, "trip_id": trip_id}
+        metadata = dict(self.checker.keys.metadata[group])
+        metadata["drive_name"] = metadata.pop("drive", self._stem)
+        metadata |= {"source_file": self.name, "trip_id": trip_id}
         for base in rows.bases.keys() - intervals_s.keys():
             steps_s = np.diff(rows.bases[base]["time"].head(RATE_ROWS).to_numpy())
             intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
         try:
-            drive = to_ticks(rows, self.mapping, intervals_s, name, known)
+            drive = to_ticks(rows, self.mapping, intervals_s, name, metadata)
         except InputError as error:
             raise InputError(f"{quote_name(self.file)}: {error}") from None
         self.counts.rows_kept += rows.height
@@ -202,8 +202,12 @@ class MeasuredStream:
         self.counts.drives_resampled += drive.method != "snap"
         self.counts.ticks += drive.ticks.size
         for signal, values in drive.counts.items():
-            some = (of[signal] for of in rows.bases.values() if signal in of.columns)
-            self._samples[signal] += sum(column.count() for column in some)
+            columns = (
+                base_rows[signal]
+                for base_rows in rows.bases.values()
+                if signal in base_rows.columns
+            )
+            self._samples[signal] += sum(column.count() for column in columns)
             self._values[signal] += len(values) - values.null_count
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
@@ -284,21 +288,21 @@ class MeasuredStream:
             "signal",
             "value",
         )
-        return frame.to_arrow().cast(QUARANTINE_SCHEMA)
+        return frame.to_arrow().cast(quarantine_schema())
 
     def suspicions(self) -> tuple[Fault, ...]:
         """Return what looks wrong in the file as a whole, once all drives were taken."""
         counts, time = self.counts, self.mapping.time
-        found = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
+        faults = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
             figure = f"drives of one car overlap in time ({twice:,} times)"
-            found += [Fault("repeated", ("time",), figure, "Set vehicle_id or drive.column.")]
-        found += _unmapped_cars(self.file, self.mapping, counts.drives)
+            faults += [Fault("repeated", ("time",), figure, "Set vehicle_id or drive.column.")]
+        faults += _unmapped_cars(self.file, self.mapping, counts.drives)
         if time.assumed:
             figure = f"the log has no time column; {time.rate_hz:g} Hz is assumed"
             remedy = "Set the true rate_hz and remove assumed = true."
-            found += [Fault("time", ("rate_hz",), figure, remedy)]
-        return tuple(found)
+            faults += [Fault("time", ("rate_hz",), figure, remedy)]
+        return tuple(faults)
 
 
 @contextmanager
@@ -385,19 +389,19 @@ def find_refusals(
 
     `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    most = max(rows * LARGEST_REFUSED, FEWEST_REFUSED)
-    several = {key: count for key, count in refused.items() if count > most}
+    limit = max(rows * LARGEST_REFUSED, FEWEST_REFUSED)
+    several = {key: count for key, count in refused.items() if count > limit}
     for (name, reason), count in several.items():
         kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
         figure = f"{count:,} of {rows:,} rows were refused: {reason}"
         yield Fault(kind, (name,), figure, remedy)
-    others = Counter(reasons)
+    remaining = Counter(reasons)
     for (_, reason), count in several.items():
-        others[reason] -= count
-    if others.total() <= most:
+        remaining[reason] -= count
+    if remaining.total() <= limit:
         return
-    ((reason, count),) = others.most_common(1)
-    figure = f"{others.total():,} of {rows:,} rows were refused, {count:,} of them: {reason}"
+    ((reason, count),) = remaining.most_common(1)
+    figure = f"{remaining.total():,} of {rows:,} rows were refused, {count:,} of them: {reason}"
     if reason.startswith(_OF_TIME):
         remedy = "Check the column of times, its unit and its format"
         if reason in {"time_duplicate", "time_backwards"}:
@@ -412,17 +416,17 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
 
     `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
     """
-    wanted = {
+    unmapped = {
         key: words
         for key, words in vocabulary()["cars"].items()
         if not (mapping.drive.column or isinstance(getattr(mapping.drive, key), FromColumn))
     }
-    if mapping.time.own_clock or not wanted:
+    if mapping.time.own_clock or not unmapped:
         return
     used = {name for names in mapping.time_bases().values() for name in names}
     with file_errors(file), open_source(file, mapping.formats) as source:
         names = [channel.name for channel in source.channels()]
-        for key, words in wanted.items():
+        for key, words in unmapped.items():
             for name in names:
                 if name in used or names.count(name) > 1 or not is_called(words, name):
                     continue

@@ -26,27 +26,26 @@ _NO_CLOCK = "this file has no clock: set column or rate_hz under [time]"
 def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     """Yield the columns of a log that a mapping uses, in its order, in bounded batches.
 
-    Rows of several time bases come as `merge_bases` says. Raises `InputError` if the file cannot be
-    read, has a clock and the mapping none or the other way round, or if a column is missing or
-    ambiguous.
+    Several time bases are merged by `merge_bases`. Raises `InputError` if the file cannot be read,
+    if only one of file and mapping has a clock, or if a column is missing or ambiguous.
     """
-    wanted, time = mapping.time_bases(), str(mapping.time.key)
+    columns_by_time, time = mapping.time_bases(), str(mapping.time.key)
     with file_errors(log), open_source(log, mapping.formats) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
                 f"{quote_name(log)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
                 f"{mapping.name!r}."
             )
-        metered = Budget.of(log).metered
-        if len(wanted) == 1 and not source.has_clock:
-            yield from metered(source.batches(next(iter(wanted.values()))))
+        metered = Budget.for_file(log).metered
+        if len(columns_by_time) == 1 and not source.has_clock:
+            yield from metered(source.batches(next(iter(columns_by_time.values()))))
             return
         if source.has_clock:
-            bases = [base for columns in wanted.values() for base in source.bases(columns)]
+            bases = [base for columns in columns_by_time.values() for base in source.bases(columns)]
         else:
             bases = [
-                _with_times(source.batches(columns), log, str(own), time)
-                for own, columns in wanted.items()
+                _with_times(source.batches(columns), log, str(time_column), time)
+                for time_column, columns in columns_by_time.items()
             ]
         held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
         for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
@@ -54,33 +53,32 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
 
 
 def _with_times(
-    batches: Iterator[pl.DataFrame], log: Path, own: str, time: str
+    batches: Iterator[pl.DataFrame], log: Path, time_column: str, time: str
 ) -> Iterator[pl.DataFrame]:
-    """Yield the rows that have a time of their own, under the name that all times have."""
+    """Yield the rows that have a time, in the common column of times."""
     for batch in batches:
-        if not batch[own].dtype.is_numeric():
+        if not batch[time_column].dtype.is_numeric():
             raise InputError(
-                f"{quote_name(log)}: the time {own!r} is not numeric, as a signal with its own "
-                "time "
-                "needs."
+                f"{quote_name(log)}: the time {time_column!r} of a signal is not numeric. Give its "
+                "column of times in s."
             )
-        if own == time:
+        if time_column == time:
             yield batch
         else:
-            yield batch.filter(pl.col(own).is_not_null()).rename({own: time})
+            yield batch.filter(pl.col(time_column).is_not_null()).rename({time_column: time})
 
 
-# Time bases become one table: a row is a sample of one of them, and null in the columns of others.
-# It comes in windows of time, so that only some rows of each base are in memory.
+# Several time bases become one table: a row is a sample of one base, and null in the columns of the
+# others. The table is made in windows of time, so that few rows of each base are in memory.
 
 DISORDER = "\0disorder"
-"""Column that says what is wrong with a row's time among those of its base, null if nothing."""
+"""Column with the fault of a row's time within its base, null if it is right."""
 HELD = "\0held "
-"""Before the name of a column: its last value at the time, whatever base the row is of."""
+"""Prefix of a column's name: its last value at the row's time, of any base."""
 ROW = "\0row"
 """Column with the row's number among those of its base, from 1."""
 _RIGHT = "\0right"
-"""Column with the last right time of the base up to each row: where the row stands among others."""
+"""Column with the last right time of the base up to each row, by which rows are sorted."""
 WINDOW_ROWS = 2**16
 """A window has about this many rows of all bases together."""
 
@@ -91,27 +89,31 @@ def merge_bases(
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
     Times are in s. A row whose time does not increase within its base has the reason in
-    `DISORDER`, and stands where the base's last right time was. The `held` columns, conditions and
-    names of drives, say of every row what was last known there, for `split_gap_s` at most. Where
-    only one base has rows, they come as they are.
+    `DISORDER`, and is sorted at the base's last right time. Every row gets the last value of the
+    `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. The rows
+    of a single base are yielded unchanged.
     """
-    opened = [_Coming(base, time, split_gap_s) for base in bases]
-    columns = {name: kind for one in opened for name, kind in one.columns.items()}
-    some = [one for one in opened if one.has_rows]
-    if len(some) == 1:
-        yield from (_completed(batch, columns) for batch in some[0].batches)
+    opened = [_PendingBase(base, time, split_gap_s) for base in bases]
+    columns = {name: kind for base in opened for name, kind in base.columns.items()}
+    filled = [base for base in opened if base.has_rows]
+    if len(filled) == 1:
+        yield from (_completed(batch, columns) for batch in filled[0].batches)
         return
-    coming = some
-    for number, one in enumerate(some):
-        one.begin(number, max(WINDOW_ROWS // len(some), 1))
+    pending = filled
+    for number, base in enumerate(filled):
+        base.begin(number, max(WINDOW_ROWS // len(filled), 1))
     columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
-    of = {name: number for number, one in reversed([*enumerate(some)]) for name in one.columns}
-    lasting = [_Lasting(name, of.get(name, -1), time, split_gap_s) for name in held]
-    while coming := [one for one in coming if one.fill()]:
-        until = min(one.reached for one in coming)
-        rows = pl.concat([_completed(one.take(until), columns) for one in coming])
+    base_of_column = {
+        name: number for number, base in reversed([*enumerate(filled)]) for name in base.columns
+    }
+    held_columns = [
+        _HeldColumn(name, base_of_column.get(name, -1), time, split_gap_s) for name in held
+    ]
+    while pending := [base for base in pending if base.fill()]:
+        until = min(base.reached for base in pending)
+        rows = pl.concat([_completed(base.take(until), columns) for base in pending])
         rows = rows.sort(_RIGHT, maintain_order=True)
-        yield rows.with_columns(one.hold(rows) for one in lasting).drop(_RIGHT)
+        yield rows.with_columns(column.hold(rows) for column in held_columns).drop(_RIGHT)
 
 
 def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
@@ -120,8 +122,8 @@ def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFr
     return rows.with_columns(absent).select(*columns)
 
 
-class _Coming:
-    """The rows of a base that are in no window yet; of the first ones its columns are known."""
+class _PendingBase:
+    """The rows of a base that are in no window yet. Its first batch gives the columns."""
 
     def __init__(self, batches: Iterator[pl.DataFrame], time: str, split_gap_s: float) -> None:
         self._time, self._gap_s = time, split_gap_s
@@ -133,13 +135,13 @@ class _Coming:
         self._before_s, self._right_s, self._judged_rows = np.nan, -np.inf, 0
         self._rows = pl.DataFrame()
 
-    def begin(self, number: int, most: int) -> None:
-        """Take the base's number, and how many rows to read at once."""
+    def begin(self, number: int, count: int) -> None:
+        """Set the base's number, and how many rows to read at once."""
         self._number = pl.lit(number, pl.Int32).alias(BASE)
-        self._slices = _resized(self._judged(), most)
+        self._slices = _resized(self._judged(), count)
 
     def _judged(self) -> Iterator[pl.DataFrame]:
-        """Yield the rows with `DISORDER`, `ROW` and `_RIGHT`; the last one waits for the next."""
+        """Yield rows with `DISORDER`, `ROW` and `_RIGHT`. The last one waits for the next batch."""
         waiting: pl.DataFrame | None = None
         for batch in self.batches:
             rows = batch if waiting is None else pl.concat([waiting, batch])
@@ -150,7 +152,7 @@ class _Coming:
             yield self._judge(waiting, None)
 
     def _judge(self, rows: pl.DataFrame, after_s: float | None) -> pl.DataFrame:
-        """Judge rows before a time. One far ahead is `isolated`, or all after it would be late."""
+        """Check times. A row far ahead is `isolated`, or all rows after it would be late."""
         time_s = rows[self._time].to_numpy()
         before_s = np.concatenate([[self._before_s], time_s[:-1]])
         next_s = np.append(time_s[1:], np.nan if after_s is None else after_s)
@@ -174,41 +176,41 @@ class _Coming:
         )
 
     def fill(self) -> bool:
-        """Read on if no rows wait; return whether some do now."""
+        """Read the next rows if none wait. Returns True if some wait now."""
         if not self._rows.height:
             self._rows = next(self._slices, self._rows)
         return self._rows.height > 0
 
     @property
     def reached(self) -> float:
-        """Place of the last row."""
+        """The time of the last row that waits."""
         return float(self._rows[_RIGHT][-1])
 
     def take(self, until: float) -> pl.DataFrame:
-        """Return what waits up to a time."""
+        """Return the waiting rows up to a time."""
         number = int(self._rows[_RIGHT].search_sorted(until, side="right"))
         taken, self._rows = self._rows.head(number), self._rows.slice(number)
         return taken.with_columns(self._number)
 
 
-def _resized(batches: Iterator[pl.DataFrame], most: int) -> Iterator[pl.DataFrame]:
-    """Yield the rows of batches with `most` at once: of large ones less, of small ones together."""
+def _resized(batches: Iterator[pl.DataFrame], count: int) -> Iterator[pl.DataFrame]:
+    """Yield the rows of batches in frames of `count` rows; joins small batches, splits large."""
     small: list[pl.DataFrame] = []
     for batch in batches:
         small.append(batch)
-        if sum(one.height for one in small) >= most:
-            yield from pl.concat(small).iter_slices(most)
+        if sum(batch.height for batch in small) >= count:
+            yield from pl.concat(small).iter_slices(count)
             small = []
     if small:
-        yield from pl.concat(small).iter_slices(most)
+        yield from pl.concat(small).iter_slices(count)
 
 
-class _Lasting:
-    """A column of one base that says something of the rows of all."""
+class _HeldColumn:
+    """A column of one base whose last value applies to the rows of all bases."""
 
     def __init__(self, name: str, base: int, time: str, longest_s: float) -> None:
         self._name, self._longest_s = name, longest_s
-        self._says = (
+        self._is_stated = (
             pl.col(name).is_not_null()
             & (pl.col(BASE) == base)
             & pl.col(DISORDER).is_null()
@@ -217,9 +219,11 @@ class _Lasting:
         self._last: list[pl.DataFrame] = []
 
     def hold(self, rows: pl.DataFrame) -> pl.Series:
-        """Return the last value at the place of each row of a window, null if it is too old."""
-        said = rows.filter(self._says).select(_RIGHT, pl.col(self._name).alias(HELD + self._name))
-        known = pl.concat([*self._last, said]).set_sorted(_RIGHT)
-        self._last = [known.tail(1)]
-        held = rows.select(_RIGHT).join_asof(known, on=_RIGHT, tolerance=self._longest_s)
+        """Return the last value at the time of each row, null if it is too old."""
+        stated = rows.filter(self._is_stated).select(
+            _RIGHT, pl.col(self._name).alias(HELD + self._name)
+        )
+        values = pl.concat([*self._last, stated]).set_sorted(_RIGHT)
+        self._last = [values.tail(1)]
+        held = rows.select(_RIGHT).join_asof(values, on=_RIGHT, tolerance=self._longest_s)
         return held[HELD + self._name]

@@ -39,8 +39,8 @@ def parts_of(name: str) -> list[str]:
 @lru_cache(maxsize=2**10)
 def split_unit(name: str) -> tuple[str, str]:
     """Return a name without the unit that stands behind it in brackets, and that unit or ''."""
-    found = _IN_BRACKETS.search(name)
-    return (name[: found.start()], found[1]) if found else (name, "")
+    match = _IN_BRACKETS.search(name)
+    return (name[: match.start()], match[1]) if match else (name, "")
 
 
 @lru_cache(maxsize=2**10)
@@ -93,28 +93,30 @@ def _called(signal: str, section: str) -> tuple[tuple[str, ...], ...]:
 def fits_any(words: Iterable[str], name: str) -> bool:
     """Whether a name has one of the words."""
     plain, _ = split_unit(name)
-    return any(_fit(tuple(one.split()), plain, plain) > 0 for one in words)
+    return any(_fit(tuple(phrase.split()), plain, plain) > 0 for phrase in words)
 
 
 def is_called(words: Iterable[str], name: str) -> bool:
     """Whether a name is one of the words and nothing but a number or a name of it."""
     parts = [part for part in parts_of(split_unit(name)[0]) if not part.isdigit()]
-    kept = [part for part in parts if part not in _NUMBERING]
-    return any(kept == [w for w in one.split() if w not in _NUMBERING] for one in words)
+    significant = [part for part in parts if part not in _NUMBERING]
+    return any(
+        significant == [w for w in phrase.split() if w not in _NUMBERING] for phrase in words
+    )
 
 
-def _fit(words: tuple[str, ...], own: str, every: str) -> float:
+def _fit(words: tuple[str, ...], name_without_unit: str, full_name: str) -> float:
     score, explained = 0.0, set()
     for word in words:
-        place = _place(word, own)
+        place = _place(word, name_without_unit)
         if place is not None:
             score += 2 * len(word)
             explained.add(place)
-        elif own != every and _place(word, every) is not None:
+        elif name_without_unit != full_name and _place(word, full_name) is not None:
             score += len(word)
         else:
             return 0.0
-    return max(score - 0.5 * (len(_stems_of(own)) - len(explained)), 0.1)
+    return max(score - 0.5 * (len(_stems_of(name_without_unit)) - len(explained)), 0.1)
 
 
 @lru_cache(maxsize=2**14)
@@ -140,8 +142,8 @@ def _pieces(part: str) -> tuple[str, ...]:
     for stem in _stems():
         if part == stem:
             return (stem,)
-        if part.startswith(stem) and (rest := _pieces(part[len(stem) :])):
-            return (stem, *rest)
+        if part.startswith(stem) and (following := _pieces(part[len(stem) :])):
+            return (stem, *following)
     return ()
 
 

@@ -25,7 +25,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.arrays import BoolArray
+from fleet_slip.arrays import BoolArray, Hashes
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import (
     Combination,
@@ -37,7 +37,6 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.grams.gram_files import Hashes
 from fleet_slip.regression.least_squares import LinearModel
 
 MOST_DIGITS = 4000

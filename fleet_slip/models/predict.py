@@ -19,7 +19,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalog.calibration_parameters import round_number
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog, round_chunks, valid_values
+from fleet_slip.catalog.counts import round_chunks, valid_values
+from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.compiling import kernel

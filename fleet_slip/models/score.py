@@ -30,7 +30,8 @@ from fleet_slip.warehouse.predicate import (
     parse_cohort,
     row_columns,
 )
-from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 BATCH_ROWS = 2**17
 

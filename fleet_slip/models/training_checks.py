@@ -25,7 +25,8 @@ from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
-from fleet_slip.warehouse.warehouse import Warehouse, connect_tables
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 DRIVES = 5
 """That are looked at, of as many cars if there are so many."""

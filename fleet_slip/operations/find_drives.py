@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.base import pluralize
+from fleet_slip.catalog.counts import digest_counts
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.signals import digest_counts
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.gram_files import gram_digests, read_rows
 from fleet_slip.grams.on_board import onboard_feature_sets

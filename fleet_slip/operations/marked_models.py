@@ -11,8 +11,9 @@ from functools import cache
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.arrays import Hashes
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_files import Hashes, hash_names
+from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.warehouse.erasure_log import ErasureLog

@@ -38,14 +38,14 @@ from fleet_slip.warehouse.predicate import (
     row_columns,
     without_drives,
 )
-from fleet_slip.warehouse.warehouse import (
-    Warehouse,
+from fleet_slip.warehouse.table_views import (
     connect_tables,
     gram_snapshots,
     lock,
     open_tables,
     views_in,
 )
+from fleet_slip.warehouse.warehouse import Warehouse
 
 NAME = "drive"
 """Stands for a model's name in the hashes of drives."""

@@ -11,15 +11,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
-from deltalake.transaction import AddAction, RemoveAction
-
 from fleet_slip.base import canonical_json
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.folder import Folder
 
 if TYPE_CHECKING:
+    from deltalake.transaction import AddAction, RemoveAction
+
     from fleet_slip.storage.table import Snapshot
 
 LOG = "_delta_log"
@@ -38,7 +36,7 @@ _KINDS = _CHECKED_KINDS | {"commitInfo", "metaData", "protocol"}
 
 def checked_note(
     note: Mapping[str, Any],
-    actions: Sequence[AddAction | RemoveAction],
+    actions: "Sequence[AddAction | RemoveAction]",
     transactions: Mapping[str, int],
 ) -> str:
     """Return a note as text, with the checksum of note, actions and transactions."""
@@ -62,7 +60,9 @@ _FIELDS = {
 """Of each kind of action what the log has of it, there in camel case."""
 
 
-def _as_logged(action: AddAction | RemoveAction) -> Action:
+def _as_logged(action: "AddAction | RemoveAction") -> Action:
+    from deltalake.transaction import AddAction
+
     kind = "add" if isinstance(action, AddAction) else "remove"
     return {
         kind: {
@@ -223,6 +223,9 @@ def read_removals(table: Folder, version: int) -> dict[str, int]:
 
 def _logged(table: Folder, version: int, kind: str, *fields: str) -> Iterator[tuple[Any, ...]]:
     """Yield fields of all actions of a kind up to a version, the newest last."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     log = table / LOG
     names = log.names()
     checkpoints = {int(name[:20]) for name in names if _CHECKPOINT.fullmatch(name)}

@@ -59,7 +59,7 @@ def _local(path: Path) -> Folder:
                 f"{path}: it is inside the table {folder}. Choose the folder that the table is in, "
                 "or another."
             )
-    from fleet_slip.storage.local import LocalFolder  # noqa: PLC0415 - pyarrow and Delta
+    from fleet_slip.storage.local import LocalFolder
 
     return LocalFolder(path)
 
@@ -79,5 +79,5 @@ def _at_url(url: str) -> Folder:
             "Credentials are not part of it: they come from the environment."
         )
     with require_extra("objects", "a data root on an object store"):
-        from fleet_slip.storage.objects import ObjectFolder  # noqa: PLC0415 - of the extra
+        from fleet_slip.storage.objects import ObjectFolder
     return ObjectFolder(found["bucket"], found["path"].strip("/"))

@@ -1,16 +1,17 @@
 """Rows as the bytes of a Parquet file, and its checksum."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.storage.checksums import checksum_of, fast_checksum_of
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 DAY = "day"
 """The one column of which the Delta log tells the least and the largest value."""
@@ -53,6 +54,9 @@ class Encoding:
 
     def encode(self, rows: pa.Table, omitted: Sequence[str] = ()) -> Encoded:
         """Return a file of these rows, with dictionaries of what occurs."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
         kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
         # would bring their names along: Parquet stores one as it is given.
@@ -75,6 +79,8 @@ def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
     nulls = {name: rows[name].null_count for name in rows.schema.names}
     statistics: dict[str, Any] = {"numRecords": rows.num_rows, "nullCount": nulls}
     if DAY in stored:
+        import pyarrow.compute as pc
+
         limits = pc.min_max(rows[DAY]).as_py()
         if limits["min"] is not None:
             statistics["minValues"] = {DAY: limits["min"].isoformat()}
@@ -84,6 +90,8 @@ def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
 
 def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return a column whose dictionary has only values that occur, in the order they occur in."""
+    import pyarrow as pa
+
     if not pa.types.is_dictionary(column.type):
         return column
     whole = column.combine_chunks()
@@ -97,6 +105,9 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, frozenset[str]]:
     """Return the names that rows of a Parquet file have, by column with a dictionary."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     metadata = pq.read_metadata(file)
     stored = [name for name in columns if name in metadata.schema.names]
     with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:

@@ -14,14 +14,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Self
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Self
 
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.checksums import check_local_files
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, Folder, StoredFile
 from fleet_slip.storage.storage_errors import storage_errors
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,9 @@ class LocalFolder(Folder):
     def check(self, path: str) -> None:
         check_local_files([str(self.path / path)])
 
-    def open(self, path: str) -> pa.NativeFile:
+    def open(self, path: str) -> "pa.NativeFile":
+        import pyarrow as pa
+
         with storage_errors(self.path / path):
             if not (self.path / path).is_file():  # a pipe would be waited for
                 raise FileNotFoundError(errno.ENOENT, "there is no such file")

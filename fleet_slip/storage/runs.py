@@ -166,7 +166,7 @@ class Run:
 
     def beginning(self) -> dict[str, Any]:
         """Return the line that is written when the run starts."""
-        from importlib.metadata import version  # noqa: PLC0415 - what is not recorded needs none
+        from importlib.metadata import version
 
         return {
             "run_id": self.run_id,
@@ -320,7 +320,7 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
 
     Raises `StorageError` for a changed line.
     """
-    import pyarrow as pa  # noqa: PLC0415 - help and version wait for no table
+    import pyarrow as pa
 
     found = []
     for path, content in _read_history(root, since):

@@ -5,9 +5,6 @@ import errno
 import re
 from collections.abc import Iterator
 
-import pyarrow as pa
-from deltalake.exceptions import DeltaError
-
 from fleet_slip.errors import StorageError
 
 _CREDENTIALS = (
@@ -88,7 +85,7 @@ class NoSuchObjectError(StorageError):
 @contextlib.contextmanager
 def object_errors(where: str) -> Iterator[None]:
     """Turn the failures of an object store into `StorageError`."""
-    from obstore.exceptions import BaseError  # noqa: PLC0415 - the library is optional
+    from obstore.exceptions import BaseError
 
     try:
         yield
@@ -106,12 +103,24 @@ def storage_errors(path: object) -> Iterator[None]:
     except OSError as error:
         reason = meaning_of(error) if "://" in str(path) else _reason(error)
         raise StorageError(f"{path}: {reason}") from None
-    except DeltaError as error:
-        known = known_meaning(error) if "://" in str(path) else None
-        reason = known or f"the Delta log cannot be used: {first_line(error)}"
-        raise StorageError(f"{path}: {reason}") from None
-    except pa.ArrowException as error:
-        raise StorageError(f"{path}: not readable as Parquet: {first_line(error)}") from None
+    except Exception as error:
+        library_reason = _library_reason(error, "://" in str(path))
+        if library_reason is None:
+            raise
+        raise StorageError(f"{path}: {library_reason}") from None
+
+
+def _library_reason(error: Exception, is_store: bool) -> str | None:
+    """Return the reason of an error of the Delta library or of pyarrow; None of any other."""
+    import pyarrow as pa
+    from deltalake.exceptions import DeltaError
+
+    if isinstance(error, DeltaError):
+        meaning = known_meaning(error) if is_store else None
+        return meaning or f"the Delta log cannot be used: {first_line(error)}"
+    if isinstance(error, pa.ArrowException):
+        return f"not readable as Parquet: {first_line(error)}"
+    return None
 
 
 def _reason(error: OSError) -> str:

@@ -1,5 +1,7 @@
 """A Delta table of a data root: its files, and what it takes to open and make it."""
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import json
@@ -12,13 +14,7 @@ from dataclasses import dataclass, field
 from datetime import date
 from decimal import Decimal
 from functools import cached_property
-from typing import Any, ParamSpec, TypeVar
-
-import pyarrow as pa
-import pyarrow.parquet as pq
-from deltalake import CommitProperties, DeltaTable, Transaction
-from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
-from deltalake.transaction import AddAction, RemoveAction
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.storage.commits import (
@@ -32,6 +28,14 @@ from fleet_slip.storage.commits import (
 from fleet_slip.storage.encoding import Encoded, Encoding, read_names
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.storage_errors import first_line, storage_errors
+
+# pyarrow and the Delta library are imported by the functions that use them: together they take
+# longer to start than a command that only reads documents.
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+    from deltalake import DeltaTable
+    from deltalake.transaction import AddAction, RemoveAction
 
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*-x[0-9a-f]{16}-[0-9a-f]{32}\.parquet", re.ASCII)
 """Path of a data file below its table: relative, without characters that could be a pattern, and
@@ -138,6 +142,8 @@ class Change:
 
     def actions(self) -> list[AddAction | RemoveAction]:
         """Return what the commit says to the Delta log, as of now."""
+        from deltalake.transaction import RemoveAction
+
         both = {action.path for action in self.add} & {file.path for file in self.remove}
         return [
             *(action for action in self.add if action.path not in both),
@@ -190,7 +196,7 @@ Result = TypeVar("Result")
 
 
 def on_newest(
-    tables: Sequence["Table"],
+    tables: Sequence[Table],
     look: Callable[[], Result],
     is_damage: Callable[[Result], bool] = lambda _: False,
 ) -> Result:
@@ -210,7 +216,7 @@ def on_newest(
     return look()
 
 
-def _versions(tables: Sequence["Table"]) -> list[int | None]:
+def _versions(tables: Sequence[Table]) -> list[int | None]:
     found: list[int | None] = []
     for table in tables:
         try:
@@ -264,6 +270,8 @@ class Evolution:
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
     """Compare the schema of the catalog with that of a stored table."""
+    from deltalake.exceptions import DeltaError
+
     try:
         stored = {field.name: field.metadata for field in delta.schema().fields}
     except DeltaError as error:
@@ -301,7 +309,7 @@ WITHDRAWN = -1
 class Snapshot:
     """One version of a table. Reading it is not disturbed by later commits."""
 
-    table: "Table"
+    table: Table
     delta: DeltaTable | None
     without: frozenset[str] = frozenset()
     """Paths of files that are left out."""
@@ -331,6 +339,8 @@ class Snapshot:
     @cached_property
     def _actions(self) -> pa.Table:
         """What the log says of each active file, a row a file."""
+        import pyarrow as pa
+
         if self.delta is None:
             return pa.Table.from_pylist([])
         # pa.table() would import pandas, which takes half a second.
@@ -352,7 +362,7 @@ class Snapshot:
         """Size of all active files."""
         return sum(file.size_bytes for file in self.files)
 
-    def renewed(self) -> "Snapshot":
+    def renewed(self) -> Snapshot:
         """Return the newest version: this snapshot, or another, which takes its place."""
         version = self.version
         if self.delta is not None and not self.table.folder.is_local:
@@ -406,6 +416,8 @@ class Snapshot:
 
     def commit(self, change: Change) -> None:
         """Apply a change in one atomic commit. Raises `ConflictError` and `StorageError`."""
+        from deltalake import CommitProperties, Transaction
+
         table, actions = self.table, change.actions()
         note = checked_note(change.note, actions, {u.name: u.version for u in change.transactions})
         with table.committing():
@@ -446,6 +458,8 @@ class Table:
     @property
     def usual_schema(self) -> pa.Schema:
         """The schema without the optional columns."""
+        import pyarrow as pa
+
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
     def snapshot(self, version: int | None = None, *, anew: bool = False) -> Snapshot:
@@ -465,6 +479,9 @@ class Table:
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
         """Return the Delta table as it is now, or was; None if nobody has written it yet."""
+        from deltalake import DeltaTable
+        from deltalake.exceptions import TableNotFoundError
+
         with storage_errors(self.folder):
             try:
                 return DeltaTable(
@@ -479,6 +496,8 @@ class Table:
 
     def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Return the rows of a file, or some columns. Raises `StorageError` if it is damaged."""
+        import pyarrow.parquet as pq
+
         self.folder.check(path)
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             wanted = None if columns is None else list(columns)
@@ -494,6 +513,9 @@ class Table:
 
         That takes a third of the time of reading the columns. Raises `StorageError` as `read`.
         """
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
         self.folder.check(path)
         names = list(columns)
         with (
@@ -507,6 +529,8 @@ class Table:
 
     def read_metadata(self, path: str) -> pq.FileMetaData:
         """Return the footer of one of the table's files."""
+        import pyarrow.parquet as pq
+
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
             return pq.read_metadata(file)
 
@@ -525,6 +549,8 @@ class Table:
         It is in the table once committed. Where that name is taken, the new file gets a longer one:
         what is not committed is its writer's alone, to delete.
         """
+        from deltalake.transaction import AddAction
+
         path = encoded.path(name, day)
         while not self.folder.create(path, encoded.content):
             path = encoded.path(f"{name}-{uuid.uuid4().hex[:8]}", day)
@@ -583,6 +609,8 @@ class Table:
         Delta refuses commits that began before a change of metadata, here of a property. Raises
         `ConflictError` if others keep changing the table.
         """
+        from deltalake import CommitProperties
+
         note = CommitProperties(custom_metadata={NOTE: checked_note({"job": "fence"}, [], {})})
 
         def attempt() -> None:
@@ -598,6 +626,8 @@ class Table:
     @contextlib.contextmanager
     def committing(self) -> Iterator[None]:
         """Turn a commit's failures into `ConflictError`, or `StorageError` for a fault."""
+        from deltalake.exceptions import CommitFailedError
+
         with storage_errors(self.folder):
             try:
                 yield
@@ -611,6 +641,8 @@ class Table:
 
     def create(self) -> DeltaTable:
         """Make the table, and return it as made, so that a commit on it meets those of others."""
+        from deltalake import CommitProperties, DeltaTable
+
         delta = DeltaTable.create(
             self.folder.uri,
             schema=self.schema,

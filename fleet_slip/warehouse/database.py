@@ -1,4 +1,6 @@
-"""DuckDB connections: how they are opened, what they may use, and how their errors are told."""
+"""DuckDB connections: how they are opened, what they may use, and how errors are translated."""
+
+from __future__ import annotations
 
 import contextlib
 import functools
@@ -11,9 +13,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, wait
 from itertools import accumulate
-from typing import Any, TypeVar
-
-import duckdb
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fleet_slip.errors import (
     FleetSlipError,
@@ -26,6 +26,9 @@ from fleet_slip.limits import data_needed, memory_bytes
 from fleet_slip.storage.checksums import check_local_files, missing_file_error
 from fleet_slip.storage.folder import SPILL_PREFIX, Folder
 from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS, words
+
+if TYPE_CHECKING:  # functions import it: it takes as long to start as all else of most commands
+    import duckdb
 
 SPILL_LIMIT = "20GB"
 """Largest size of what one connection may write to disk for a query beyond its memory."""
@@ -53,6 +56,8 @@ def open_database(
     process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
     otherwise such a query fails.
     """
+    import duckdb
+
     aside = reading.spill / f"{SPILL_PREFIX}{uuid.uuid4().hex}" if reading and spill else ""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
@@ -76,6 +81,8 @@ def open_database(
 
 @functools.cache
 def _in_common() -> duckdb.DuckDBPyConnection:
+    import duckdb
+
     return duckdb.connect(":memory:", config={"threads": 1, "enable_external_access": False})
 
 
@@ -133,42 +140,40 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
 _INTERRUPTED = "Query interrupted"
 """What DuckDB's Python client says when it stopped at a Ctrl-C."""
 
-_OF_FILES = (
-    duckdb.IOException,
-    duckdb.InvalidInputException,
-    duckdb.InternalException,
-)
-
-
 _DELETED = re.compile(r'"(.*)/\*\*/\*\.parquet"')
 """How DuckDB names a file that was deleted after a view was made of it: as a folder."""
 
-_STREAMED: dict[str, type[Exception]] = {
-    "Conversion Error": duckdb.ConversionException,
-    "Out of Range Error": duckdb.OutOfRangeException,
-    "Invalid Input Error": duckdb.InvalidInputException,
-    "IO Error": duckdb.IOException,
-    "INTERNAL Error": duckdb.InternalException,
-    "Out of Memory Error": duckdb.OutOfMemoryException,
-    "INTERRUPT Error": duckdb.InterruptException,
+_STREAMED_ERRORS = {
+    "Conversion Error": "ConversionException",
+    "Out of Range Error": "OutOfRangeException",
+    "Invalid Input Error": "InvalidInputException",
+    "IO Error": "IOException",
+    "INTERNAL Error": "InternalException",
+    "Out of Memory Error": "OutOfMemoryException",
+    "INTERRUPT Error": "InterruptException",
 }
+"""DuckDB's exceptions by the beginning of their message."""
 
 
 @contextlib.contextmanager
 def _errors_of_streams() -> Iterator[None]:
-    """Raise what DuckDB raised: of an answer that is read batch by batch, pyarrow hides it."""
+    """Raise DuckDB's exception again: pyarrow hides it if an answer is read batch by batch."""
+    import duckdb
+
     try:
         yield
     except OSError as error:
-        kind = _STREAMED.get(str(error).partition(":")[0])
-        if kind is None:
+        name = _STREAMED_ERRORS.get(str(error).partition(":")[0])
+        if name is None:
             raise
-        raise kind(str(error)) from None
+        raise getattr(duckdb, name)(str(error)) from None
 
 
 @contextlib.contextmanager
 def database_errors(doing: str) -> Iterator[None]:
-    """Turn DuckDB's errors into ours, saying what was being done."""
+    """Translate DuckDB's errors to ours; `doing` begins the message."""
+    import duckdb
+
     try:
         with _errors_of_streams():
             yield
@@ -187,7 +192,11 @@ def database_errors(doing: str) -> Iterator[None]:
         if deleted := _DELETED.search(str(error)):
             raise missing_file_error(deleted[1]) from None
         raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
-    except _OF_FILES as error:
+    except (
+        duckdb.IOException,
+        duckdb.InvalidInputException,
+        duckdb.InternalException,
+    ) as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
         if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
@@ -260,7 +269,9 @@ _SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "
 
 
 def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
-    """Return the statements of a text; the text itself where it has none, or is not valid SQL."""
+    """Return the statements of a text; the text itself if it has none or is not valid SQL."""
+    import duckdb
+
     if len(text) > LONGEST_QUERY:
         return [text]
     try:
@@ -271,6 +282,8 @@ def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str
 
 def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
     """Return the text if it is one statement that only reads. Raises `QuestionError`."""
+    import duckdb
+
     if len(text) > LONGEST_QUERY:
         raise QuestionError(
             f"the query has {len(text):,} characters, at most {LONGEST_QUERY:,} are read."
@@ -290,7 +303,9 @@ def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
 
 
 def _explained(text: str) -> str:
-    """Return what an EXPLAIN statement explains; EXPLAIN ANALYZE runs it."""
+    """Return the statement of an EXPLAIN; EXPLAIN ANALYZE runs it."""
+    import duckdb
+
     encoded = text.encode()
     tokens = [start for start, kind in duckdb.tokenize(text) if kind != duckdb.token_type.comment]
     ends = [*tokens[1:], len(encoded)]

@@ -28,8 +28,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal, TypeAlias
 
-import pyarrow.compute as pc
-
 from fleet_slip.base import name_key, normalize_name, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import StorageError
@@ -276,6 +274,8 @@ _Names: TypeAlias = Iterable[str | None]
 
 def _names_in(grams: Table, snapshots: Sequence[Snapshot]) -> Iterator[tuple[_Names, _Names]]:
     """Yield the vehicles and drives of files. A log file with Gram rows is not opened."""
+    import pyarrow.compute as pc
+
     counted: set[str] = set()
     for snapshot in sorted(snapshots, key=lambda snapshot: snapshot.table != grams):
         is_grams = snapshot.table == grams

@@ -22,7 +22,8 @@ from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.connections import IdleConnection
 from fleet_slip.warehouse.gram_rows import find_backlog
 from fleet_slip.warehouse.predicate import Predicate, guarded_query
-from fleet_slip.warehouse.warehouse import Warehouse, gram_snapshots, lock, open_tables
+from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 BATCH_ROWS = 2**13
 """Gram rows of one batch: some 700 bytes each."""

@@ -14,9 +14,7 @@ import threading
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from hashlib import sha256
-from typing import Any
-
-import duckdb
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.drive_sources import SCENARIO, TRAINING_DRIVES
@@ -31,6 +29,9 @@ from fleet_slip.warehouse.database import (
     problems,
     reading_files,
 )
+
+if TYPE_CHECKING:
+    import duckdb
 
 MAX_QUERY_S = 3600.0
 """Longest query with a predicate, in s: unattended jobs must end."""
@@ -78,12 +79,14 @@ class Predicate:
 
 @contextlib.contextmanager
 def guarded_query(
-    database: duckdb.DuckDBPyConnection, predicate: Predicate, limit_s: float = MAX_QUERY_S
+    database: "duckdb.DuckDBPyConnection", predicate: Predicate, limit_s: float = MAX_QUERY_S
 ) -> Iterator[None]:
     """Interrupt a query with a predicate after `limit_s`, and translate its errors.
 
     A connection can have one such query at a time. Raises `QuestionError` after the time limit.
     """
+    import duckdb
+
     expired = threading.Event()
 
     def stop() -> None:
@@ -181,6 +184,8 @@ def _expression(text: str, quoted: str) -> Tree:
 
 
 def _parse(text: str, quoted: str) -> Tree:
+    import duckdb
+
     try:
         (serialised,) = _run_scratch("SELECT json_serialize_sql($text::VARCHAR)", _QUERY + text)
     except (UnicodeEncodeError, duckdb.Error) as error:
@@ -209,6 +214,8 @@ def _normalized(value: Any) -> Any:
 
 def _deparse(tree: Tree) -> str | None:
     """Return the SQL of a parsed expression; None if the parser cannot write it."""
+    import duckdb
+
     (template,) = _run_scratch("SELECT json_serialize_sql($text::VARCHAR)", f"{_QUERY}true")
     query = json.loads(template)
     query["statements"][0]["node"]["where_clause"] = tree

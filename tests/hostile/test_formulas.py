@@ -42,7 +42,7 @@ def write_mdf(
 
 
 def read(file: Path, name: str, format_name: str = "mdf") -> Any:
-    with within(), open_here(format_name, None, Budget.of(file)) as source:
+    with within(), open_here(format_name, None, Budget.for_file(file)) as source:
         return np.concatenate([rows[name].to_numpy() for rows in source.batches([name])])
 
 

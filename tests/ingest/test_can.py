@@ -306,7 +306,7 @@ def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> Non
     frames = [motion(i) for i in range(50)] + [mux(i, 0, 1.0) for i in range(50)]
     (tmp_path / "car.dbc").write_text(DBC)
     bus = read_can_database(CanBus(database="car.dbc"), tmp_path)
-    with open_can_trace(bus, Budget.of(write_trace(tmp_path, frames))) as source:
+    with open_can_trace(bus, Budget.for_file(write_trace(tmp_path, frames))) as source:
         for column in ("Motion.ax", "Mux.yaw", "Motion.beta"):
             (table,) = source.batches([column])
             assert (table.height, table[column].null_count()) == (50, 0)

@@ -125,7 +125,7 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
     file = write_mdf(tmp_path, [a_x(), beta(**flags)], version=version)
     whole = read_measured(file, mdf_mapping())
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 33)
-    with mdf.open_mdf(Budget.of(file)) as source:
+    with mdf.open_mdf(Budget.for_file(file)) as source:
         batches = list(source.batches(["a_x", "beta"]))
     assert [batch.height for batch in batches] == [33, 33, 33, 1]
     log = read_measured(file, mdf_mapping())
@@ -358,7 +358,7 @@ def test_columns_of_matlab_5_are_listed(tmp_path: Path) -> None:
     }  # fmt: skip
     file = tmp_path / "log.mat"
     scipy.io.savemat(file, content)
-    with matlab.open_mat(Budget.of(file)) as source:
+    with matlab.open_mat(Budget.for_file(file)) as source:
         listed = [channel.name for channel in source.channels()]
         (batch,) = source.batches(["s.deep.x(:,2)"])
         (names,) = source.batches(["names"])

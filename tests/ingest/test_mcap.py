@@ -118,7 +118,7 @@ def write_json(
 
 def test_a_topic_of_which_a_part_cannot_be_decoded_is_refused(tmp_path: Path) -> None:
     file = write_json(tmp_path / "log.mcap", [{"a": 1.0}] * 4, ("json", "protobuf"))
-    with mcap_log.open_mcap(Budget.of(file)) as source, pytest.raises(InputError) as caught:
+    with mcap_log.open_mcap(Budget.for_file(file)) as source, pytest.raises(InputError) as caught:
         list(source.batches(["imu.a"]))
     assert "topic 'imu' has messages in an encoding that is not supported ('protobuf')" in str(
         caught.value
@@ -130,7 +130,7 @@ def test_a_field_with_a_text_far_down_is_one_of_texts(tmp_path: Path) -> None:
     messages[0]["b"] = messages[0]["c"] = None
     messages[17] |= {"b": "late", "c": 5}
     file = write_json(tmp_path / "log.mcap", messages)
-    with mcap_log.open_mcap(Budget.of(file)) as source:
+    with mcap_log.open_mcap(Budget.for_file(file)) as source:
         (base,) = source.bases(["imu.a", "imu.b", "imu.c"])
         found = pl.concat(base)
         assert found.height == 20

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows, stream
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA
+from fleet_slip.warehouse.warehouse import quarantine_schema
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.logs import schema_without, without_names
 from tests.support.measured import (
@@ -52,7 +52,7 @@ def test_the_table_has_the_schema_of_the_logs(tmp_path: Path) -> None:
         "sideslip": 0,
     }
     assert {name: value for name, value in first.items() if value is not None} == known
-    assert log.quarantine.schema == QUARANTINE_SCHEMA
+    assert log.quarantine.schema == quarantine_schema()
     assert log.quarantine.num_rows == 0
 
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.catalog.signals import as_arrow
+from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import log_rows as checking
 from fleet_slip.ingest import time_bases
@@ -256,7 +256,7 @@ def test_a_time_beyond_the_calendar_is_no_time(
     table = pa.table({"time": column})
     file = tmp_path / "log.parquet"
     pq.write_table(table, file)
-    with open_parquet(Budget.of(file)) as source:
+    with open_parquet(Budget.for_file(file)) as source:
         (batch,) = source.batches(["time"])
     assert [value is None for value in batch["time"]] == [True, False]
     assert capfd.readouterr().err == ""
@@ -267,7 +267,7 @@ def test_a_row_group_that_is_a_whole_file_is_not_in_memory_as_a_whole(tmp_path: 
     values = np.random.default_rng(0).random(rows)
     columns = pa.table({"ax": as_arrow(values)})
     pq.write_table(columns, tmp_path / "log.parquet", row_group_size=rows, use_dictionary=False)
-    with open_parquet(Budget.of(tmp_path / "log.parquet")) as source:
+    with open_parquet(Budget.for_file(tmp_path / "log.parquet")) as source:
         before = pa.total_allocated_bytes()
         batches = source.batches(["ax"])
         next(batches)

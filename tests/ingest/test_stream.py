@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleet_slip.catalog.signals import as_arrow
+from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import load, open_drives, stream
@@ -229,7 +229,7 @@ def test_plain_numbers_are_those_of_their_texts(
     form = CsvFormat(separator=";", decimal_comma=comma)
 
     def read(plain: PlainNumbers) -> pl.Series:
-        return pl.concat(CsvSource(Budget.of(file), form, plain).batches(["a"]))["a"]
+        return pl.concat(CsvSource(Budget.for_file(file), form, plain).batches(["a"]))["a"]
 
     found = read(PlainNumbers(frozenset({"a"}), (-99.0, float("nan"))))
     told = read(PlainNumbers())

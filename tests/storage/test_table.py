@@ -18,7 +18,6 @@ from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
-from fleet_slip.storage import table as tables
 from fleet_slip.storage.checksums import CHECKSUM_DIGITS, checksum_in, checksum_of
 from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
@@ -229,7 +228,7 @@ def test_a_table_is_opened_again_after_a_commit_of_anybody(
         opened.append(uri)
         return DeltaTable(uri, **options)
 
-    monkeypatch.setattr(tables, "DeltaTable", opening)
+    monkeypatch.setattr("deltalake.DeltaTable", opening)
     first = warehouse.logs.snapshot()
     assert len(first.files) == 1
     opened.clear()

@@ -17,7 +17,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.load import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
-from fleet_slip.warehouse.warehouse import QUARANTINE_SCHEMA, Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse, quarantine_schema
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 
@@ -48,7 +48,7 @@ class MeasuredLog:
     Strings are dictionary-encoded.
     """
     quarantine: pa.Table
-    """`QUARANTINE_SCHEMA`, in the file's order."""
+    """`quarantine_schema`, in the file's order."""
     counts: IngestCounts
     digest: str
     """SHA-256 of the file's bytes and the mapping: what has the same one was ingested before."""
@@ -64,7 +64,7 @@ def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
         drives = sorted(stream.drives(), key=lambda drive: drive.drive_id)
     return MeasuredLog(
         log_table(drives, mapping),
-        pa.concat_tables([QUARANTINE_SCHEMA.empty_table(), *stream.quarantine()]),
+        pa.concat_tables([quarantine_schema().empty_table(), *stream.quarantine()]),
         stream.counts,
         stream.digest,
     )

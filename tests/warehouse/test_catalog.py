@@ -11,7 +11,7 @@ import pytest
 
 from fleet_slip.catalog.definitions import Combination
 from fleet_slip.catalog.first_stage import FirstStageModel
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.resources import folder
@@ -147,7 +147,8 @@ def test_a_first_stage_model_belongs_to_its_root_until_that_is_closed(
     shutil.rmtree(path_of(warehouse.root) / "lines")
     assert warehouse.stacked_models.find(model.digest) == model, "it is read once"
     warehouse.close()
-    assert warehouse.stacked_models.find(model.digest) is None
+    with pytest.raises(StorageError, match="is missing"):
+        warehouse.stacked_models.find(model.digest)
 
 
 def test_a_worker_without_the_folder_of_configs_has_the_catalog(other: Warehouse) -> None:

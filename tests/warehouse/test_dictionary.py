@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from fleet_slip.views import VIEWS, connect
-from fleet_slip.warehouse.warehouse import COMMON, column_descriptions
+from fleet_slip.warehouse.table_views import COMMON, column_descriptions
 from tests.support.catalog import SIGNALS
 
 

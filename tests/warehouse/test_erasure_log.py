@@ -16,7 +16,8 @@ from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change, Table
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
-from fleet_slip.warehouse.warehouse import TABLE_VIEWS, Warehouse
+from fleet_slip.warehouse.table_views import TABLE_VIEWS
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts
 

@@ -75,8 +75,8 @@ def raw_numbers(signal: Any, payloads: Bytes) -> NDArray[Any]:
     """Return a signal as it was sent: integers, signed if it is, or floats."""
     value = raw_integers(signal, payloads)
     if signal.is_float:
-        whole = value.astype(f"u{signal.length // 8}")
-        return whole.view(_FLOATS[signal.length]).astype(np.float64)
+        bits = value.astype(f"u{signal.length // 8}")
+        return bits.view(_FLOATS[signal.length]).astype(np.float64)
     if not signal.is_signed:
         return value
     shift = np.int64(64 - signal.length)
@@ -143,38 +143,38 @@ class CanFrames:
         """Begin without any; what is too much for the memory goes to `spool`."""
         self._spool = spool
         self._waiting: list[FrameBlock] = []
-        self._found: Counter[tuple[str, int]] = Counter()
+        self._frame_counts: Counter[tuple[str, int]] = Counter()
 
     def extend(self, block: FrameBlock) -> None:
         """Keep frames of the message."""
         buses = block.buses.astype(np.str_)
         for bus in np.unique(buses).tolist():
             for size, frames in zip(*np.unique_counts(block.sizes[buses == bus]), strict=True):
-                self._found[bus, int(size)] += int(frames)
+                self._frame_counts[bus, int(size)] += int(frames)
         self._waiting.append(replace(block, buses=buses))
-        if sum(len(one.sizes) for one in self._waiting) >= PIECE_FRAMES:
+        if sum(len(block.sizes) for block in self._waiting) >= PIECE_FRAMES:
             self._spool.add(self, pickle.dumps(joined(self._waiting)))
             self._waiting = []
 
     @property
     def buses(self) -> list[str]:
         """The buses that the message is on, sorted."""
-        return sorted({bus for bus, _ in self._found})
+        return sorted({bus for bus, _ in self._frame_counts})
 
     def sizes_on(self, bus: str | None) -> Counter[int]:
         """Return how many frames have how many bytes, on a bus or on all."""
         sizes = Counter[int]()
-        for (of, size), frames in self._found.items():
-            sizes[size] += frames if bus in {None, of} else 0
+        for (frame_bus, size), frames in self._frame_counts.items():
+            sizes[size] += frames if bus in {None, frame_bus} else 0
         return +sizes
 
     def take(self, bus: str | None, size: int) -> Iterator[tuple[FloatArray, Bytes]]:
         """Yield times and first bytes of the payloads on a bus, or on all, piece by piece."""
         pieces = map(pickle.loads, self._spool.read(self))
         for block in chain(pieces, [joined(self._waiting)] if self._waiting else []):
-            some = block if bus is None else block.where(block.buses == bus)
-            if some.sizes.size:
-                yield some.times_s, some.data[:, :size]
+            selected = block if bus is None else block.where(block.buses == bus)
+            if selected.sizes.size:
+                yield selected.times_s, selected.data[:, :size]
 
 
 # What a mapping says of a CAN trace: the database of its messages, and the bus.
@@ -259,9 +259,11 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
                 "Copy "
                 "it again."
             )
-        sent = (one for one in trace if not (one.is_error_frame or one.is_remote_frame))
-        while some := list(islice(sent, AT_ONCE)):
-            yield _block_of(some)
+        sent = (
+            message for message in trace if not (message.is_error_frame or message.is_remote_frame)
+        )
+        while messages := list(islice(sent, AT_ONCE)):
+            yield _block_of(messages)
         if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
             raise InputError(
                 f"{quote_name(budget.file)}: an object in it is damaged, or ends too early. Copy "
@@ -279,13 +281,13 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
 
 def _block_of(frames: list[Any]) -> FrameBlock:
     """Return frames of python-can."""
-    payloads = b"".join(bytes(one.data).ljust(MOST_BYTES, b"\0") for one in frames)
+    payloads = b"".join(bytes(frame.data).ljust(MOST_BYTES, b"\0") for frame in frames)
     return FrameBlock(
-        np.array([one.arbitration_id for one in frames]),
-        np.array([one.is_extended_id for one in frames]),
-        np.array([one.timestamp for one in frames]),
-        np.array([str(one.channel) for one in frames]),
-        np.array([len(one.data) for one in frames]),
+        np.array([frame.arbitration_id for frame in frames]),
+        np.array([frame.is_extended_id for frame in frames]),
+        np.array([frame.timestamp for frame in frames]),
+        np.array([str(frame.channel) for frame in frames]),
+        np.array([len(frame.data) for frame in frames]),
         np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MOST_BYTES),
     )
 
@@ -302,7 +304,7 @@ class CanSource(FormatSource):
         self._file, self._bus, self._spool, self._blocks = file, bus, Spool(), blocks
         self._database = parse_database(bus)
         self._messages = {message.name: message for message in self._database.messages}
-        self._wanted: set[_Key] = set()
+        self._identifiers_to_keep: set[_Key] = set()
         self._numbers: set[_Key] = set()
         """Of the messages in the trace, once it was read."""
 
@@ -319,11 +321,13 @@ class CanSource(FormatSource):
     def find(self, column: str) -> tuple[str, Any]:
         """Return the name of a message, and the signal. Raises `InputError`."""
         name, _, signal_name = column.partition(".")
-        of = self._messages[name].signals if name in self._messages else ()
-        signal = next((s for s in of if s.name == signal_name and is_possible(s)), None)
+        signals = self._messages[name].signals if name in self._messages else ()
+        signal = next((s for s in signals if s.name == signal_name and is_possible(s)), None)
         if signal is None:
-            known = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
-            raise missing_column(self._bus.database, column, known)
+            names = [
+                f"{m}.{s.name}" for m, signals in self._messages.items() for s in signals.signals
+            ]
+            raise missing_column(self._bus.database, column, names)
         if not math.isfinite(signal.scale) or not signal.scale:
             raise InputError(
                 f"{quote_name(self._bus.database)}: the conversion of {column!r} is not linear "
@@ -332,16 +336,16 @@ class CanSource(FormatSource):
             )
         return name, signal
 
-    def prepare(self, wanted: dict[str, dict[str, Any]]) -> None:
+    def prepare(self, places_by_base: dict[str, dict[str, Any]]) -> None:
         """Read the trace for some messages."""
-        self._want({_key(self._messages[name]) for name in wanted})
+        self._want({_key(self._messages[name]) for name in places_by_base})
 
-    def _want(self, asked: set[_Key]) -> None:
+    def _want(self, keys: set[_Key]) -> None:
         """Read the trace, once more if it was read without these messages."""
-        if not self._numbers or not asked <= self._wanted:
-            self._wanted |= asked
+        if not self._numbers or not keys <= self._identifiers_to_keep:
+            self._identifiers_to_keep |= keys
             self._spool.clear()
-            self._frames = {key: CanFrames(self._spool) for key in self._wanted}
+            self._frames = {key: CanFrames(self._spool) for key in self._identifiers_to_keep}
             self._numbers = set()
             for block in self._blocks():
                 self._keep(block)
@@ -361,35 +365,35 @@ class CanSource(FormatSource):
         }
         for times_s, payloads in frames.take(self._bus.channel, needed):
             frame = {OWN_TIME: pl.Series(times_s)}
-            some = np.zeros(len(times_s), dtype=np.bool_)
+            has_value = np.zeros(len(times_s), dtype=np.bool_)
             for column, signal in signals.items():
                 sent = is_sent(message, signal, payloads)
-                some |= sent
+                has_value |= sent
                 raw = raw_numbers(signal, payloads)
                 frame[column] = _values(signal, raw, sent, as_names=column in named).alias(column)
-            yield pl.DataFrame(frame).filter(some)
+            yield pl.DataFrame(frame).filter(has_value)
 
     def _has_names_only(self, message: Any, signal: Any) -> bool:
         """Whether the database gives all values of a signal a name, and there is one."""
-        found = False
+        is_multiplexed = False
         needed = needed_bytes(signal)
         for _, payloads in self._frames[_key(message)].take(self._bus.channel, needed):
             sent = is_sent(message, signal, payloads)
             named = np.isin(raw_numbers(signal, payloads), list(signal.choices))
             if not (named | ~sent).all():
                 return False
-            found |= bool(sent.any())
-        return found
+            is_multiplexed |= bool(sent.any())
+        return is_multiplexed
 
     def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
         """Return the frames of a message. Raises `InputError` if they are not what it says."""
         frames = self._frames[_key(message)]
         if _key(message) not in self._numbers:
-            known = sum(_key(m) in self._numbers for m in self._database.messages)
+            known_ids = sum(_key(m) in self._numbers for m in self._database.messages)
             raise InputError(
                 f"{quote_name(self._file)}: no message {message.name} ({message.frame_id:#x}). Of "
                 "the "
-                f"{len(self._numbers)} identifiers in the trace, {known} are in "
+                f"{len(self._numbers)} identifiers in the trace, {known_ids} are in "
                 f"{self._bus.database}. Is it the database of this car and bus?"
             )
         buses = frames.buses
@@ -414,12 +418,12 @@ class CanSource(FormatSource):
         """Keep the frames of the wanted messages, and note the numbers of all."""
         keys = block.numbers << 1 | block.extended
         order = np.argsort(keys, kind="stable")
-        found, firsts = np.unique(keys[order], return_index=True)
-        for key, chosen in zip(found.tolist(), np.split(order, firsts[1:]), strict=True):
-            of = key >> 1, bool(key & 1)
-            self._numbers.add(of)
-            if of in self._frames:
-                self._frames[of].extend(block.where(chosen))
+        distinct, firsts = np.unique(keys[order], return_index=True)
+        for key, chosen in zip(distinct.tolist(), np.split(order, firsts[1:]), strict=True):
+            identifier = key >> 1, bool(key & 1)
+            self._numbers.add(identifier)
+            if identifier in self._frames:
+                self._frames[identifier].extend(block.where(chosen))
 
 
 def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:

@@ -44,7 +44,7 @@ _ENVIRONMENT = {
     "MALLOC_TRIM_THRESHOLD_": "1000000000",
 }
 """Else libraries reserve memory for threads that a reader does not need."""
-_KEPT = ("TZ", "LD_LIBRARY_PATH")
+_INHERITED = ("TZ", "LD_LIBRARY_PATH")
 _LARGEST_TEXT = 2**26
 _LOOK_S = 0.1
 """Interval in s at which the sum of a reader's temporary files is measured."""
@@ -55,12 +55,12 @@ _ONE_AT_A_TIME = Lock()
 def _server(_pid: int) -> tuple["subprocess.Popen[bytes]", socket.socket]:
     """Start what forks readers, for this process and not for one that it was forked from."""
     ours, theirs = socket.socketpair()
-    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    inherited = {name: os.environ[name] for name in _INHERITED if name in os.environ}
     with theirs:
         process = subprocess.Popen(  # noqa: S603 - our own interpreter
             [sys.executable, "-I", "-X", "utf8", "-c", _SERVE, str(theirs.fileno())]
             + [str(Path(place).absolute()) for place in sys.path],
-            env=_ENVIRONMENT | kept,
+            env=_ENVIRONMENT | inherited,
             pass_fds=[theirs.fileno()],
             start_new_session=True,
             stdin=subprocess.DEVNULL,
@@ -108,7 +108,7 @@ class ConfinedSource(Source):
 
     def channels(self) -> list[Channel]:
         """Return all that can be read, in the file's order."""
-        return [Channel(*map(str, one)) for one in self._ask("channels")[0]]
+        return [Channel(*map(str, fields)) for fields in self._ask("channels")[0]]
 
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
         """Return the rows of each time base that has one of the columns. Raises `InputError`."""
@@ -142,31 +142,31 @@ class ConfinedSource(Source):
         if text > _LARGEST_TEXT or size > self._budget.memory:
             raise self._budget.crashed()
         try:
-            said = json.loads(self._take(text, until_s))
+            answer = json.loads(self._take(text, until_s))
         except (ValueError, RecursionError):
             raise self._budget.crashed() from None
-        return self._found(said), self._take(size, until_s)
+        return self._require_answer(answer), self._take(size, until_s)
 
-    def _found(self, said: Any) -> Any:
-        if not isinstance(said, dict) or not {"found", "error"} & said.keys():
+    def _require_answer(self, answer: Any) -> Any:
+        if not isinstance(answer, dict) or not {"found", "error"} & answer.keys():
             raise self._budget.crashed()
-        if "found" in said:
-            return said["found"]
-        if said["error"] == "MemoryError":
+        if "found" in answer:
+            return answer["found"]
+        if answer["error"] == "MemoryError":
             raise self._budget.over_memory()
-        kind = getattr(errors, str(said["error"]), InputError)
+        kind = getattr(errors, str(answer["error"]), InputError)
         is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
-        raise (kind if is_ours else InputError)(str(said.get("text")))
+        raise (kind if is_ours else InputError)(str(answer.get("text")))
 
     def _take(self, size: int, until_s: float) -> bytearray:
         """Receive so many bytes. Raises `InputError` if they do not come in time."""
         taken = bytearray(size)
-        left = memoryview(taken)
-        while left:
+        remaining = memoryview(taken)
+        while remaining:
             remaining_s = until_s - time.monotonic()
             self._channel.settimeout(min(max(remaining_s, 1e-3), _LOOK_S))
             try:
-                came = self._channel.recv_into(left)
+                came = self._channel.recv_into(remaining)
             except TimeoutError:
                 if remaining_s < _LOOK_S:
                     raise self._budget.over_time() from None
@@ -176,7 +176,7 @@ class ConfinedSource(Source):
                 came = 0
             if not came:
                 raise self._budget.crashed()
-            left = left[came:]
+            remaining = remaining[came:]
         return taken
 
     def _require_disk(self) -> None:

@@ -79,19 +79,19 @@ class Job:
 def open_here(name: str, bus: CanBus | None, budget: Budget) -> AbstractContextManager[Source]:
     """Open a file of a format in this process. Raises `InputError`."""
     module = importlib.import_module(f"{__package__}.{FORMATS[name].module}")
-    given = [budget] if bus is None else [bus, budget]
-    source: AbstractContextManager[Source] = getattr(module, f"open_{name}")(*given)
+    arguments = [budget] if bus is None else [bus, budget]
+    source: AbstractContextManager[Source] = getattr(module, f"open_{name}")(*arguments)
     return source
 
 
 def serve(control: int) -> None:
     """Fork a reader for each socket that comes, until nobody is left who sends one."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
-    own = os.getpid()
+    parent = os.getpid()
     with socket.socket(fileno=control) as asking:
         while True:
-            name, given, *_ = socket.recv_fds(asking, 100, 1)
-            if not given:
+            name, descriptors, *_ = socket.recv_fds(asking, 100, 1)
+            if not descriptors:
                 return
             _, module, packages = FORMATS[name.decode()]
             importlib.import_module(f"{__package__}.{module}")
@@ -102,11 +102,11 @@ def serve(control: int) -> None:
             if not reader:
                 asking.close()
                 try:
-                    with socket.socket(fileno=given[0]) as channel:
-                        _Reader(channel).serve(own)
+                    with socket.socket(fileno=descriptors[0]) as channel:
+                        _Reader(channel).serve(parent)
                 finally:
                     os._exit(0)
-            os.close(given[0])
+            os.close(descriptors[0])
             handle = os.pidfd_open(reader)
             socket.send_fds(asking, [b"."], [handle])
             os.close(handle)
@@ -123,8 +123,8 @@ class _Reader:
 
     def serve(self, parent: int) -> None:
         """Answer what is asked of a file, confined to it."""
-        with self._channel.makefile("rb") as asked, contextlib.ExitStack() as opened:
-            job: Job = pickle.load(asked)  # noqa: S301 - of our own parent
+        with self._channel.makefile("rb") as requests, contextlib.ExitStack() as opened:
+            job: Job = pickle.load(requests)  # noqa: S301 - of our own parent
             os.chdir(job.cwd)
             tempfile.tempdir = job.folder
             confine(parent, job.file, job.folder, *job.limits)
@@ -136,7 +136,7 @@ class _Reader:
 
             if not self._answer(job.file, open_it):
                 return
-            for line in asked:
+            for line in requests:
                 name, *arguments = json.loads(line)
                 self._answer(job.file, partial(getattr(self, name), *arguments))
                 if name == "rows":
@@ -145,12 +145,12 @@ class _Reader:
     def _answer(self, file: str, find: Callable[[], Any]) -> bool:
         """Send what is found, or what is wrong; return whether it was found."""
         try:
-            found = find()
-            if isinstance(found, pl.DataFrame):
-                names = {name: str(place) for place, name in enumerate(found.columns)}
-                self._send({"found": [*names]}, found.rename(names))  # Arrow cuts names at a NUL
+            answer = find()
+            if isinstance(answer, pl.DataFrame):
+                names = {name: str(place) for place, name in enumerate(answer.columns)}
+                self._send({"found": [*names]}, answer.rename(names))  # Arrow cuts names at a NUL
             else:
-                self._send({"found": found})
+                self._send({"found": answer})
         except Exception as error:
             kind, text = type(error).__name__, str(error)
             if is_lack_of_memory(error) or getattr(error, "errno", 0) == errno.EFBIG:
@@ -170,7 +170,7 @@ class _Reader:
 
     def channels(self) -> list[tuple[str, ...]]:
         """Return all that can be read."""
-        return [astuple(one) for one in self._source.channels()]
+        return [astuple(channel) for channel in self._source.channels()]
 
     def bases(self, columns: Sequence[str]) -> list[int]:
         """Return the numbers of time bases, by which their rows are asked for."""
@@ -272,10 +272,10 @@ def confine(parent: int, file: str, folder: str, memory: int, disk: int, seconds
     _forbid_calls()
 
 
-def _limit(kind: int, most: int) -> None:
+def _limit(kind: int, limit: int) -> None:
     _, hard = resource.getrlimit(kind)
-    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    resource.setrlimit(kind, (most, most))
+    limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+    resource.setrlimit(kind, (limit, limit))
 
 
 def _close_files(file: str, folder: str) -> None:
@@ -285,8 +285,8 @@ def _close_files(file: str, folder: str) -> None:
         return
     handled = (1 << _RIGHTS.get(version, 16)) - 1
     ports, beyond = 3 if version >= 4 else 0, 3 if version >= 6 else 0
-    asked = struct.pack("QQQ", handled, ports, beyond)
-    rules = _call(_LIBC.syscall(_CREATE_RULESET, asked, len(asked), 0))
+    attributes = struct.pack("QQQ", handled, ports, beyond)
+    rules = _call(_LIBC.syscall(_CREATE_RULESET, attributes, len(attributes), 0))
     # Of the folder, all that the first version knows, and to cut files.
     allowed = {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
     for place, rights in {**dict(_readable()), **allowed}.items():

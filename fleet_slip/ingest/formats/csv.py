@@ -84,12 +84,12 @@ def text_of(stream: BinaryIO, csv_format: CsvFormat) -> BinaryIO:
     return BufferedReader(plain, 2**20)
 
 
-def first_lines(file: Path, csv_format: CsvFormat, most: int) -> list[str]:
+def first_lines(file: Path, csv_format: CsvFormat, count: int) -> list[str]:
     """Return the first lines of a text file, whatever it is compressed with."""
     with file.open("rb") as stream:
         text = text_of(stream, csv_format)
         lines = iter(lambda: text.readline(MAX_LINE_BYTES), b"")
-        return [line.decode("utf-8", "replace").rstrip("\r\n") for line in islice(lines, most)]
+        return [line.decode("utf-8", "replace").rstrip("\r\n") for line in islice(lines, count)]
 
 
 BLOCK_BYTES = 2**22
@@ -146,21 +146,21 @@ class CsvSource(FormatSource):
         """Return where a column stands. Raises `InputError`."""
         return "", find_column(self._file, self._names, column)
 
-    def read(self, _base: str, found: dict[str, int]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`."""
         with self._file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
             names = _csv_header(plain, self._file, self.csv_format)
-            numbers = set(self._numbers.columns & set(found))
+            numbers = set(self._numbers.columns & set(places))
 
             def parse(block: bytes) -> pl.DataFrame:
                 # Reading on over bad numbers is reading on over bad quotes.
                 fit = frozenset() if b'"' in block else frozenset(numbers)
-                parsed = self._parse(block, len(names), found, fit)
+                parsed = self._parse(block, len(names), places, fit)
                 texts = {name for name in fit if not self._numbers.are_in(parsed[name])}
                 if texts:
                     numbers.difference_update(texts)  # so that others need not be parsed twice
-                    again = self._parse(block, len(names), {n: found[n] for n in texts}, set())
+                    again = self._parse(block, len(names), {n: places[n] for n in texts}, set())
                     parsed = parsed.with_columns(again.select(sorted(texts)))
                 return parsed
 
@@ -223,36 +223,36 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
 
     Each begins with the padding, a line of its own: put here, the block is not copied for it.
     """
-    rest = before = padding
+    remainder = before = padding
     while more := stream.read(BLOCK_BYTES):
-        block = rest + more
+        block = remainder + more
         end = _end_of_lines(block)
         if end > len(padding):
-            whole, rest = block[:end], padding + block[end:]
-            _require_text(whole, file)
-            before = whole[whole.rfind(b"\n", 0, -1) + 1 :]
-            yield whole
+            lines, remainder = block[:end], padding + block[end:]
+            _require_text(lines, file)
+            before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
+            yield lines
             continue
         if len(block) > LINE_BLOCKS * BLOCK_BYTES:
             raise InputError(
                 f"{quote_name(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
                 "Is a quote not closed?"
             )
-        rest = block
-    if len(rest) > len(padding):
-        _require_text(rest, file)
-        yield _with_cut_marked(rest, before, padding)
+        remainder = block
+    if len(remainder) > len(padding):
+        _require_text(remainder, file)
+        yield _with_cut_marked(remainder, before, padding)
 
 
-def _with_cut_marked(rest: bytes, before: bytes, padding: bytes) -> bytes:
+def _with_cut_marked(line: bytes, before: bytes, padding: bytes) -> bytes:
     """Return the last line, which says in `EXTRA_FIELDS` if it is cut."""
-    last, separator, fields = rest[len(padding) :], padding[:1], len(padding) - 1
-    found = last.count(separator)
+    last, separator, fields = line[len(padding) :], padding[:1], len(padding) - 1
+    separators = last.count(separator)
     if not last.strip() or b'"' in before + last:
-        return rest
-    if found >= min(before.count(separator), fields - 1):
-        return rest
-    return rest + separator * (fields - found) + f'"{CUT}"'.encode()
+        return line
+    if separators >= min(before.count(separator), fields - 1):
+        return line
+    return line + separator * (fields - separators) + f'"{CUT}"'.encode()
 
 
 def _end_of_lines(block: bytes) -> int:

@@ -58,8 +58,8 @@ class Matrix:
 
     def read(self, column: int, start: int, end: int) -> Array:
         """Return some rows of a column."""
-        wanted = iter([column, slice(start, end)][-len(self.shape) :])
-        places = tuple(0 if size == 1 else next(wanted) for size in self._values.shape)
+        indices = iter([column, slice(start, end)][-len(self.shape) :])
+        places = tuple(0 if size == 1 else next(indices) for size in self._values.shape)
         return np.asarray(self._values[places])
 
 
@@ -76,40 +76,40 @@ class Vectors(FormatSource):
 
     def channels(self) -> list[Channel]:
         """Return all vectors, and the columns of matrices."""
-        found = []
+        channels = []
         for path, matrix in self._matrices.items():
             rows, columns = matrix.size
             names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
             if rows > 1 and columns <= _MOST_COLUMNS:
-                found += [Channel(name, matrix.unit, f"{rows} rows") for name in names]
-        return found
+                channels += [Channel(name, matrix.unit, f"{rows} rows") for name in names]
+        return channels
 
     def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
         """Return a matrix, and which of its columns is meant. Raises `InputError`."""
-        whole = self._matrices.get(column)
-        if whole is not None:
-            if whole.size[1] != 1:
-                axes = " x ".join(map(str, whole.shape)) or "1"
+        matrix_of_name = self._matrices.get(column)
+        if matrix_of_name is not None:
+            if matrix_of_name.size[1] != 1:
+                axes = " x ".join(map(str, matrix_of_name.shape)) or "1"
                 raise InputError(
                     f"{quote_name(self._file)}: channel {column!r} has {axes} values, not one a "
                     "row. "
                     "Map one of its columns."
                 )
-            return "", (whole, 0)
-        found = _COLUMN.fullmatch(column)
-        matrix = self._matrices.get(found[1]) if found else None
-        if found and matrix and 1 <= int(found[2]) <= matrix.size[1]:
-            return "", (matrix, int(found[2]) - 1)
+            return "", (matrix_of_name, 0)
+        match = _COLUMN.fullmatch(column)
+        matrix = self._matrices.get(match[1]) if match else None
+        if match and matrix and 1 <= int(match[2]) <= matrix.size[1]:
+            return "", (matrix, int(match[2]) - 1)
         for path, why in self._refused.items():
             if f"{column}.".startswith(f"{path}."):
                 raise InputError(f"{quote_name(self._file)}: {column!r} {why}")
         raise missing_column(self._file, column, [channel.name for channel in self.channels()])
 
-    def read(self, _base: str, found: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, places: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
-        first, (matrix, _) = next(iter(found.items()))
+        first, (matrix, _) = next(iter(places.items()))
         rows, _ = matrix.size
-        for name, (matrix, _) in found.items():
+        for name, (matrix, _) in places.items():
             if (length := matrix.size[0]) != rows:
                 raise InputError(
                     f"{quote_name(self._file)}: {name!r} has {length:,} values and {first!r} has "
@@ -119,7 +119,7 @@ class Vectors(FormatSource):
             end = min(start + WINDOW_ROWS, rows)
             yield pl.DataFrame(
                 as_column(self._file, name, matrix.read(column, start, end)).alias(name)
-                for name, (matrix, column) in found.items()
+                for name, (matrix, column) in places.items()
             )
 
 
@@ -128,13 +128,13 @@ def open_mat(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
     with budget.file.open("rb") as stream:
         content = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
-    own = {name: value for name, value in content.items() if not name.startswith("__")}
-    yield Vectors(dict(_arrays_in(own)), budget, {})
+    variables = {name: value for name, value in content.items() if not name.startswith("__")}
+    yield Vectors(dict(_arrays_in(variables)), budget, {})
 
 
-def _arrays_in(of: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Matrix]]:
+def _arrays_in(variables: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Matrix]]:
     """Yield the matrices of numbers or text in a struct, by path."""
-    for name, value in of.items():
+    for name, value in variables.items():
         if isinstance(value, dict):
             yield from _arrays_in(value, f"{above}{name}.")
         elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbU":

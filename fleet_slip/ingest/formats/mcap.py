@@ -45,8 +45,8 @@ def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str,
             below = [(f"[{number}]", item) for number, item in enumerate(value[:_MOST_ITEMS])]
         else:
             names = value if isinstance(value, dict) else getattr(type(value), "__slots__", ())
-            of = value if isinstance(value, dict) else {n: getattr(value, n) for n in names}
-            below = [(f".{name}" if path else str(name), of[name]) for name in names]
+            members = value if isinstance(value, dict) else {n: getattr(value, n) for n in names}
+            below = [(f".{name}" if path else str(name), members[name]) for name in names]
         for name, item in below:
             yield from leaves_of(item, path + name, depth + 1)
 
@@ -60,7 +60,7 @@ _STAMPS: tuple[tuple[_Path, _Path], ...] = tuple(
 def parse_path(name: str) -> _Path:
     """Return the names and numbers that lead to a field."""
     steps = re.findall(r"\[(\d+)\]|\.?([^.\[]+)", name)
-    return tuple(int(number) if number else of for number, of in steps)
+    return tuple(int(number) if number else name for number, name in steps)
 
 
 def value_at(message: Any, path: _Path) -> Any:
@@ -115,7 +115,7 @@ class McapSource(FormatSource):
     def __init__(self, budget: Budget) -> None:
         """Take the file."""
         self._file, self._spool = budget.file, Spool()
-        self._kept: dict[str, _Fields] = {}
+        self._decoded: dict[str, _Fields] = {}
         self._numbers: set[str] = set()
         self._texts: set[str] = set()
 
@@ -131,41 +131,44 @@ class McapSource(FormatSource):
         """Return a topic, and the path of a field. Raises `InputError`."""
         topics = [topic for topic in self._topics if column.startswith(f"{topic}.")]
         if not topics:
-            raise missing_column(self._file, column, [one.name for one in self.channels()])
+            raise missing_column(self._file, column, [channel.name for channel in self.channels()])
         topic = max(topics, key=len)
         return topic, column[len(topic) + 1 :]
 
-    def prepare(self, wanted: dict[str, _Fields]) -> None:
+    def prepare(self, places_by_base: dict[str, _Fields]) -> None:
         """Decode columns and put them aside, unless they are. Raises `InputError`."""
-        if any(not of.keys() <= self._kept.get(topic, {}).keys() for topic, of in wanted.items()):
-            self._decode(wanted)
-        for topic, of in wanted.items():
-            for column in of.keys() - self._numbers - self._texts:
+        if any(
+            not fields.keys() <= self._decoded.get(topic, {}).keys()
+            for topic, fields in places_by_base.items()
+        ):
+            self._decode(places_by_base)
+        for topic, fields in places_by_base.items():
+            for column in fields.keys() - self._numbers - self._texts:
                 names = [f"{topic}.{name}" for name in self._topics[topic]]
                 raise missing_column(self._file, column, names)
 
-    def read(self, topic: str, found: _Fields) -> Iterator[pl.DataFrame]:
+    def read(self, topic: str, places: _Fields) -> Iterator[pl.DataFrame]:
         """Yield fields of a topic."""
-        texts = [pl.col(column).cast(pl.String) for column in found if column in self._texts]
+        texts = [pl.col(column).cast(pl.String) for column in places if column in self._texts]
         for piece in self._spool.read(topic):
-            yield pl.read_ipc_stream(piece).select(OWN_TIME, *found).with_columns(texts)
+            yield pl.read_ipc_stream(piece).select(OWN_TIME, *places).with_columns(texts)
 
     @cached_property
     def _topics(self) -> dict[str, list[str]]:
         """The fields of the first message of each topic that can be decoded."""
-        found: dict[str, list[str]] = {}
+        fields_by_topic: dict[str, list[str]] = {}
         encodings = set[str]()
         for channel, decode, message in self._messages():
             encodings.add(channel.message_encoding)
-            if decode is not None and channel.topic not in found:
-                found[channel.topic] = list(dict(leaves_of(decode(message.data))))
-        if not found:
+            if decode is not None and channel.topic not in fields_by_topic:
+                fields_by_topic[channel.topic] = list(dict(leaves_of(decode(message.data))))
+        if not fields_by_topic:
             raise InputError(
                 f"{quote_name(self._file)}: no message in it can be decoded "
                 f"({', '.join(sorted(encodings)) or 'none'}). Supported are ROS 2 messages "
                 "(cdr with ros2msg schemas) and json."
             )
-        return found
+        return fields_by_topic
 
     def _messages(self) -> Iterator[tuple[Any, Decode | None, Any]]:
         """Yield the channel, the decoder and the record of all messages, in the file's order."""
@@ -184,15 +187,18 @@ class McapSource(FormatSource):
                     decode = _decoder_of(record, schemas.get(record.schema_id))
                     channels[record.id] = record, decode
 
-    def _decode(self, wanted: dict[str, _Fields]) -> None:
+    def _decode(self, fields_by_topic: dict[str, _Fields]) -> None:
         """Put columns of some topics aside."""
         self._spool.clear()
-        self._kept, self._numbers, self._texts = {}, set(), set()
-        waiting: dict[str, list[list[Any]]] = {topic: [] for topic in wanted}
-        paths = {topic: [parse_path(name) for name in of.values()] for topic, of in wanted.items()}
+        self._decoded, self._numbers, self._texts = {}, set(), set()
+        waiting: dict[str, list[list[Any]]] = {topic: [] for topic in fields_by_topic}
+        paths = {
+            topic: [parse_path(name) for name in fields.values()]
+            for topic, fields in fields_by_topic.items()
+        }
         for channel, decode, message in self._messages():
             topic = channel.topic
-            if topic not in wanted:
+            if topic not in fields_by_topic:
                 continue
             if decode is None:
                 raise InputError(
@@ -201,29 +207,29 @@ class McapSource(FormatSource):
                     f"not supported ({channel.message_encoding!r}). Record it in one encoding, or "
                     "map another topic."
                 )
-            found = decode(message.data)
-            values = [value_at(found, path) for path in paths[topic]]
-            waiting[topic].append([stamp_s(found, message.publish_time), *values])
+            content = decode(message.data)
+            values = [value_at(content, path) for path in paths[topic]]
+            waiting[topic].append([stamp_s(content, message.publish_time), *values])
             if len(waiting[topic]) >= PIECE_ROWS:
-                self._put_aside(topic, wanted[topic], waiting[topic])
+                self._put_aside(topic, fields_by_topic[topic], waiting[topic])
                 waiting[topic] = []
         for topic, rows in waiting.items():
-            self._put_aside(topic, wanted[topic], rows)
-        self._kept = wanted
+            self._put_aside(topic, fields_by_topic[topic], rows)
+        self._decoded = fields_by_topic
 
     def _put_aside(self, topic: str, fields: _Fields, rows: list[list[Any]]) -> None:
         times_s, *values = zip(*rows, strict=True) if rows else [()] * (1 + len(fields))
         columns = [pl.Series(OWN_TIME, times_s, dtype=pl.Float64)]
-        columns += [self._column(*one) for one in zip(fields, values, strict=True)]
+        columns += [self._column(*pair) for pair in zip(fields, values, strict=True)]
         content = io.BytesIO()
         pl.DataFrame(columns).write_ipc_stream(content)
         self._spool.add(topic, content.getvalue())
 
     def _column(self, column: str, values: Sequence[Any]) -> pl.Series:
         """Return some values of a column: all of it are numbers, or texts."""
-        some = [value for value in values if value is not None]
-        if all(isinstance(value, int | float) for value in some):
-            self._numbers |= {column} if some else set()
+        present = [value for value in values if value is not None]
+        if all(isinstance(value, int | float) for value in present):
+            self._numbers |= {column} if present else set()
             return pl.Series(column, values, dtype=pl.Float64, strict=False)
         self._texts.add(column)
         return pl.Series(column, [v if v is None else str(v) for v in values], dtype=pl.String)

@@ -94,10 +94,10 @@ def _kind_of(conversion: Any) -> str:
 
 def _listed(conversion: Any, name: str) -> Array:
     """Return parameters that are numbered from 0 on."""
-    of, found = vars(conversion), list[float]()
-    while f"{name}_{len(found)}" in of:
-        found.append(of[f"{name}_{len(found)}"])
-    return np.array(found, dtype=np.float64)
+    attributes, numbers = vars(conversion), list[float]()
+    while f"{name}_{len(numbers)}" in attributes:
+        numbers.append(attributes[f"{name}_{len(numbers)}"])
+    return np.array(numbers, dtype=np.float64)
 
 
 def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
@@ -120,9 +120,9 @@ def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
         return np.array(parts, dtype=bytes)[place]
     values = np.full(raw.shape, np.nan)  # of which some have a name instead
     for number in np.unique(place).tolist():
-        part, mine = parts[number], place == number
+        part, selected = parts[number], place == number
         if not isinstance(part, bytes):
-            values[mine] = to_physical(part, raw[mine])
+            values[selected] = to_physical(part, raw[selected])
     return values
 
 
@@ -170,7 +170,7 @@ class MdfSource(FormatSource):
                 if group in {str(number), getattr(groups[number].channel_group, "acq_name", "")}
             ]
         if not places:
-            raise missing_column(self._file, column, [one.name for one in self.channels()])
+            raise missing_column(self._file, column, [channel.name for channel in self.channels()])
         if len(places) > 1:
             titles = ", ".join(repr(f"{name}@{number}") for number, _ in places[:5])
             raise InputError(
@@ -180,12 +180,12 @@ class MdfSource(FormatSource):
             )
         return f"group {places[0][0]}", places[0]
 
-    def read(self, _base: str, found: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, places: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
         """Read channels of a group, some records at a time; what is marked as invalid is null."""
-        [number] = {number for number, _ in found.values()}
-        for signals in self._windows(number, {name: index for name, (_, index) in found.items()}):
+        [number] = {number for number, _ in places.values()}
+        for signals in self._windows(number, {name: index for name, (_, index) in places.items()}):
             frame = {OWN_TIME: pl.Series(self._times_s(signals[0]))}
-            for name, signal in zip(found, signals, strict=True):
+            for name, signal in zip(places, signals, strict=True):
                 values = as_column(self._file, name, signal.samples)
                 invalid = signal.invalidation_bits
                 if invalid is not None:
@@ -285,16 +285,16 @@ class MdfSource(FormatSource):
 
     def _require_data(self, number: int, name: str) -> None:
         """Raise `InputError` for a group that states more samples than there are bytes."""
-        group, there = self._mdf.groups[number], self._file.stat().st_size
-        whole = there
+        group, file_bytes = self._mdf.groups[number], self._file.stat().st_size
+        data_bytes = file_bytes
         if hasattr(group, "get_data_blocks"):  # MDF 3 has no compressed blocks
-            whole = sum(block.original_size for block in group.get_data_blocks())
+            data_bytes = sum(block.original_size for block in group.get_data_blocks())
         samples, size = group.channel_group.cycles_nr, group.channel_group.samples_byte_nr
-        if samples * size > whole:
+        if samples * size > data_bytes:
             raise InputError(
                 f"{quote_name(self._file)}: the group of {name!r} states {samples:,} samples of "
-                f"{size:,} bytes, and has {whole:,} bytes: it is truncated or damaged. Copy it "
-                "again."
+                f"{size:,} bytes, and has {data_bytes:,} bytes: it is truncated or damaged. Copy "
+                "the file again."
             )
 
     def frames(self) -> Iterator[FrameBlock]:
@@ -309,25 +309,25 @@ class MdfSource(FormatSource):
         for number in groups:
             places = {c.name: i for i, c in enumerate(self._mdf.groups[number].channels)}
             names = ("ID", "DataBytes", "DataLength", "IDE", "BusChannel")
-            there = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
-            if "DataBytes" not in there:
+            indices = {n: places[_FRAME + n] for n in names if _FRAME + n in places}
+            if "DataBytes" not in indices:
                 raise InputError(
                     f"{quote_name(self._file)}: group {number} has frames without "
                     f"{_FRAME}DataBytes. "
                     "Export it again, with payloads."
                 )
-            for window in self._windows(number, there):
-                found = {n: one.samples for n, one in zip(there, window, strict=True)}
-                numbers, payloads = found["ID"].astype(np.int64), _payloads(found["DataBytes"])
+            for window in self._windows(number, indices):
+                samples = {n: signal.samples for n, signal in zip(indices, window, strict=True)}
+                numbers, payloads = samples["ID"].astype(np.int64), _payloads(samples["DataBytes"])
                 extended = numbers & _EXTENDED != 0
-                if "IDE" in found:
-                    extended |= found["IDE"].astype(np.int64) != 0
-                sizes = found.get("DataLength", np.full(len(numbers), payloads.shape[1]))
+                if "IDE" in samples:
+                    extended |= samples["IDE"].astype(np.int64) != 0
+                sizes = samples.get("DataLength", np.full(len(numbers), payloads.shape[1]))
                 yield FrameBlock(
                     numbers & _IDENTIFIER,
                     extended,
                     self._times_s(window[0]),
-                    found.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
+                    samples.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
                     np.minimum(sizes.astype(np.int64), payloads.shape[1]),
                     payloads,
                 )
@@ -363,8 +363,8 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
     """Return payloads as a matrix of bytes, those that are shorter filled up."""
     if samples.ndim > 1:
         return samples.astype(np.uint8, copy=False)
-    found = np.asarray(samples, dtype="S64" if samples.dtype.kind == "O" else samples.dtype)
-    return np.ascontiguousarray(found).view(np.uint8).reshape(len(found), -1)
+    texts = np.asarray(samples, dtype="S64" if samples.dtype.kind == "O" else samples.dtype)
+    return np.ascontiguousarray(texts).view(np.uint8).reshape(len(texts), -1)
 
 
 @contextmanager

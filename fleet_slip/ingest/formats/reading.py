@@ -62,8 +62,8 @@ def require_unchanged_log(log: Path) -> Iterator[None]:
             "own path."
         )
     if not log.is_file():
-        what = "is not a regular file" if log.exists() else "no such file"
-        raise InputError(f"{quote_name(log)}: {what}. Give the path of a file.")
+        problem = "is not a regular file" if log.exists() else "no such file"
+        raise InputError(f"{quote_name(log)}: {problem}. Give the path of a file.")
     before = _size_and_time(log)
     yield
     if _size_and_time(log) != before:
@@ -83,7 +83,7 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
     Each format makes sure that the file stands for itself: that no value of it is to be fetched
     from another file, or computed, and that it is not far more than its `Budget` once decoded.
     """
-    budget = Budget.of(file)
+    budget = Budget.for_file(file)
     with file.open("rb") as stream:
         start = stream.read(_HDF5_AT + len(_HDF5))
     for magic, program in _ARCHIVES.items():
@@ -94,7 +94,9 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
             )
     suffix = file.suffix.lower()
     begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
-    name = next((name for name, of in FORMATS.items() if begun.startswith(of.begins)), "")
+    name = next(
+        (name for name, file_format in FORMATS.items() if begun.startswith(file_format.begins)), ""
+    )
     if formats.can is not None:
         name = "mdf_bus" if name == "mdf" else name or "can_trace"
     elif suffix in {".blf", ".asc"}:

@@ -87,20 +87,20 @@ class FormatSource(Source):
         """Return the name of a column's time base, and its place there. Raises `InputError`."""
 
     @abstractmethod
-    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the rows of some columns of a base, in bounded batches, at least one."""
 
-    def prepare(self, wanted: dict[str, dict[str, Any]]) -> None:
+    def prepare(self, places_by_base: dict[str, dict[str, Any]]) -> None:
         """Get ready to read some columns of some bases, where a file is read as a whole first."""
 
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
         """Return the rows of each time base that has one of the columns. Raises `InputError`."""
-        wanted: dict[str, dict[str, Any]] = {}
+        places_by_base: dict[str, dict[str, Any]] = {}
         for column in columns:
             base, place = self.find(column)
-            wanted.setdefault(base, {})[column] = place
-        self.prepare(wanted)
-        return [self.read(base, found) for base, found in wanted.items()]
+            places_by_base.setdefault(base, {})[column] = place
+        self.prepare(places_by_base)
+        return [self.read(base, places) for base, places in places_by_base.items()]
 
 
 def load_library(file: Path, package: str) -> Any:
@@ -150,24 +150,24 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
         raise InputError(
             f"{quote_name(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
         )
-    found = [i for i, name in enumerate(names) if name == column]
-    if len(found) > 1:
-        where = ", ".join(str(i + 1) for i in found[:5])
+    matches = [i for i, name in enumerate(names) if name == column]
+    if len(matches) > 1:
+        where = ", ".join(str(i + 1) for i in matches[:5])
         raise InputError(
-            f"{quote_name(file)}: {len(found)} columns are called {column!r} (number {where}). "
+            f"{quote_name(file)}: {len(matches)} columns are called {column!r} (number {where}). "
             "Rename all but one."
         )
-    if not found:
+    if not matches:
         raise missing_column(file, column, names)
-    return found[0]
+    return matches[0]
 
 
-def describe_unknown(signal: str, known: Iterable[str]) -> str:
+def describe_unknown(signal: str, signals: Iterable[str]) -> str:
     """Return what to say of a signal that the catalog does not have."""
-    names = list(known)
-    near = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
-    near += [name for name in names if signal in name.split("_") and name not in near]
-    hint = f" Do you mean {' or '.join(near[:3])}?" if near else ""
+    names = list(signals)
+    similar = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
+    similar += [name for name in names if signal in name.split("_") and name not in similar]
+    hint = f" Do you mean {' or '.join(similar[:3])}?" if similar else ""
     return f"unknown signal {signal!r}.{hint} Known signals: {', '.join(names)}"
 
 
@@ -175,12 +175,16 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
     """Return the error of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}
     matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
-    near = [folded[match] for match in matches]
-    hint = f" Did the mapping mean {' or '.join(repr(name[:80]) for name in near)}?" if near else ""
-    there = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
+    similar = [folded[match] for match in matches]
+    hint = (
+        f" Did the mapping mean {' or '.join(repr(name[:80]) for name in similar)}?"
+        if similar
+        else ""
+    )
+    present = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
     return InputError(
-        f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {there}{more}."
+        f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {present}{more}."
     )
 
 
@@ -206,7 +210,7 @@ class Budget:
     """Bytes of the file."""
 
     @classmethod
-    def of(cls, file: Path) -> "Budget":
+    def for_file(cls, file: Path) -> "Budget":
         """Return the budget of a file. Raises `OSError`."""
         return cls(file, file.stat().st_size)
 
@@ -266,11 +270,10 @@ class Budget:
             f"decoding its {self.size:,} bytes took more than {self.seconds:,.0f} s"
         )
 
-    def _too_much(self, what: str) -> InputError:
+    def _too_much(self, problem: str) -> InputError:
         return InputError(
-            f"{quote_name(self.file)}: {what}. Is it damaged? If it is a real recording, export it "
-            "as "
-            "uncompressed CSV."
+            f"{quote_name(self.file)}: {problem}. Is it damaged? If it is a real recording, "
+            "export it as uncompressed CSV."
         )
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:

@@ -65,10 +65,12 @@ class ParquetSource(FormatSource):
             )
         return "", None
 
-    def read(self, _base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, texts_of_folders: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
-        inside = [name for name, text in found.items() if text is None]
-        keys = [pl.lit(text).alias(name) for name, text in found.items() if text is not None]
+        inside = [name for name, text in texts_of_folders.items() if text is None]
+        keys = [
+            pl.lit(text).alias(name) for name, text in texts_of_folders.items() if text is not None
+        ]
         texts = [name for name in inside if _is_text(self._schema.field(name).type)]
         # Buffered before, the bytes of the whole file would stay in memory until its end; and
         # without a buffer those of each column of a row group, of which a file may have only one.

@@ -39,10 +39,13 @@ class _Vector(Matrix):
 
     def __init__(self, channel: Any) -> None:
         self._channel, self._first, self._ahead = channel, 0, np.zeros(0)
-        of, self.shape = channel.properties, (len(channel),)
-        self.unit, self.step_s = str(of.get("unit_string", "")), float(of.get("wf_increment", 0))
-        began_s = np.datetime64(of.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
-        offset_s = float(of.get("wf_start_offset", 0))
+        properties, self.shape = channel.properties, (len(channel),)
+        self.unit, self.step_s = (
+            str(properties.get("unit_string", "")),
+            float(properties.get("wf_increment", 0)),
+        )
+        began_s = np.datetime64(properties.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
+        offset_s = float(properties.get("wf_start_offset", 0))
         self.start_s = offset_s + (began_s if began_s > EARLIEST_S else 0.0)
         times = f"{self.start_s!r} s and each {self.step_s!r} s, {len(channel)} times"
         self.base = times if self.step_s > 0 else ""
@@ -63,17 +66,17 @@ class TdmsSource(Vectors):
 
     def channels(self) -> list[Channel]:
         """Return the waveforms, with their units."""
-        return [Channel(name, one.unit, one.base) for name, one in self._matrices.items()]
+        return [Channel(name, vector.unit, vector.base) for name, vector in self._matrices.items()]
 
     def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
         """Return what has the same times, and a waveform. Raises `InputError`."""
-        _, found = super().find(column)
-        return self._matrices[column].base, found
+        _, place = super().find(column)
+        return self._matrices[column].base, place
 
-    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield all rows, with their times."""
-        wave, row = self._matrices[next(iter(found))], 0
-        for rows in super().read(base, found):
+        wave, row = self._matrices[next(iter(places))], 0
+        for rows in super().read(base, places):
             times_s = wave.start_s + wave.step_s * np.arange(row, row + rows.height)
             row += rows.height
             yield rows.with_columns(pl.Series(OWN_TIME, times_s, dtype=pl.Float64))
@@ -91,27 +94,32 @@ def open_tdms(budget: Budget) -> Iterator[Vectors]:
         nptdms.log.log_manager.set_level(CRITICAL)  # each of its modules has a level of its own
         tdms = nptdms.TdmsFile.open(stream)
         last = tdms._reader._segments[-1:]
-        if [one.next_segment_pos for one in last] != [budget.size] or any(
-            one.segment_incomplete or one.final_chunk_lengths_override is not None for one in last
+        if [channel.next_segment_pos for channel in last] != [budget.size] or any(
+            channel.segment_incomplete or channel.final_chunk_lengths_override is not None
+            for channel in last
         ):
             raise InputError(
                 f"{quote_name(file)}: its last segment ends too early: it was cut off, or is still "
                 "written. Copy it again."
             )
-        channels = [one for group in tdms.groups() for one in group.channels() if len(one)]
-        if not channels or any(one.scaler_data_types for one in channels):
-            what = "has unscaled raw data of DAQmx" if channels else "has no values"
+        channels = [
+            channel for group in tdms.groups() for channel in group.channels() if len(channel)
+        ]
+        if not channels or any(channel.scaler_data_types for channel in channels):
+            problem = "has unscaled raw data of DAQmx" if channels else "has no values"
             raise InputError(
-                f"{quote_name(file)}: it {what}. Save it from LabVIEW or DIAdem, scaled."
+                f"{quote_name(file)}: it {problem}. Save it from LabVIEW or DIAdem, scaled."
             )
-        for of in (tdms, *tdms.groups(), *channels):
-            _require_scales(budget, of.properties)
-        several = Counter(one.name for one in channels)
+        for item in (tdms, *tdms.groups(), *channels):
+            _require_scales(budget, item.properties)
+        several = Counter(channel.name for channel in channels)
         vectors = {
-            one.name if several[one.name] < 2 else f"{one.name}@{one.group_name}": _Vector(one)
-            for one in channels
+            channel.name
+            if several[channel.name] < 2
+            else f"{channel.name}@{channel.group_name}": _Vector(channel)
+            for channel in channels
         }
-        waves = {name: one for name, one in vectors.items() if one.base}
+        waves = {name: channel for name, channel in vectors.items() if channel.base}
         yield TdmsSource(waves, budget, {}) if waves else Vectors(vectors, budget, {})
 
 

@@ -75,27 +75,29 @@ class VboSource(CsvSource):
             units |= {n: unit for n, unit in zip(self._names, called, strict=True) if unit}
         units |= zip(self._names[::-1], of_modules[::-1], strict=False)  # the last columns
         return [
-            Channel(one.name, units.get(one.name, ""), title=_KNOWN.get(one.name, ("",))[0])
-            for one in super().channels()
-            if one.name not in {"", _TIME}
+            Channel(
+                channel.name, units.get(channel.name, ""), title=_KNOWN.get(channel.name, ("",))[0]
+            )
+            for channel in super().channels()
+            if channel.name not in {"", _TIME}
         ]
 
-    def read(self, base: str, found: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the columns as CSV does, with their times. Raises `InputError`."""
         _, place = self.find(_TIME)
         start_s, last_s = None, np.nan
-        for rows in super().read(base, found | {_TIME: place}):
+        for rows in super().read(base, places | {_TIME: place}):
             times_s = _seconds(rows[_TIME])
-            known = np.isfinite(times_s)
-            if known.any():
+            is_finite = np.isfinite(times_s)
+            if is_finite.any():
                 if start_s is None:
-                    last_s = times_s[known][0]
+                    last_s = times_s[is_finite][0]
                     start_s = self._start_s(last_s)
-                whole = np.unwrap(np.append(last_s, times_s[known]), period=_DAY_S)[1:]
-                times_s[known], last_s = whole + start_s, whole[-1]
-            yield rows.select(pl.exclude({_TIME} - found.keys())).with_columns(
-                *(_number(name) * factor for name, factor in _DEGREES.items() if name in found),
-                *(_number(name) % _FLAGS for name in found if name == "sats"),
+                unwrapped_s = np.unwrap(np.append(last_s, times_s[is_finite]), period=_DAY_S)[1:]
+                times_s[is_finite], last_s = unwrapped_s + start_s, unwrapped_s[-1]
+            yield rows.select(pl.exclude({_TIME} - places.keys())).with_columns(
+                *(_number(name) * factor for name, factor in _DEGREES.items() if name in places),
+                *(_number(name) % _FLAGS for name in places if name == "sats"),
                 pl.Series(OWN_TIME, times_s).fill_nan(None),
             )
 

@@ -26,7 +26,8 @@ from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.warehouse import gram_reader
 from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
-from fleet_slip.warehouse.warehouse import Warehouse, open_tables
+from fleet_slip.warehouse.table_views import open_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
 from tests.support.logs import land, log_rows, random_counts
