@@ -1,13 +1,11 @@
 """The paper's filter against textbook algebra, the joint Gaussian, and what its model must give."""
 
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
@@ -140,70 +138,6 @@ def last_state(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) ->
         if np.isfinite(drive.gps_vx_mps[k]):
             update(state, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
     return state
-
-
-@kernel
-def normalised_innovations(
-    ax: Any, ay: Any, yaw_rate: Any, vx: Any, vy: Any, c: Any
-) -> NDArray[np.float64]:
-    """Return S^(−1/2) (z − H x̂) at the fixes after the first."""
-    state = kalman.initial_state(vx[0], vy[0], c)
-    found = np.full((2, len(ax)), np.nan)
-    for k in range(1, len(ax)):
-        predict(state, ax[k], ay[k], yaw_rate[k], STEP_S, c)
-        if not np.isnan(vx[k]):
-            ux, _, uy, _ = state.mean
-            p = state.covariance
-            l00 = np.sqrt(p[0, 0] + c.r_ux)
-            l10 = p[0, 2] / l00
-            found[0, k] = (vx[k] - ux) / l00
-            found[1, k] = (vy[k] - uy - l10 * found[0, k]) / np.sqrt(p[2, 2] + c.r_uy - l10 * l10)
-            update(state, vx[k], vy[k], c)
-    return found
-
-
-@cache
-def generated() -> tuple[DriveSignals, FloatArray]:
-    return generate(20_000, NOISE, seed=3)[:2]
-
-
-def innovations(assumed: FilterNoise) -> FloatArray:
-    drive, yaw_rate = generated()
-    found = normalised_innovations(
-        drive.ax_mps2,
-        drive.ay_mps2,
-        yaw_rate,
-        drive.gps_vx_mps,
-        drive.gps_vy_mps,
-        covariances(assumed),
-    )
-    whole: FloatArray = found[:, np.isfinite(found[0])]
-    return whole
-
-
-def ljung_box(series: FloatArray, lags: int = 20) -> float:
-    """Return the p-value of the hypothesis that a series is white."""
-    n = len(series)
-    centred = series - series.mean()
-    autocorrelation = [centred[lag:] @ centred[:-lag] / (centred @ centred) for lag in range(1, 21)]
-    statistic = n * (n + 2) * sum(r**2 / (n - lag) for lag, r in enumerate(autocorrelation, 1))
-    return float(stats.chi2.sf(statistic, lags))
-
-
-def test_innovations_are_white_and_of_the_predicted_size_on_data_of_the_model() -> None:
-    found = innovations(NOISE)
-    count = found.shape[1]
-    for series in found:
-        assert ljung_box(series) > 1e-3
-        assert abs(series.mean()) < 4 / np.sqrt(count)
-    low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], 2 * count)
-    assert low < np.sum(found**2) < high
-    assert abs(found[0] @ found[1]) < 4 * np.sqrt(count)
-
-
-def test_innovations_of_a_wrong_noise_are_not_white() -> None:
-    wrong = NOISE.model_copy(update={"gps_vx_std_mps": 0.5, "gps_vy_std_mps": 0.5})
-    assert all(ljung_box(series) < 1e-6 for series in innovations(wrong))
 
 
 @kernel
