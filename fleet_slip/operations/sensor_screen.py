@@ -220,7 +220,7 @@ def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
 
 
 def _has_measured(grams: Snapshot) -> bool:
-    """Whether any Gram row is of a measured drive; of many files a query tells it as fast."""
+    """Return True if there may be Gram rows of measured drives. Does not search many files."""
     if len(grams.files) > FEW_FILES:
         return True
     read = (grams.table.read_combinations(file.path, ["source"]) for file in grams.files)
