@@ -24,8 +24,8 @@ class StrayLink(PosixPath):
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
     """Return the given files, and the logs in the given folders, sorted.
 
-    A path that does not exist may be a pattern such as `2024-*/*.mf4`. The suffix identifies logs in
-    folders; hidden files and folders are skipped. Raises `InputError` for no files.
+    A path that does not exist may be a pattern such as `2024-*/*.mf4`. The suffix identifies logs
+    in folders; hidden files and folders are skipped. Raises `InputError` for no files.
     """
     for place in paths:
         if "://" in str(place):

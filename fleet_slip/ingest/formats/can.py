@@ -386,7 +386,7 @@ class CanSource(FormatSource):
         return is_multiplexed
 
     def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
-        """Return the frames of a message. Raises `InputError` if their size differs from its own."""
+        """Return the frames of a message. Raises `InputError` if their sizes differ."""
         frames = self._frames[_key(message)]
         if _key(message) not in self._numbers:
             known_ids = sum(_key(m) in self._numbers for m in self._database.messages)
