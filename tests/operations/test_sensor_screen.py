@@ -255,10 +255,10 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
         and "Run: fleet-slip gram" in told
     )
     with monkeypatch.context() as patch:
-        patch.setattr(sensor_screen, "READ_ON_THE_WAY", 100)
+        patch.setattr(sensor_screen, "CHECK_ROWS", 100)
         with pytest.raises(NotScreenedError, match=r"6 measured drives .* --include-faulty"):
             fleet.models.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr
-    assert "computed missing Gram rows of 6 measured drives" in done.stderr
+    assert "computing Gram rows of signals from 2 log files" in done.stderr
     assert fleet.models.get("m").manifest.trained_on.drives == 4
