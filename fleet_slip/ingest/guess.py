@@ -34,7 +34,7 @@ from fleet_slip.ingest.vocabulary import (
     unit_called,
     vocabulary,
 )
-from fleet_slip.quality.plausibility import RADIUS_M, TURNING, WHEELS
+from fleet_slip.quality.drive_signals import RADIUS_M, SIGNED, WHEELS
 
 _WEAK = 0.5
 """Weight of an ambiguous word; that of an unambiguous one is 1."""
@@ -157,7 +157,7 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
 
 def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
     """Return a magnitude with the column of its sign, where another is called so."""
-    if guess.signal not in TURNING or guess.profile.range[0] < 0:
+    if guess.signal not in (*SIGNED, "sideslip") or guess.profile.range[0] < 0:
         return guess
     words_of_name = sorted(parts_of(split_unit(guess.column)[0]))
     for other in profiles:

@@ -44,7 +44,7 @@ from fleet_slip.ingest.formats.can import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
-from fleet_slip.quality.plausibility import RADIUS_M
+from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 

@@ -21,7 +21,7 @@ from fleet_slip.catalog.counts import round_chunks
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
-from fleet_slip.quality.plausibility import RADIUS_M, SECOND, wrapped
+from fleet_slip.quality.drive_signals import RADIUS_M, TICKS_PER_S, wrap_angle
 
 # Fixes of a satellite receiver: which are valid, and at which ticks.
 
@@ -35,7 +35,7 @@ BACKWARDS_MPS = 8.0
 LEAST_TURNING_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
 
-GRIDS = tuple(ticks for ticks in range(1, SECOND + 1) if SECOND % ticks == 0)
+GRIDS = tuple(ticks for ticks in range(1, TICKS_PER_S + 1) if TICKS_PER_S % ticks == 0)
 """Spacings of fixes, in ticks, of which a whole number is a second."""
 REGULAR = 0.8
 LONGEST_BETWEEN = 25
@@ -114,10 +114,12 @@ def find_ticks(
 
 def _is_regular(fixes: IntArray) -> bool:
     """Return whether most fixes that have one about a second later have one exactly then."""
-    later = find_ticks(fixes, fixes + SECOND)[1]
-    next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
+    later = find_ticks(fixes, fixes + TICKS_PER_S)[1]
+    next_one = np.searchsorted(fixes, fixes + TICKS_PER_S - TICKS_PER_S // 10)
     has_next = next_one < fixes.size
-    has_next[has_next] = fixes[next_one[has_next]] <= fixes[has_next] + SECOND + SECOND // 10
+    has_next[has_next] = (
+        fixes[next_one[has_next]] <= fixes[has_next] + TICKS_PER_S + TICKS_PER_S // 10
+    )
     return not has_next.any() or bool(later[has_next].mean() >= REGULAR)
 
 
@@ -317,7 +319,7 @@ def fixes_on_ticks(
         sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
     courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
-    return wrapped(courses), speeds
+    return wrap_angle(courses), speeds
 
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
@@ -341,15 +343,20 @@ def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) ->
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
-    """Return the counts of the label at the centre of gravity, and of velocities it is made of."""
+    """Return the counts of the label at the centre of gravity, and of velocities it is made of.
+
+    There is no label below `LEAST_SPEED_MPS`, where sensors of angles report noise.
+    """
     sensor, signals = mapping.label, mapping.signal_catalog
-    if sensor is None:
-        return {}
     columns: dict[str, FloatArray] = {}
-    if sensor.from_velocities:
+    if sensor is not None and sensor.from_velocities:
         columns = _velocities(signals, sensor, counts)
-    elif sensor.is_elsewhere:
-        columns = _angle(signals, sensor, _speed(mapping, counts), counts)
+    elif signals.label in counts and (speed := _speed(mapping, counts)) is not None:
+        if sensor is not None and sensor.is_elsewhere:
+            columns = _angle(signals, sensor, speed, counts)
+        elif (slow := speed < LEAST_SPEED_MPS).any():
+            angle = physical(signals, counts, signals.label)
+            columns = {signals.label: np.where(slow, np.nan, angle)}
     return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
 
 
@@ -377,8 +384,8 @@ def _angle(
     return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
 
 
-def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
-    """Return the car's speed: as it is logged, or that of its wheels."""
+def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:
+    """Return the car's speed: as it is logged, or that of its wheels; None without both."""
     for name in OWN_SPEEDS:
         if name in counts:
             return np.abs(physical(mapping.signal_catalog, counts, name))
@@ -388,4 +395,4 @@ def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
         * (mapping.signals[name].radius_m or RADIUS_M)
         for name in wheels
     ]
-    return np.asarray(np.median(speeds, axis=0), dtype=np.float64)
+    return np.asarray(np.median(speeds, axis=0), dtype=np.float64) if speeds else None

@@ -22,7 +22,8 @@ from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
-from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
+from fleet_slip.quality.drive_signals import Signals, to_regular_grid
+from fleet_slip.quality.plausibility import check_plausibility
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
 from fleet_slip.warehouse.table_views import connect_tables

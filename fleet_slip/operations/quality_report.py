@@ -22,7 +22,7 @@ from fleet_slip.quality.course_relation import relate
 from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.quality.moments import DriveBatches
 from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
-from fleet_slip.quality.turning import find_implausible
+from fleet_slip.quality.turning import check_moments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.database import sql_text
@@ -141,7 +141,7 @@ def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
     found: dict[str, Fault] = {}
     for table, metadata in _long_drives(cohort, limits.min_rows):
         in_order = np.ones(len(table), dtype=np.bool_)
-        in_order[list(find_implausible(table, catalog.signals, limits.min_correlation))] = False
+        in_order[list(check_moments(table, catalog.signals, limits.min_correlation))] = False
         if in_order.sum() >= limits.min_drives:
             faults = find_reversed_labels(table, in_order, catalog.signals.label)
             in_order[list(faults)] = False
@@ -155,7 +155,7 @@ def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
 def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> QualityReport:
     """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
 
-    First for what no car does (`find_implausible`), then by comparison with its peers, if it has
+    First for what no car does (`check_moments`), then by comparison with its peers, if it has
     `min_drives` of them; see `_peer_groups`. `known` are faulty drives.
     """
     catalog = cohort.catalog
@@ -165,7 +165,7 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
     findings = []
     for table, metadata in _groups(cohort, limits.min_rows):
         names = metadata["drive_id"].to_pylist()
-        faults = find_implausible(table, catalog.signals, limits.min_correlation)
+        faults = check_moments(table, catalog.signals, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
         faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
