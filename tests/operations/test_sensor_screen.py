@@ -142,7 +142,8 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.gram()
         if name == "a":
             assert fleet.models.publish("m", fleet.cohort()).new
-    chosen = fleet.cohort().select()
+    assert fleet.cohort().examine().faults == {"late sideslip": 4}
+    chosen = fleet.cohort(include_faulty=True).select()
     with pytest.raises(RefusedError, match=r"of 4 inspected drives .*late sideslip\? it is \+0\.6"):
         fleet.models.publish("m", chosen)
     assert fleet.models.publish("m", chosen, candidate=True).candidate
