@@ -203,7 +203,7 @@ class Learner:
         if len(training) < QUARTERS * len(names) or len(names) < 2:
             cohort = self.quarters
             names = {_quarter_name(name, quarter) for name, quarter in training}
-        cohort = cohort.part(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
+        cohort = cohort.filter(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
         if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
             plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
         return plan.choose(replace(cohort, prior=prior) if prior else cohort)

@@ -1,4 +1,4 @@
-"""Checks the Gram rows against two other ways to compute them, bit for bit."""
+"""Comparison of stored Gram rows with the kernel and with SQL, bit for bit."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -20,12 +20,12 @@ from fleet_slip.warehouse.gram_rows import find_backlog, is_onboard, is_onboard_
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4
-"""The SQL of windows takes minutes for a file: one of so many files is checked."""
+"""Checks of plain features per check of windows, whose SQL takes minutes for a file."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What was compared. All of it was equal, or `StorageError` would have been raised."""
+    """Number of files and drives that were compared and equal."""
 
     files: int
     rows: int
@@ -35,12 +35,12 @@ class CheckReport:
 
     @property
     def ways(self) -> list[tuple[str, int, str]]:
-        """What was compared, in how many drives, and that it was equal."""
+        """Each comparison, its number of drives, and its result."""
         ways = ("stored Gram rows against the kernel", "SQL against the kernel")
-        found = [(way, self.drives, "yes") for way in ways]
+        rows = [(way, self.drives, "yes") for way in ways]
         if wide := ", ".join(self.wide_sets):
-            found.append((f"stored against the kernel: {wide}", self.wide_drives, "yes"))
-        return found
+            rows.append((f"stored against the kernel: {wide}", self.wide_drives, "yes"))
+        return rows
 
 
 def check_grams(
@@ -49,7 +49,7 @@ def check_grams(
     progress: Progress = no_progress,
     begin: int = 0,
 ) -> CheckReport:
-    """Check the Gram rows of evenly chosen log files, the next ones for the next number `begin`.
+    """Check the Gram rows of `count` evenly spaced log files, the first one at `begin`.
 
     Raises `StorageError` naming the first drive that differs, and `DataError` for nothing to check.
     """
@@ -64,12 +64,12 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
             f"{warehouse.root}: no logs to compute Gram rows from. Load some: fleet-slip "
             "ingest, or fleet-slip run. Gram rows sent by cars are checked by: fleet-slip verify"
         )
-    chosen = _evenly(logs.files, count, begin)
-    where = find_gram_files(warehouse, grams.files)
+    files = _evenly(logs.files, count, begin)
+    gram_files = find_gram_files(warehouse, grams.files)
     drives = wide_drives = 0
-    for file in chosen:
-        drives += _compare_ways(warehouse, file, PLAIN, where.get(file.path, ()))
-        progress(1, len(chosen))
+    for file in files:
+        drives += _compare_ways(warehouse, file, PLAIN, gram_files.get(file.path, ()))
+        progress(1, len(files))
     catalog = warehouse.catalog
     wide = tuple(
         name
@@ -81,8 +81,8 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         missing = find_backlog(logs, grams, catalog.identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
         for file in _evenly(computed, max(1, count // SQL_COSTS), begin):
-            wide_drives += _compare_ways(warehouse, file, name, [one.path for one in grams.files])
-    return CheckReport(len(chosen), sum(file.rows for file in chosen), drives, wide, wide_drives)
+            wide_drives += _compare_ways(warehouse, file, name, [f.path for f in grams.files])
+    return CheckReport(len(files), sum(file.rows for file in files), drives, wide, wide_drives)
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:
@@ -91,24 +91,28 @@ def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFil
 
 
 def _compare_ways(
-    warehouse: Warehouse, file: TableFile, feature_set: str, places: Iterable[str]
+    warehouse: Warehouse, file: TableFile, feature_set: str, gram_files: Iterable[str]
 ) -> int:
-    """Compare the kernel with what is stored, if it is there, and with SQL; count drives."""
+    """Compare the Gram rows of a log file by the kernel with the stored ones and with SQL.
+
+    Returns the number of drives; 0 for windows that were not computed.
+    """
     identity = warehouse.catalog.identity(feature_set)
-    stored = stored_grams(warehouse, [file], places, identity).get(file.path, {})
+    stored = stored_grams(warehouse, [file], gram_files, identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
-    late = recorded_delays(warehouse.grams.snapshot(), identity, file.path)
-    rows = wide_grams(warehouse, [file], feature_set, late)
-    computed, others = grams_of(rows), {"the stored Gram rows": stored}
+    delays = recorded_delays(warehouse.grams.snapshot(), identity, file.path)
+    rows = wide_grams(warehouse, [file], feature_set, delays)
+    computed, references = grams_of(rows), {"the stored Gram rows": stored}
     if has_statement(warehouse.catalog, feature_set):
-        others["SQL"] = grams_of(by_sql(warehouse, [file], feature_set))
-    for other, found in others.items():
-        if drives := differing_drives(computed, found):
+        references["SQL"] = grams_of(by_sql(warehouse, [file], feature_set))
+    for reference, grams in references.items():
+        if drives := differing_drives(computed, grams):
             raise StorageError(
                 f"{file.path}: the Gram row of drive {drives[0]} ({feature_set}) differs "
-                f"between the kernel and {other}. If the logs have changed since, run: fleet-slip "
-                "gram. Otherwise the file or a library is damaged: keep both and report it."
+                f"between the kernel and {reference}. If the logs have changed since, run: "
+                "fleet-slip gram. Otherwise the file or a library is damaged: keep both and "
+                "report it."
             )
     return len(rows["drive_id"].unique())
 
@@ -117,35 +121,35 @@ DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
 
 
 def grams_of(rows: pa.Table) -> DriveGrams:
-    """Return rows of the table `grams` as Grams, by the names of drive and part."""
-    found = {}
+    """Return rows of the table `grams` as Grams, by drive (and block) and signals."""
+    grams = {}
     for row in rows.select(["drive_id", "part", "signals", "n", "sums", "products"]).to_pylist():
         signals = tuple(row["signals"].split(",")) if row["signals"] else ()
         drive = row["drive_id"] if row["part"] is None else f"{row['drive_id']}, {row['part']}"
-        found[drive, signals] = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
-    return found
+        grams[drive, signals] = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
+    return grams
 
 
-def differing_drives(one: DriveGrams, two: DriveGrams) -> list[str]:
-    """Return the drives whose Grams differ, sorted, whatever the order of signals then and now."""
-    one, two = _in_one_order(one), _in_one_order(two)
-    return sorted({key[0] for key in one.keys() | two.keys() if one.get(key) != two.get(key)})
+def differing_drives(a: DriveGrams, b: DriveGrams) -> list[str]:
+    """Return the sorted drives whose Grams differ, regardless of the order of signals."""
+    a, b = _sort_signals(a), _sort_signals(b)
+    return sorted({key[0] for key in a.keys() | b.keys() if a.get(key) != b.get(key)})
 
 
-def _in_one_order(grams: DriveGrams) -> DriveGrams:
+def _sort_signals(grams: DriveGrams) -> DriveGrams:
     ordered = ((drive, tuple(sorted(signals)), gram) for (drive, signals), gram in grams.items())
     return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
 
 
 def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[str, tuple[str, ...]]:
-    """Return the paths of the Gram files with rows of the logged signals of each log file."""
-    found: dict[str, tuple[str, ...]] = {}
+    """Return the paths of the Gram files with rows of logged signals, by log file."""
+    paths: dict[str, tuple[str, ...]] = {}
     for path in (gram_file.path for gram_file in grams if not is_onboard_file(gram_file)):
         pairs = warehouse.grams.read_combinations(path, ["feature_set", "file"])
-        mine = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_onboard(pairs)))
-        for file in pairs.filter(mine)["file"].to_pylist():
-            found[file] = (*found.get(file, ()), path)
-    return found
+        mask = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_onboard(pairs)))
+        for file in pairs.filter(mask)["file"].to_pylist():
+            paths[file] = (*paths.get(file, ()), path)
+    return paths
 
 
 def stored_grams(
@@ -154,15 +158,15 @@ def stored_grams(
     grams: Iterable[str],
     identity: str = PLAIN,
 ) -> dict[str, DriveGrams]:
-    """Return the Gram rows of some log files and a feature set in some Gram files, by log file."""
+    """Return the stored Grams of log files and a feature set, by log file."""
     paths = pa.array([file.path for file in files], pa.string())
-    found: dict[str, DriveGrams] = defaultdict(dict)
+    stored: dict[str, DriveGrams] = defaultdict(dict)
     for path in grams:
         pairs = warehouse.grams.read(path, ["feature_set", "file"])
         names = pairs["file"].cast(pa.string())
-        mine = pc.and_(pc.equal(pairs["feature_set"], identity), pc.is_in(names, paths))
-        if pc.any(mine).as_py():
-            rows = warehouse.grams.read(path).filter(mine)
+        mask = pc.and_(pc.equal(pairs["feature_set"], identity), pc.is_in(names, paths))
+        if pc.any(mask).as_py():
+            rows = warehouse.grams.read(path).filter(mask)
             for file in rows["file"].unique().to_pylist():
-                found[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
-    return found
+                stored[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
+    return stored

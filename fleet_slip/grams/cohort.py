@@ -1,7 +1,7 @@
-"""Cohorts: Gram rows of the drives that satisfy an SQL predicate, each with a fold and a weight.
+"""Cohorts: Gram rows of the drives that satisfy an SQL predicate, with folds and weights.
 
-What looks at single drives has all Gram rows in memory; what compares given models needs the exact
-sum of each fold alone, of any number of rows.
+Methods on single drives need all Gram rows in memory. The comparison of listed models needs only
+the exact sum of each fold, for any number of rows.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, Hashes, IntArray
 from fleet_slip.base import pluralize
@@ -49,7 +50,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:
-    """Yield how many drives have no Gram rows of a feature set, since their cars sent no log."""
+    """Yield a remark on drives without Gram rows of a feature set: their cars sent no log."""
     if drives:
         yield Remark(
             f"{pluralize(drives, 'drive')} without a log left out: cars send Gram rows of the "
@@ -59,7 +60,7 @@ def remark_left_out(drives: int, feature_set: str) -> Iterator[Remark]:
 
 @dataclass(frozen=True)
 class CompleteCases:
-    """The drives of a cohort with all of some signals: a Gram row and metadata each, in order."""
+    """Drives of a cohort that contain all given signals: a Gram row and metadata for each."""
 
     table: GramTable
     drives: pa.Table
@@ -67,21 +68,22 @@ class CompleteCases:
 
 @dataclass(frozen=True, kw_only=True)
 class Cohort:
-    """Gram rows of drives, each with a fold and a weight.
+    """Gram rows of the drives that satisfy a predicate.
 
-    A drive has several rows if a signal is in some of its rows only, or if its set has parts.
+    A drive has several rows if a signal is missing in some of its log rows, or if its feature set
+    divides drives into blocks.
 
     Attributes:
-        catalog: what the columns of the Gram rows are.
-        predicate: which drives, by the columns of the view `drives`.
-        logs_version, grams_version, feature_set: what was read.
-        left_out: drives of the predicate that have no such Gram rows: their cars sent no log.
-        drives: a line for each Gram row: whose it is, its signals, and of how many rows.
-        tables: the Gram rows in the order of `drives`, by signals; none if only sums were kept.
-        sums, folding: the Gram of each fold, if only these were kept, and what the folds are of.
-        source: where the Gram rows were read, and can be read again.
-        prior, weight: Gram rows of simulated drives, which are in no fold and always trained on,
-            with this weight, where the others have 1.
+        catalog: definitions of the columns.
+        predicate: SQL predicate on the view `drives`.
+        logs_version, grams_version, feature_set: the data that were read.
+        left_out: number of drives without such Gram rows because their cars sent no log.
+        drives: metadata of each Gram row: drive, car, signals, number of rows.
+        tables: the Gram rows in the order of `drives`, by signals; empty if only `sums` were read.
+        sums, folding: the Gram of each fold and the division into folds, if only these were read.
+        source: warehouse or reader of the Gram rows.
+        prior, weight: Gram rows of simulated drives that belong to the training set of every fold,
+            and the weight of their rows; rows of the cohort have the weight 1.
     """
 
     catalog: Catalog
@@ -100,12 +102,12 @@ class Cohort:
 
     @property
     def rows(self) -> int:
-        """Number of rows of the logs behind the cohort."""
+        """Number of log rows."""
         return int(pc.sum(self.drives["n"]).as_py())
 
     @cached_property
     def drive_numbers(self) -> IntArray:
-        """The drive of each Gram row, numbered from 0."""
+        """Number of the drive of each Gram row, from 0."""
         indices = pc.dictionary_encode(self.drives["drive_id"].combine_chunks()).indices
         return np.asarray(indices.to_numpy(), dtype=np.int64)
 
@@ -116,17 +118,16 @@ class Cohort:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """What a search may choose of the columns that any drive has, in the set's order.
-
-        With a prior those that it has as well.
-        """
-        present = {name for kind in _kinds(self.drives) for name in kind.split(",")}
+        """Candidate inputs of a search: columns that the drives, and the prior, contain."""
+        present = {
+            name for signals in _distinct_signals(self.drives) for name in signals.split(",")
+        }
         if self.prior is not None:
             present &= set(self.prior.inputs)
         return tuple(n for n in self.catalog.search_inputs(self.feature_set) if n in present)
 
     def gram_condition(self, inputs: Sequence[str]) -> str:
-        """Return the SQL predicate on the view `grams` of the rows that a model is made of."""
+        """Return the SQL predicate on the view `grams` for the training rows of a model."""
         catalog, columns = self.catalog, self.catalog.calibrated
         stored = dict.fromkeys(columns[name].of if name in columns else name for name in inputs)
         names = ", ".join(f"'{name}'" for name in [*stored, catalog.signals.label])
@@ -136,40 +137,41 @@ class Cohort:
         )
 
     def hash_drives_with(self, signals: Collection[str]) -> Hashes:
-        """Return the hashes of the drives trained on with all of some signals, once, sorted."""
-        hashes: Hashes = np.unique(_lines_with(self.drives, signals)["drive_hash"].to_numpy())
+        """Return the sorted hashes of the drives that contain all given signals."""
+        hashes: Hashes = np.unique(_rows_with(self.drives, signals)["drive_hash"].to_numpy())
         return hashes
 
     def count_vehicles_with(self, signals: Collection[str]) -> int:
-        """Return the number of cars trained on that have all of some signals."""
-        return int(pc.count_distinct(_lines_with(self.drives, signals)["vehicle_hash"]).as_py())
+        """Return the number of cars whose drives contain all given signals."""
+        return int(pc.count_distinct(_rows_with(self.drives, signals)["vehicle_hash"]).as_py())
 
     def count_onboard_with(self, signals: Collection[str] = ()) -> int:
-        """Return the number of drives trained on without a log that have all of some signals."""
-        rows = _lines_with(self.drives, signals)
-        received = rows.filter(pc.equal(rows["source"].cast(pa.string()), RECEIVED))
-        return int(pc.count_distinct(received["drive_hash"]).as_py())
+        """Return the number of drives without a log that contain all given signals."""
+        rows = _rows_with(self.drives, signals)
+        onboard = rows.filter(pc.equal(rows["source"].cast(pa.string()), RECEIVED))
+        return int(pc.count_distinct(onboard["drive_hash"]).as_py())
 
     def folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        """Divide the cohort into folds, of whole drives unless by `part`.
+        """Divide the cohort into folds by a key of `FOLD_KEYS`.
 
-        By a key of `FOLD_KEYS`: a fold for each value, or hashed into `count` if there are more
-        (`EACH`: never); by `speed` in bands; by `part` as the feature set has them. Raises
-        `QuestionError` if it has none. Where only sums were kept the Gram rows are read again.
+        Each value of the key is a fold; more than `count` values are hashed into `count` folds,
+        unless `count` is `EACH`. `speed` makes bands, `part` the blocks of the feature set. Raises
+        `QuestionError` if the feature set has no blocks. Reads Gram rows again if only sums of
+        other folds were read.
         """
-        folds = self._own_folds(by, count)
+        folds = self._folds_without_prior(by, count)
         if self.prior is None:
             return folds
         auxiliary = tuple(table.total() for table in self.prior.tables)
         return replace(folds, auxiliary=auxiliary, weight=self.weight)
 
-    def _own_folds(self, by: FoldKey, count: FoldCount) -> CohortFolds:
+    def _folds_without_prior(self, by: FoldKey, count: FoldCount) -> CohortFolds:
         folding = Folding(by=by, count=count)
         if self.sums is not None and folding == self.folding:
             return self.sums
         if self.sums is not None and self.source is not None:
-            again = load_cohort(self.source, self.predicate, self.feature_set, folding)
-            return again._own_folds(by, count)
+            cohort = load_cohort(self.source, self.predicate, self.feature_set, folding)
+            return cohort._folds_without_prior(by, count)
         require_blocks(self.catalog, self.feature_set, by)
         values = self.drives[FOLD_KEYS[by]].to_pylist()
         return CohortFolds.from_tables(
@@ -177,7 +179,7 @@ class Cohort:
         )
 
     def complete_cases(self, inputs: Sequence[str]) -> CompleteCases:
-        """Return the drives with the label and all inputs, a Gram row each. Raises `DataError`."""
+        """Return the drives that contain the label and all inputs. Raises `DataError` for none."""
         if self.sums is not None and self.source is not None:
             return load_cohort(self.source, self.predicate, self.feature_set).complete_cases(inputs)
         table, mask = complete_cases(self.tables, [*inputs, self.catalog.signals.label])
@@ -189,36 +191,39 @@ class Cohort:
             return CompleteCases(table, self.drives.take(rows))
         return CompleteCases(table.merged(number), self.drives.take(rows[first]))
 
-    def part(self, wanted: BoolArray) -> "Cohort":
-        """Return the cohort with some of its Gram rows only; the mask lists them all."""
-        stops = np.cumsum([len(table) for table in self.tables])[:-1]
-        masks = np.split(wanted, stops)
-        kept = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
-        return replace(self, tables=tuple(kept), drives=self.drives.filter(pa.array(wanted)))
+    def filter(self, mask: BoolArray) -> "Cohort":
+        """Return the cohort with the Gram rows that a mask selects."""
+        masks = self._split(mask)
+        tables = [table.take(m) for table, m in zip(self.tables, masks, strict=True) if m.any()]
+        return replace(self, tables=tuple(tables), drives=self.drives.filter(pa.array(mask)))
 
-    def weighted(self, parts: IntArray) -> "Cohort":
-        """Return the cohort with each of its Gram rows so many times, and `FULL` times the others.
+    def weighted(self, weights: IntArray) -> "Cohort":
+        """Return the cohort with its Gram rows times integer weights, and the prior times `FULL`.
 
-        Rows of weight zero are left out.
+        Rows of weight zero are dropped.
         """
-        kept, left = self.part(parts > 0), parts[parts > 0]
-        each = np.split(left, np.cumsum([len(one) for one in kept.tables])[:-1])
+        cohort = self.filter(weights > 0)
+        factors = cohort._split(weights[weights > 0])
         prior = self.prior
         if prior is not None:
             prior = prior.weighted(np.full(len(prior.drives), FULL))
-        tables = tuple(weighted(one, some) for one, some in zip(kept.tables, each, strict=True))
-        return replace(kept, tables=tables, prior=prior)
+        tables = tuple(weighted(*pair) for pair in zip(cohort.tables, factors, strict=True))
+        return replace(cohort, tables=tables, prior=prior)
+
+    def _split(self, values: NDArray[Any]) -> list[NDArray[Any]]:
+        """Split values of all Gram rows by table."""
+        return np.split(values, np.cumsum([len(table) for table in self.tables])[:-1])
 
 
-def _kinds(drives: pa.Table) -> list[str]:
+def _distinct_signals(drives: pa.Table) -> list[str]:
     return list(drives["signals"].unique().to_pylist())
 
 
-def _lines_with(drives: pa.Table, signals: Collection[str]) -> pa.Table:
-    """Return the lines of the Gram rows that have all of some signals."""
-    wanted = set(signals)
-    kinds = [kind for kind in _kinds(drives) if wanted <= set(kind.split(","))]
-    return drives.filter(pc.is_in(drives["signals"], pa.array(kinds, pa.string())))
+def _rows_with(drives: pa.Table, signals: Collection[str]) -> pa.Table:
+    """Return the rows whose signals include all given ones."""
+    required = set(signals)
+    matches = [text for text in _distinct_signals(drives) if required <= set(text.split(","))]
+    return drives.filter(pc.is_in(drives["signals"], pa.array(matches, pa.string())))
 
 
 def load_cohort(
@@ -229,10 +234,10 @@ def load_cohort(
 ) -> Cohort:
     """Read the Gram rows of the drives that satisfy a predicate.
 
-    With a `folding` only the sum of each fold is kept, which takes little memory. Raises
+    With a `folding` only the sum of each fold is read, which takes little memory. Raises
     `QuestionError` for an invalid predicate, `DataError` if no drive satisfies it, for a single
-    fold, or if the set was not computed for all logs, `RefusedError` for drives of evaluation
-    scenarios.
+    fold, or if the feature set was not computed for all logs, and `RefusedError` for drives of
+    evaluation scenarios.
     """
     catalog = source.catalog
     predicate = parse_cohort(catalog.signals, predicate)
@@ -242,13 +247,14 @@ def load_cohort(
         if folding is None:
             rows = opened.rows(predicate)
             require_training(rows["source"].unique().to_pylist(), predicate)
-            kept = _expand_rows(opened, rows)
-            if not kept["tables"]:  # no row, or none of changes
+            content = _expand_rows(opened, rows)
+            if not content["tables"]:  # no row, or none with changes
                 raise empty_cohort_error(opened, predicate)
         else:
             names, fold_of = _find_folds(opened, folding, predicate)
             grams, drives = _add_up(opened, predicate, names, fold_of)
-            kept = {"drives": drives, "sums": _used_folds(names, grams, drives), "folding": folding}
+            sums = _used_folds(names, grams, drives)
+            content = {"drives": drives, "sums": sums, "folding": folding}
         return Cohort(
             catalog=catalog,
             predicate=predicate,
@@ -257,40 +263,42 @@ def load_cohort(
             feature_set=catalog.name_of(opened.identity),
             left_out=opened.count_left_out(predicate),
             source=source,
-            **kept,
+            **content,
         )
 
 
 def _expand_rows(opened: OpenedGrams, rows: pa.Table) -> dict[str, Any]:
     expansion = expansion_of(opened)
-    parts = list(expansion.tables(rows))
-    lines = rows.drop_columns(["sums", "products", "signals"])
-    # Rows whose calibrated columns are not the same are apart now: their lines follow them.
-    some = [_with_signals(lines.filter(pa.array(here)), signals) for signals, _, here in parts]
-    drives = pa.concat_tables(some) if some else lines
-    return {"tables": tuple(table for _, table, _ in parts), "drives": drives}
+    groups = list(expansion.tables(rows))
+    metadata = rows.drop_columns(["sums", "products", "signals"])
+    # Rows with different calibrated columns are in different tables; the metadata follow them.
+    sorted_metadata = [
+        _with_signals(metadata.filter(pa.array(mask)), signals) for signals, _, mask in groups
+    ]
+    drives = pa.concat_tables(sorted_metadata) if groups else metadata
+    return {"tables": tuple(table for _, table, _ in groups), "drives": drives}
 
 
 def with_gram_rows(cohort: Cohort, rows: pa.Table) -> Cohort:
-    """Return a cohort of other Gram rows, such as those of parts of its drives.
+    """Return a cohort with other Gram rows, such as those of segments of its drives.
 
-    Beside the columns of `Cohort.drives` these have `sums`, `products` and `signals`, and are
-    sorted by signals.
+    `rows` have the columns of `Cohort.drives` and `sums`, `products` and `signals`, and are sorted
+    by signals.
     """
     if cohort.source is None:
-        raise ValueError("it is not known where the cohort was read")
+        raise ValueError("the cohort has no source")
     with open_grams(cohort.source, cohort.feature_set, cohort.predicate) as opened:
         return replace(cohort, **_expand_rows(opened, rows))
 
 
-def _with_signals(lines: pa.Table, signals: str) -> pa.Table:
-    """Return lines of Gram rows that all have some signals, whose names may be long."""
-    same = pa.DictionaryArray.from_arrays(np.zeros(len(lines), dtype=np.int32), [signals])
-    return lines.append_column("signals", same)
+def _with_signals(rows: pa.Table, signals: str) -> pa.Table:
+    """Append a column with the same signals in all rows, as a dictionary: the text may be long."""
+    column = pa.DictionaryArray.from_arrays(np.zeros(len(rows), dtype=np.int32), [signals])
+    return rows.append_column("signals", column)
 
 
 def require_training(sources: Iterable[str], predicate: Predicate) -> None:
-    """Raise `RefusedError` if drives of a scenario are among those of a predicate."""
+    """Raise `RefusedError` if the drives of a predicate include evaluation scenarios."""
     if SCENARIO in sources:
         raise RefusedError(
             f"the cohort {predicate.quoted} has drives of evaluation scenarios, which no model "
@@ -299,7 +307,7 @@ def require_training(sources: Iterable[str], predicate: Predicate) -> None:
 
 
 def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
-    """Return the error that tells why a predicate leaves no drive."""
+    """Return the error for a predicate that selects no drive, with the reason."""
     if left_out := opened.count_left_out(predicate):
         return NotComputedError(
             f"all {pluralize(left_out, 'drive')} of the cohort {predicate.quoted} have no log: "
@@ -325,62 +333,63 @@ def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
     )
 
 
-# The sums of a cohort over its folds, from Gram rows read batch by batch.
+# Sums of a cohort over its folds, from Gram rows read batch by batch.
 
 FoldOf = Callable[[pa.RecordBatch], IntArray]
-"""Returns the fold of each Gram row, by its metadata."""
+"""Returns the fold of each Gram row from its metadata."""
 
 
 def _add_up(
     opened: OpenedGrams, predicate: Predicate, names: Sequence[object], fold_of: FoldOf
 ) -> tuple[dict[str, list[Gram]], pa.Table]:
-    """Return the exact sums of Gram rows, by signals and fold, and whose each row is."""
+    """Return the exact sums of Gram rows by signals and fold, and the metadata of the rows."""
     expansion = expansion_of(opened)
     grams: dict[str, list[Gram]] = {}
-    lines: list[pa.Table] = []
+    metadata: list[pa.Table] = []
     for batch in opened.batches(predicate, *HASHES):
         require_training(batch["source"].unique().to_pylist(), predicate)
         folds = fold_of(batch)
-        some = pa.table({name: batch[name] for name in ("n", "source", *HASHES[:2])})
-        some = some.append_column("fold", pa.array(folds))
-        for signals, table, here in expansion.tables(batch):
-            totals, before = table.totals(folds[here], len(names)), grams.get(signals)
+        rows = pa.table({name: batch[name] for name in ("n", "source", *HASHES[:2])})
+        rows = rows.append_column("fold", pa.array(folds))
+        for signals, table, mask in expansion.tables(batch):
+            totals, before = table.totals(folds[mask], len(names)), grams.get(signals)
             grams[signals] = list(map(Gram.__add__, before, totals)) if before else totals
-            # Filtered lines are copies: a column by itself would keep all of its batch.
-            lines.append(_with_signals(some.filter(pa.array(here)), signals))
+            # The filter copies: a column of the batch would keep the whole batch in memory.
+            metadata.append(_with_signals(rows.filter(pa.array(mask)), signals))
     if not grams:
         raise empty_cohort_error(opened, predicate)
-    return grams, pa.concat_tables(lines)
+    return grams, pa.concat_tables(metadata)
 
 
 def _find_folds(
     opened: OpenedGrams, folding: Folding, predicate: Predicate
 ) -> tuple[Sequence[str], FoldOf]:
-    """Return the folds that there may be, and which a Gram row is in. Raises like `load_cohort`."""
+    """Return the names of the folds, and the function that finds the fold of a Gram row."""
     key = FOLD_KEYS[folding.by]
-    dealt = folding.by in ("drive", "vehicle") and folding.count != EACH
-    found = opened.values_of(key, predicate, int(folding.count) + 1 if dealt else None)
-    if dealt and len(found) > (count := int(folding.count)):
-        hashed = key.removesuffix("_id") + "_hash"
+    by_hash = folding.by in ("drive", "vehicle") and folding.count != EACH
+    values = opened.values_of(key, predicate, int(folding.count) + 1 if by_hash else None)
+    if by_hash and len(values) > (count := int(folding.count)):
+        hash_column = key.removesuffix("_id") + "_hash"
         names = [str(fold + 1) for fold in range(count)]
-        return names, lambda rows: (rows[hashed].to_numpy() % count).astype(np.int64)
-    if not len(found):
+        return names, lambda rows: (rows[hash_column].to_numpy() % count).astype(np.int64)
+    if not len(values):
         raise empty_cohort_error(opened, predicate)
-    assignment = assign_folds(found.to_pylist(), folding.by, folding.count)
-    return assignment.names, lambda rows: assignment.fold[_places(rows[key], found)]
+    assignment = assign_folds(values.to_pylist(), folding.by, folding.count)
+    return assignment.names, lambda rows: assignment.fold[_index_in(values, rows[key])]
 
 
-def _places(values: pa.Array, known: pa.Array) -> IntArray:
-    places: IntArray = pc.index_in(values.cast(known.type), value_set=known).to_numpy()
-    return places
+def _index_in(values: pa.Array, column: pa.Array) -> IntArray:
+    """Return the position of each value of a column in `values`."""
+    positions: IntArray = pc.index_in(column.cast(values.type), value_set=values).to_numpy()
+    return positions
 
 
 def _used_folds(
     names: Sequence[str], grams: dict[str, list[Gram]], drives: pa.Table
 ) -> CohortFolds:
-    """Return the folds that have drives. Raises `DataError` if only one has."""
+    """Return the folds that contain drives. Raises `DataError` for a single one."""
     order = sorted(grams)
-    used = [fold for fold in range(len(names)) if any(grams[kind][fold].n for kind in order)]
+    used = [fold for fold in range(len(names)) if any(grams[key][fold].n for key in order)]
     if len(used) < 2:
         raise DataError(
             "cross-validation needs at least two folds, and the cohort has one: "
@@ -388,23 +397,20 @@ def _used_folds(
         )
 
     @cache
-    def count_drives(kinds: tuple[int, ...]) -> int:
-        mine = pc.is_in(drives["signals"], pa.array([order[i] for i in kinds]))
-        return int(pc.count_distinct(drives["drive_hash"].filter(mine)).as_py())
+    def count_drives(tables: tuple[int, ...]) -> int:
+        mask = pc.is_in(drives["signals"], pa.array([order[table] for table in tables]))
+        return int(pc.count_distinct(drives["drive_hash"].filter(mask)).as_py())
 
     return CohortFolds(
         tuple(names[fold] for fold in used),
-        tuple(tuple(grams[kind][fold] for fold in used) for kind in order),
+        tuple(tuple(grams[key][fold] for fold in used) for key in order),
         lambda tables: count_drives(tuple(tables)),
     )
 
 
 @dataclass(frozen=True)
 class DailySums:
-    """The Gram of each day, and the number of drives in it.
-
-    `left_out` drives of the predicate have no such Gram rows: their cars sent no log.
-    """
+    """Gram and number of drives of each day; `left_out` as in `Cohort`."""
 
     days: tuple[date, ...]
     grams: tuple[Gram, ...]
@@ -418,54 +424,53 @@ def sum_days(
     predicate: str | Predicate = TRAINING_DRIVES,
     feature_set: str = PLAIN,
 ) -> DailySums:
-    """Add up a cohort's Gram rows with label and inputs, day by day. Raises like `load_cohort`."""
+    """Add up the Gram rows with label and inputs by day. Raises like `load_cohort`."""
     signals = (*inputs, source.catalog.signals.label)
     predicate = parse_cohort(source.catalog.signals, predicate)
     with open_grams(source, feature_set, predicate) as opened:
-        found = opened.values_of("day", predicate).sort()
-        days: list[date] = found.to_pylist()
-        sums, lines = _add_up(opened, predicate, days, lambda rows: _places(rows["day"], found))
+        values = opened.values_of("day", predicate).sort()
+        days: list[date] = values.to_pylist()
+        sums, rows = _add_up(opened, predicate, days, lambda rows: _index_in(values, rows["day"]))
         left_out = opened.count_left_out(predicate)
-    complete_cases = [one for kind, one in sums.items() if set(signals) <= set(kind.split(","))]
-    if not complete_cases:
+    complete = [grams for text, grams in sums.items() if set(signals) <= set(text.split(","))]
+    if not complete:
         raise missing_signals_error(signals)
-    grams = [
-        sum((one[day].restrict(signals) for one in complete_cases), Gram.zero(signals))
+    totals = [
+        sum((grams[day].restrict(signals) for grams in complete), Gram.zero(signals))
         for day in range(len(days))
     ]
-    of_drives = _lines_with(lines, signals).group_by("drive_hash").aggregate([("fold", "min")])
-    drives = np.bincount(of_drives["fold_min"].to_numpy(), minlength=len(days)).tolist()
-    used = [day for day, gram in enumerate(grams) if gram.n]
+    first_days = _rows_with(rows, signals).group_by("drive_hash").aggregate([("fold", "min")])
+    drives = np.bincount(first_days["fold_min"].to_numpy(), minlength=len(days)).tolist()
+    used = [day for day, gram in enumerate(totals) if gram.n]
     return DailySums(
         tuple(days[day] for day in used),
-        tuple(grams[day] for day in used),
+        tuple(totals[day] for day in used),
         tuple(drives[day] for day in used),
         left_out,
     )
 
 
-# A cohort made ready for one set of inputs: folds, and moments of each drive.
+# Folds and moments of the complete cases of a set of inputs.
 
 
 def clustered_moments(
-    served: CompleteCases,
+    cases: CompleteCases,
     cluster: ClusterUnit | None = None,
     *,
     intercept: bool = True,
 ) -> DriveMoments:
-    """Return the moments of each drive, and which of them are one piece of evidence.
+    """Return the moments of each drive and its cluster: by default its car, for one car its trip.
 
-    By default cars where there are several, else drives. Without an intercept moments are about
-    zero.
+    Without an intercept moments are about zero.
     """
-    table = served.table if intercept else served.table.about_origin()
-    cars = served.drives["vehicle_id"].to_pylist()
+    table = cases.table if intercept else cases.table.about_origin()
+    cars = cases.drives["vehicle_id"].to_pylist()
     unit = cluster or ("vehicle" if len(set(cars)) > 1 else "drive")
-    owners = cars if unit == "vehicle" else served.drives["trip"].to_pylist()
-    number = {owner: i for i, owner in enumerate(sorted(set(owners), key=str))}
-    if unit == "drive" and len(number) == len(owners):
+    keys = cars if unit == "vehicle" else cases.drives["trip"].to_pylist()
+    numbers = {key: i for i, key in enumerate(sorted(set(keys), key=str))}
+    if unit == "drive" and len(numbers) == len(keys):
         return DriveMoments.from_table(table)
-    return DriveMoments.from_table(table, np.array([number[one] for one in owners]), unit)
+    return DriveMoments.from_table(table, np.array([numbers[key] for key in keys]), unit)
 
 
 def drive_folds(
@@ -476,19 +481,18 @@ def drive_folds(
     cluster: ClusterUnit | None = None,
     intercept: bool = True,
 ) -> tuple[TrainingFolds, IntArray]:
-    """Divide the drives with all the inputs into folds; return the fold of each, too.
+    """Divide the drives with all inputs into folds; return the folds and the fold of each drive.
 
-    Raises `DataError` if no drive has them all, and `QuestionError` for folds of parts of drives.
+    Raises `DataError` if no drive contains all inputs, and `QuestionError` for folds of blocks.
     """
     if folding.by == PARTS:
         raise QuestionError(
             f"with folds by {folding.by} there are no drives to hold out. Fold by drive for this."
         )
-    served = cohort.complete_cases(inputs)
-    assignment = assign_folds(
-        served.drives[FOLD_KEYS[folding.by]].to_pylist(), folding.by, folding.count
-    )
+    cases = cohort.complete_cases(inputs)
+    values = cases.drives[FOLD_KEYS[folding.by]].to_pylist()
+    assignment = assign_folds(values, folding.by, folding.count)
     label, scales = cohort.catalog.signals.label, cohort.catalog.input_scales
-    folds = CohortFolds.from_tables([served.table], assignment).complete_cases(inputs, label)
-    moments = clustered_moments(served, cluster, intercept=intercept)
+    folds = CohortFolds.from_tables([cases.table], assignment).complete_cases(inputs, label)
+    moments = clustered_moments(cases, cluster, intercept=intercept)
     return TrainingFolds(folds, moments, scales, intercept), assignment.fold

@@ -1,7 +1,7 @@
-"""Whole-number weights of drives: Gram rows are multiplied by them, so that every sum stays exact.
+"""Integer weights of drives: Gram rows times a weight keep every sum exact.
 
-A weight counts in parts of `FULL`, a power of two. Robust ones take from drives whose label or
-signals were lost: those that a model of all drives fits far worse than it fits the usual one.
+Weights are multiples of 1 / `FULL`, a power of two. Robust weights are lower for drives whose error
+is far above that of the median drive, such as drives with a lost label or signal.
 """
 
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.gram import GramTable
 
 FULL = 16
-"""The weight of a drive that is as others are."""
+"""Weight of a usual drive."""
 USUAL_ERRORS = 3.0
-"""Root mean squares of the median drive that a drive may have without losing weight."""
+"""Error of a drive over that of the median drive, beyond which its weight is lower."""
 MAX_LOST_SHARE = 0.1
-"""Of the weight of all rows: where more is unusual, nothing is usual."""
+"""Maximum share of the weight of all rows that outliers lose."""
 MAX_ROUNDS = 50
 
 
 @dataclass(frozen=True)
 class DownweightedDrive(Record):
-    """A drive that counts less than others.
+    """A drive with a robust weight below 1.
 
     Attributes:
-        weight: at most 1.
+        weight: from 0 to 1.
         times: root mean square of its residuals over that of the median drive.
     """
 
@@ -40,7 +40,7 @@ class DownweightedDrive(Record):
 
     @property
     def reason(self) -> str:
-        """Why it lost weight."""
+        """Explanation for the user."""
         return (
             f"its error is {self.times:.1f} times that of the median drive: robust "
             f"gives it the weight {self.weight:.2f}"
@@ -51,59 +51,57 @@ class DownweightedDrive(Record):
 class DriveWeights:
     """Weight of each drive in parts of `FULL`, and `DownweightedDrive.times`; shape (drives,)."""
 
-    parts: IntArray
+    weights: IntArray
     times: FloatArray
 
-    def of(self, drive: int) -> DownweightedDrive:
-        """Return what became of a drive."""
-        return DownweightedDrive(float(self.parts[drive]) / FULL, float(self.times[drive]))
+    def drive(self, number: int) -> DownweightedDrive:
+        """Return weight and error of a drive."""
+        return DownweightedDrive(float(self.weights[number]) / FULL, float(self.times[number]))
 
 
 def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeights:
-    """Return weights min(1, c median rms / rms)^2 of drives, fitted and weighed in turn.
+    """Return weights min(1, c median rms / rms)^2 of drives, by reweighted least squares.
 
-    `drives` are the moments of the inputs, the label last. c is `USUAL_ERRORS`, or so large that no
-    more than `MAX_LOST_SHARE` of the weight of rows is lost.
+    `drives` are the moments of the inputs and the label, which is last. c is `USUAL_ERRORS`, or the
+    lowest multiple of it by powers of 1.25 that takes at most `MAX_LOST_SHARE` of the weight.
     """
-    each = drives.moments[:, int(not intercept) :, int(not intercept) :]
+    moments = drives.moments[:, int(not intercept) :, int(not intercept) :]
     rows, limit = drives.moments[:, 0, 0], USUAL_ERRORS
-    found = _weigh(each, rows, limit)
-    while float(rows @ (FULL - found.parts)) > MAX_LOST_SHARE * FULL * float(rows.sum()):
+    result = _reweight(moments, rows, limit)
+    while float(rows @ (FULL - result.weights)) > MAX_LOST_SHARE * FULL * float(rows.sum()):
         limit *= 1.25
-        found = _weigh(each, rows, limit)
-    return found
+        result = _reweight(moments, rows, limit)
+    return result
 
 
 def age_weights(days: Sequence[date], half_life_days: int) -> IntArray:
-    """Return weights of drives by day, in parts of `FULL`: half as much for each half-life.
-
-    Ages are before the newest of the days.
-    """
+    """Return weights of drives that halve with each half-life of age before the newest day."""
     age = np.array([(max(days) - day).days for day in days])
     return np.rint(FULL * 0.5 ** (age / half_life_days)).astype(np.int64)
 
 
-def weighted(table: GramTable, parts: IntArray) -> GramTable:
-    """Return Gram rows, each times a whole number: exact, with Python's integers where need be."""
-    largest = np.abs(table.products.astype(np.float64)).max(initial=0) * parts.max(initial=0)
+def weighted(table: GramTable, weights: IntArray) -> GramTable:
+    """Return Gram rows times integer weights, exactly; beyond 62 bits as Python integers."""
+    largest = np.abs(table.products.astype(np.float64)).max(initial=0) * weights.max(initial=0)
     kind = np.dtype(object) if largest >= 2.0**62 else np.dtype(np.int64)
-    n, sums, products = (one.astype(kind) for one in (table.n, table.sums, table.products))
-    return GramTable(table.signals, n * parts, sums * parts[:, None], products * parts[:, None])
+    n, sums, products = (values.astype(kind) for values in (table.n, table.sums, table.products))
+    column = weights[:, None]
+    return GramTable(table.signals, n * weights, sums * column, products * column)
 
 
-def _weigh(each: FloatArray, rows: FloatArray, limit: float) -> DriveWeights:
-    """Fit and weigh in turn until no weight changes; `each` are moments, the label last."""
-    parts = np.full(len(each), FULL, dtype=np.int64)
+def _reweight(moments: FloatArray, rows: FloatArray, limit: float) -> DriveWeights:
+    """Fit and weight in turn until no weight changes; the label is the last of the moments."""
+    weights = np.full(len(moments), FULL, dtype=np.int64)
     for _ in range(MAX_ROUNDS):
-        total = np.einsum("d,dij->ij", parts.astype(np.float64), each)
+        total = np.einsum("d,dij->ij", weights.astype(np.float64), moments)
         slopes = np.linalg.pinv(total[:-1, :-1], rcond=1e-13, hermitian=True) @ total[:-1, -1]
         error = np.append(slopes, -1.0)
-        squares = np.maximum(np.einsum("i,dij,j->d", error, each, error), 0.0) / rows
-        if not (usual := float(np.median(squares))):
-            return DriveWeights(np.full(len(each), FULL, dtype=np.int64), np.ones(len(each)))
-        times = np.sqrt(squares / usual)
-        again = np.rint(FULL * (limit / np.maximum(times, limit)) ** 2)
-        if np.array_equal(again, parts):
+        squares = np.maximum(np.einsum("i,dij,j->d", error, moments, error), 0.0) / rows
+        if not (median := float(np.median(squares))):
+            return DriveWeights(np.full(len(moments), FULL, dtype=np.int64), np.ones(len(moments)))
+        times = np.sqrt(squares / median)
+        update = np.rint(FULL * (limit / np.maximum(times, limit)) ** 2)
+        if np.array_equal(update, weights):
             break
-        parts = again.astype(np.int64)
-    return DriveWeights(parts, times)
+        weights = update.astype(np.int64)
+    return DriveWeights(weights, times)

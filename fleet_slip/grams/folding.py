@@ -1,4 +1,4 @@
-"""How a cohort is divided into folds, and which fold each of its Gram rows falls into."""
+"""Division of a cohort into folds."""
 
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias
@@ -23,33 +23,33 @@ FOLD_KEYS: dict[str, str] = {
     "speed": "speed_factor",
     "part": "part",
 }
-"""What a fold may be made of, and its column. Drives of a trip are pieces, and share a fold."""
+"""Column of each fold key. The drives of a trip are segments of one, and share a fold."""
 
 BANDS: FoldKey = "speed"
-"""Whole bands of speed: neighbouring drives share a fold, so that no model sees their speed."""
+"""Folds are bands of speed, so that a model is tested on speeds that it was not trained on."""
 
 PARTS: FoldKey = "part"
-"""Parts of drives that the feature set divides rows into: blocks of time."""
+"""Folds are blocks of time, into which the feature set divides drives."""
 
 
 EACH: Literal["each"] = "each"
-"""Instead of a number of folds: each drive, or vehicle, track or day, is a fold of its own."""
+"""Instead of a number of folds: each value of the key is a fold."""
 
 FoldCount: TypeAlias = Annotated[int, Field(ge=2, le=1000)] | Literal["each"]
 
 MAX_FOLDS = 10_000
-"""Each fold is an exact fit of every model."""
+"""Limit for `EACH`: each fold is an exact fit of every model."""
 
 
 class Folding(Config):
-    """What divides a cohort, and into how many folds."""
+    """Key and number of the folds of a cohort."""
 
     by: FoldKey = "drive"
     count: FoldCount = 5
 
 
 def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Folding:
-    """Return a folding, by default of the usual count, or each part. Raises `UsageError`."""
+    """Return a folding, by default of `usual` folds or all blocks. Raises `UsageError`."""
     if count is None:
         count = EACH if by == PARTS else usual
     try:
@@ -62,7 +62,7 @@ def make_folding(by: FoldKey, count: int | str | None, usual: FoldCount) -> Fold
 
 
 def require_blocks(catalog: Catalog, feature_set: str, by: str) -> None:
-    """Raise `QuestionError` if a feature set has not divided the rows of drives as folds need."""
+    """Raise `QuestionError` if folds need blocks and the feature set does not have any."""
     if by == PARTS and not catalog.feature_set(feature_set).block_ticks:
         divided = ", ".join(name for name, entry in catalog.sets.items() if entry.block_ticks)
         raise QuestionError(
@@ -72,7 +72,7 @@ def require_blocks(catalog: Catalog, feature_set: str, by: str) -> None:
 
 
 def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssignment:
-    """Assign Gram rows to folds by a key's values. Raises `DataError` for one fold, or too many."""
+    """Assign Gram rows to folds by the values of a key. Raises `DataError` for one or too many."""
     if by == "drive" and len(set(values)) == 1:
         raise DataError(
             "cross-validation needs at least two folds, and the cohort is one drive, or one trip: "

@@ -43,11 +43,11 @@ _NUMBERS = {"1": 1.0, "%": 0.01, "percent": 0.01}
 
 @cache
 def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
-    """Return f in `value in si_unit = f * value in unit`; `quantity` is what messages call it.
+    """Return f in `value in si_unit = f * value in unit`; messages name the `quantity`.
 
     In an acceleration `g` is standard gravity, 9.80665 m/s². The radian counts as a dimension, so
-    that neither a ratio passes for an angle nor Hz for rad/s: that would be off by 2π or by 100.
-    Raises `ValueError`, with what is needed instead.
+    that a ratio is no angle and Hz is not rad/s: that would be wrong by 2π or by 100.
+    Raises `ValueError` with the unit that is needed.
     """
     needs = f"{quantity} needs {_NEEDS.get(si_unit, f'a unit like {si_unit!r}')}"
     if si_unit == "1" and unit in _NUMBERS:
@@ -70,7 +70,7 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
 
 
 def measures(unit: str, si_unit: str) -> bool:
-    """Whether a unit measures what an SI unit does."""
+    """Return True if a unit has the dimension of an SI unit."""
     with suppress(ValueError):
         conversion_factor(unit, si_unit)
         return True
@@ -83,24 +83,24 @@ WHEEL_PREFIX = "wheel_"
 """How the names of wheel speeds begin."""
 VELOCITY = "m/s"
 CHOOSE = "choose"
-"""What a draft has for a unit that the file does not say."""
+"""Placeholder of a draft for a unit that the file does not contain."""
 
 Component: TypeAlias = Literal["north", "east"]
 
 
 class SignBit(Config):
-    """The column that says the sign of another one, which has the magnitude alone."""
+    """The column with the sign of a column that has magnitudes only."""
 
     column: Name
     negative: int | Name = 1
-    """What stands there where the value is negative."""
+    """The text of that column where the value is negative."""
 
 
 class SignalColumn(Config):
     """One column of the file: `signal = factor(unit) * (±gain * value + offset) / radius`.
 
-    Keys at their default are left out of the mapping's identity where they came after the first
-    release, so that a file is not ingested twice because a program learned a word.
+    Keys that came after the first release are not part of the mapping's identity at their default,
+    so that an upgrade does not ingest a file twice.
     """
 
     column: Name
@@ -108,7 +108,7 @@ class SignalColumn(Config):
     negate: bool = False
     """For axes that are not ISO 8855, such as y to the right."""
     sign: SignBit | None = added(None)
-    """Where a column of its own says the sign, as on the buses of some cars."""
+    """The column of the sign, if that is separate, as on the buses of some cars."""
     offset: FiniteFloat = 0.0
     """Added after the sign, in the column's unit."""
     gain: FiniteFloat = added(1.0)
@@ -116,18 +116,18 @@ class SignalColumn(Config):
     radius_m: Annotated[FiniteFloat, Field(ge=0.05, le=2)] | None = added(None)
     """Rolling radius of a wheel whose speed is logged as a velocity."""
     delay_s: FiniteFloat = added(0.0, ge=-10, le=10)
-    """How much later than it happened a value stands in the file."""
+    """Delay of a value in the file after its measurement, in s."""
     interpolate: bool = added(True)
-    """False: samples stand at the nearest tick, and ticks between them have no value."""
+    """False: samples are moved to the nearest tick, and ticks between them have no value."""
     longest_gap_s: Annotated[FiniteFloat, Field(gt=0, le=10)] | None = added(None)
     """Instead of the mapping's, for a signal with a rate of its own."""
     time: Name | None = added(None)
     """The column of this signal's times, where the file has several, in the unit of the others."""
 
     component: Component | None = added(None)
-    """Of the velocity over ground, if it is one: set for `course = { north = …, east = … }`."""
+    """Component of the velocity over ground, for `course = { north = …, east = … }`."""
     clockwise_from_north: bool | None = added(None)
-    """Whether the course is given so; False: counterclockwise from east."""
+    """True if the course is clockwise from north, False if counterclockwise from east."""
     antenna_x_m: OffsetM | None = added(None)
     """How far the receiver's antenna is before the centre of gravity."""
     antenna_y_m: OffsetM | None = added(None)
@@ -227,19 +227,19 @@ def count_range(signals: SignalCatalog, name: str, column: SignalColumn) -> tupl
 
 
 class DateColumn(Config):
-    """The column of dates beside one of times of the day, and its strftime codes."""
+    """The column of dates that belongs to a time of the day, and its strftime codes."""
 
     column: Name
     format: Name = "%Y-%m-%d"
 
 
 class TimeBase(Config):
-    """Where time is from, and which gaps are bridged or end a drive.
+    """The source of time, and the gaps that are interpolated or end a drive.
 
     Either `column` with a `unit` (numbers) or a `format` (timestamps as text, strftime codes; naive
-    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format; a `date` may stand in
-    a column of its own), or `rate_hz` for equally spaced rows, or `own_clock` for a format that
-    says itself when a sample was taken.
+    ones are UTC, or of a `zone`; a Parquet timestamp column needs no format; a `date` may be a
+    separate column), or `rate_hz` for equally spaced rows, or `own_clock` for a format that stores
+    the times of samples.
     """
 
     column: Name | None = None
@@ -250,9 +250,9 @@ class TimeBase(Config):
     epoch: bool = added(False)
     """Numbers are counted from 1970, in UTC, so that they have the date."""
     zone: str | None = added(None)
-    """Where the clock of timestamps without a zone stands, such as `Europe/Berlin`."""
+    """Time zone of timestamps without one, such as `Europe/Berlin`."""
     assumed: bool = added(False)
-    """Nobody knows the rate: each ingest says so."""
+    """The rate is a guess; each ingest reports it."""
     own_clock: bool = added(False)
     longest_gap_s: Annotated[PositiveFloat, Field(le=10)] = 0.1
     """Samples of a signal that lie further apart are not interpolated between."""
@@ -306,7 +306,7 @@ class TimeBase(Config):
 
     @property
     def is_dated(self) -> bool:
-        """Whether times have the date."""
+        """True if times have the date."""
         if self.unit is not None or self.rate_hz is not None:
             return self.epoch
         if self.date is not None:
@@ -315,7 +315,7 @@ class TimeBase(Config):
 
     @property
     def moment_format(self) -> str | None:
-        """The format of a text, the date before it if that stands in a column of its own."""
+        """The format of a text, preceded by the date if that is a separate column."""
         return self.format if self.date is None else f"{self.date.format} {self.format}"
 
     @property
@@ -327,7 +327,7 @@ class TimeBase(Config):
 def as_moments(text: pl.Expr, timestamp_format: str) -> pl.Expr:
     """Return texts as timestamps, null where they are none.
 
-    Polars warns of `%f` with the place in our code; what comes of a wrong one, ingest reports.
+    Polars warns of `%f` with a place in our code; ingest reports the result of a wrong format.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pl.exceptions.ChronoFormatWarning)
@@ -335,7 +335,7 @@ def as_moments(text: pl.Expr, timestamp_format: str) -> pl.Expr:
 
 
 def _reads_back(timestamp_format: str) -> bool:
-    """Whether a moment that is written in this format can be read, to the minute."""
+    """Return True if a moment that is written in this format can be read, to the minute."""
     moment = datetime(2024, 5, 31, 12, 34, tzinfo=UTC)
     try:
         written = pl.Series([moment]).dt.to_string(timestamp_format)
@@ -347,7 +347,7 @@ def _reads_back(timestamp_format: str) -> bool:
 
 @cache
 def reads_clock(timestamp_format: str) -> bool:
-    """Whether a format has the time of day and no date."""
+    """Return True if a format has the time of day and no date."""
     if _reads_back(timestamp_format):
         return False
     try:
@@ -372,7 +372,7 @@ _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {
 class RowCondition(Config):
     """A condition on one column, in the column's own unit; a missing value does not meet it.
 
-    Or on a signal that the mapping makes of a column, in the catalog's unit.
+    Or on a signal of the mapping, in the catalog's unit.
     """
 
     column: Name | None = None

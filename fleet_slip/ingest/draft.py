@@ -1,8 +1,7 @@
 """Drafts a mapping for a file: guesses by name and unit, each with its reasons.
 
-What is doubtful stays a question, as a comment. A unit that the file does not say is chosen by a
-person: until then the draft does not load. Signs, and which wheel is which, a dry run of the ingest
-shows.
+Doubtful guesses become questions, as comments. A person chooses units that the file does not
+contain: until then the draft does not load. A dry run of the ingest checks signs and wheels.
 """
 
 import json
@@ -47,7 +46,7 @@ class Draft:
     absent: tuple[str, ...]
     """The signals that no channel looks like."""
     open_questions: tuple[str, ...]
-    """What only a person knows, and what of the file was not read."""
+    """Questions that only a person can answer, and parts of the file that were not read."""
 
 
 def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> Draft:
@@ -76,7 +75,7 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
 
 
 def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
-    """Return a guess, doubted if a weak name without a unit has nothing beside it that agrees."""
+    """Return a guess, doubtful if its name is weak, it has no unit, and no other signal agrees."""
     agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses) - {guess.signal}
     if guess.is_weak and guess.readings and not agreeing:
         return guess.doubted("name and unit are ambiguous")
@@ -84,7 +83,7 @@ def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
 
 
 def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
-    """Yield what only a person knows: of headings, missing values, and the label's sensor."""
+    """Yield the questions on headings, missing values, and the label's sensor."""
     taken = {guess.column for guess in guesses.values()}
     for name in headings(profile.profiles, taken) if COURSE not in guesses else ():
         yield (
@@ -107,7 +106,7 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
 
 
 def _refused(profile: FileProfile) -> Iterator[str]:
-    """Yield what could not be read, and why."""
+    """Yield the channels that could not be read, with reasons."""
     more = len(profile.refused) - _MOST_REFUSED
     for reason in profile.refused[:_MOST_REFUSED]:
         yield f"not read: {reason}"
@@ -140,7 +139,7 @@ def name_of(stem: str) -> str:
 
 
 def write_draft(draft: Draft, name: str) -> str:
-    """Return a mapping in TOML. It lacks what the file does not contain: the day, the car."""
+    """Return a mapping in TOML, without the day and the car, which the file does not contain."""
     called = shlex.quote(quote_name(draft.file))
     parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats

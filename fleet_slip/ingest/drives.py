@@ -52,23 +52,23 @@ _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
 
 
 class DriveCutter:
-    """Gives every row the number of its part, which becomes a drive, and refuses others.
+    """Assigns every row to a segment, which becomes a drive, and rejects rows out of order.
 
     A group, such as a car, has stretches, and these have parts: a step in time larger than
-    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a part. A row whose
-    neighbours are both that far is `isolated`, so that one wild time stamp does not cut a drive.
-    `time_duplicate` and `time_backwards` are rows not later than all before in their stretch. None
-    of it depends on the blocks in which rows come: what the next row decides waits for it.
+    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a part. A row that far
+    from both neighbours is `isolated`, so that one wrong time stamp does not cut a drive.
+    `time_duplicate` and `time_backwards` are rows not later than all earlier rows of their stretch.
+    The result does not depend on the blocks: a row that needs the next one waits for it.
     """
 
     def __init__(self, base: TimeBase, longest_s: float = LONGEST_DRIVE_S) -> None:
-        """Take the gap that ends a drive, and how long a part lasts at most."""
+        """Set the gap that ends a drive, and the maximum duration of a part."""
         self._gap_s = base.split_gap_s + TIME_EPSILON_S
         self._longest_s = longest_s
         self._waiting: pl.DataFrame | None = None
         self._parts = 0
         self._state = np.empty(0, dtype=_GROUP)
-        """What was seen of each group so far."""
+        """The state of each group."""
         self.ended: list[int] = []
         """Parts that the last block ended, in an order that does not depend on blocks."""
 
@@ -122,7 +122,7 @@ class DriveCutter:
             waiting[end] = alone[end]
             alone[end] = False
         self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
-        # Of several time bases only times show what comes first.
+        # Rows of several time bases can be ordered by their times only.
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
         known_at = np.concatenate([number[1:], [np.inf]])
         known_at[end] = np.inf
@@ -131,9 +131,9 @@ class DriveCutter:
     def _number_parts(
         self, rows: pl.DataFrame, known_at: FloatArray
     ) -> tuple[pl.DataFrame, FloatArray]:
-        """Return the rows with their parts, and the latest time of its stretch before each.
+        """Return the rows with their parts, and the latest earlier time of their stretch.
 
-        Ended parts are listed in the order in which it becomes known that they have ended.
+        Lists ended parts in the order in which their end is detected.
         """
         group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
@@ -244,7 +244,7 @@ def to_ticks(
     name: str,
     metadata_of_drive: dict[str, Any],
 ) -> MeasuredDrive:
-    """Bring one drive's signals, SI units at times in s, to counts at 100 Hz.
+    """Convert a drive's signals, SI units at times in s, to counts at 100 Hz.
 
     Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
     the samples of each time base; `metadata_of_drive` has values by column of `logs`. Raises

@@ -1,7 +1,6 @@
-"""Guesses which channel is which signal, by its name, its unit and its values.
+"""Guesses the signal of each channel by its name, unit and values.
 
-Every guess has its reasons as texts, for a person to correct; what speaks against it are doubts,
-and with a doubt it is a question.
+Every guess has reasons as texts, for a person to check. A guess with doubts becomes a question.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -35,10 +34,10 @@ from fleet_slip.ingest.vocabulary import (
     unit_called,
     vocabulary,
 )
-from fleet_slip.quality.plausibility import RADIUS_M, TURNING, WHEELS
+from fleet_slip.quality.drive_signals import RADIUS_M, SIGNED, WHEELS
 
 _WEAK = 0.5
-"""What a word that may mean something else counts against one that does not."""
+"""Weight of an ambiguous word; that of an unambiguous one is 1."""
 _UNIT_FITS = 4.0
 _SIGN_WORDS = {"vz", "vorzeichen", "sign", "signum", "sgn"}
 _ALIKE = 0.02
@@ -53,11 +52,11 @@ class Guess:
 
     Attributes:
         keys: of the signal in a mapping, without the column: unit, negate, sign …
-        reasons: why, for people.
-        is_weak: whether its name may as well mean something else.
-        doubts: what speaks against it.
-        rivals: others that its name and unit fit as well.
-        readings: the units that are possible, where the file has none.
+        reasons: texts for people.
+        is_weak: True if its name may mean another signal.
+        doubts: reasons against it.
+        rivals: other signals that its name and unit fit.
+        readings: the possible units, if the file has none.
     """
 
     signal: str
@@ -89,7 +88,7 @@ class Guess:
 
 
 def guess_signals(catalog: SignalCatalog, profiles: tuple[Profile, ...]) -> dict[str, Guess]:
-    """Return the best guess for each signal that has one; a channel is one signal at most."""
+    """Return the best guess for each signal. A channel is assigned to one signal at most."""
     scored = [pair for p in profiles if p.is_number for pair in _scored(catalog, p)]
     scored.sort(key=lambda pair: -pair[0])
     guesses: dict[str, Guess] = {}
@@ -111,7 +110,7 @@ def guess_signals(catalog: SignalCatalog, profiles: tuple[Profile, ...]) -> dict
 
 
 def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, Guess]]:
-    """Yield what a channel may be, with how well it fits."""
+    """Yield the possible signals of a channel with their scores."""
     if not profile.channel.name.isprintable():
         return
     name = profile.channel.title or profile.channel.name
@@ -158,7 +157,7 @@ def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
 
 def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
     """Return a magnitude with the column of its sign, where another is called so."""
-    if guess.signal not in TURNING or guess.profile.range[0] < 0:
+    if guess.signal not in (*SIGNED, "sideslip") or guess.profile.range[0] < 0:
         return guess
     words_of_name = sorted(parts_of(split_unit(guess.column)[0]))
     for other in profiles:
@@ -225,7 +224,7 @@ def _si_unit(catalog: SignalCatalog, signal: str, radius_m: float | None = None)
     return VELOCITY if signal in {"north", "east"} or radius_m else catalog[signal].unit
 
 
-# Units that a file does not say: a person chooses among those of other files.
+# Units that the file does not contain: a person chooses among those of other files.
 
 _UNITS_OF = {
     "m/s^2": ("m/s^2", "g"),
@@ -316,7 +315,7 @@ def guess_time(
 
 
 def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:
-    """Return a time of the day with the column of dates beside it, if there is one."""
+    """Return a time of the day with its column of dates, if there is one."""
     words = set(vocabulary()["time"]["date_words"])
     for profile in profiles:
         if (
@@ -338,7 +337,7 @@ def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:
 
 
 def _are_dates(texts: tuple[str, ...], written: str) -> bool:
-    """Whether texts are dates of this century, or of the end of the last."""
+    """Return True if texts are dates of this century, or of the end of the last."""
     days = pl.Series(texts, dtype=pl.String).str.to_date(written, strict=False)
     return bool(texts) and all(day and date(1990, 1, 1) <= day < date(2100, 1, 1) for day in days)
 
@@ -380,7 +379,7 @@ def _numbers(profile: Profile, present: FloatArray) -> TimeGuess:
 
 
 def _is_clock(values: FloatArray) -> bool:
-    """Whether numbers are a time of the day without colons: after 59.99 comes 100, not 60."""
+    """Return True if numbers are a time of day without colons: 100, not 60, follows 59.99."""
     inside = (values >= 0) & (values < 240_000) & (values % 100 < 60) & (values // 100 % 100 < 60)
     steps = np.diff(values)
     rolls = ((steps > 40) & (steps <= 41)) | (steps < -235_900)  # a minute, midnight

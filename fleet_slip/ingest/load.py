@@ -49,7 +49,8 @@ from fleet_slip.ingest.recordings import (
 )
 from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
+from fleet_slip.quality.drive_signals import Signals, to_regular_grid
+from fleet_slip.quality.plausibility import check_plausibility
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, Table, retry_conflicts
 from fleet_slip.warehouse.erasure_log import ErasureLog
@@ -321,22 +322,32 @@ def write_batch(
                 written.append(report_of_file)
                 if report_of_file.report.new:
                     longest.append((report_of_file.report, stream.longest))
-        _judge_longest(mapping.signal_catalog, longest)
+        _check_longest(mapping, longest)
         new = {name: data.finish() for name, data in batch.data.items()}
     return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
 
 
-def _judge_longest(
-    signals: SignalCatalog, results: Iterable[tuple[FileReport, MeasuredDrive | None]]
+def _check_longest(
+    mapping: Mapping, results: Iterable[tuple[FileReport, MeasuredDrive | None]]
 ) -> None:
-    """Check the longest drive of some files, and add its faults to the report of its file.
+    """Check the longest drive of each file; report a fault with the longest drive that has it.
 
-    One drive only: the check takes longer than ingesting a small file.
+    `CHECKED_TICKS` bound the time of a batch: a check takes as long as loading a small file.
     """
     drives = [(report, drive) for report, drive in results if drive is not None]
-    if drives:
-        report, drive = max(drives, key=lambda pair: pair[1].ticks.size)
-        report.suspicions += tuple(check_plausibility(signals, signals_of(signals, drive)))
+    drives.sort(key=lambda pair: pair[1].ticks.size, reverse=True)
+    from_velocities = mapping.label is not None and mapping.label.from_velocities
+    faults: dict[tuple[str, tuple[str, ...]], list[tuple[FileReport, Fault]]] = {}
+    for report, drive in drives:
+        ticks = max(CHECKED_TICKS // len(drives), MIN_CHECKED_TICKS)
+        signals = signals_of(mapping.signal_catalog, drive, ticks)
+        for fault in check_plausibility(
+            mapping.signal_catalog, signals, from_velocities=from_velocities
+        ):
+            faults.setdefault((fault.kind, fault.signals), []).append((report, fault))
+    for (report, fault), *others in faults.values():
+        also = f", as in {pluralize(len(others), 'other file')}" if others else ""
+        report.suspicions += (dataclasses.replace(fault, figure=fault.figure + also),)
 
 
 class _Writer:
@@ -440,7 +451,7 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     previews: list[Preview] = []
     for batch in _batches(map(IngestTask, logs)):
         results = [preview_log(task.file, mapping) for task in batch]
-        _judge_longest(mapping.signal_catalog, results)
+        _check_longest(mapping, results)
         previews += [preview for preview, _ in results]
     return previews
 
@@ -466,13 +477,13 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
     return Preview(str(log), stream.counts, suspicions, tuple(ranges)), stream.longest
 
 
-MOST_TICKS = 200_000
-"""Maximum number of ticks of the longest drive that are checked: half an hour."""
+CHECKED_TICKS, MIN_CHECKED_TICKS = 200_000, 6_000
+"""Ticks that are checked in a batch of files, half an hour, and in each file, a minute."""
 
 
-def signals_of(signals: SignalCatalog, drive: MeasuredDrive) -> Signals:
-    """Return the signals of the first ticks of a drive, for `check_plausibility`."""
-    selected = drive.ticks - drive.ticks[0] < MOST_TICKS
+def signals_of(signals: SignalCatalog, drive: MeasuredDrive, ticks: int) -> Signals:
+    """Return the signals of the first ticks of a drive, as `check_plausibility` reads them."""
+    selected = drive.ticks - drive.ticks[0] < ticks
     counts = {  # by Polars: Arrow's own would load pandas
         name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[selected]
         for name, values in drive.counts.items()

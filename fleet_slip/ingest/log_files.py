@@ -18,14 +18,14 @@ WILDCARDS = frozenset("*?[")
 
 
 class StrayLink(PosixPath):
-    """A file found behind a link out of a folder: who fills it may not choose what is read."""
+    """A file behind a link out of its folder, which is refused."""
 
 
 def find_logs(paths: Iterable[Path | str]) -> list[Path]:
-    """Return files as they are given, and those in folders that have the suffix of a log, sorted.
+    """Return the given files, and the logs in the given folders, sorted.
 
-    What is not a path may be a pattern such as `2024-*/*.mf4`, given in quotes. Hidden files and
-    folders are passed over. Raises `InputError` for a folder or a pattern without any.
+    A path that does not exist may be a pattern such as `2024-*/*.mf4`. The suffix identifies logs
+    in folders; hidden files and folders are skipped. Raises `InputError` for no files.
     """
     for place in paths:
         if "://" in str(place):
@@ -37,7 +37,7 @@ def find_logs(paths: Iterable[Path | str]) -> list[Path]:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """Return a file, or those that a folder or a pattern stands for."""
+    """Return the files of a path: itself, those of a folder, or those that match a pattern."""
     if is_pattern(path):
         return _matching(path)
     if not path.is_dir():
@@ -60,12 +60,12 @@ def _files_of(path: Path) -> list[Path]:
 
 
 def names_several(place: Path | str) -> bool:
-    """Whether it is a folder or a pattern, of which what is new is taken."""
+    """Return True for a folder or a pattern, of which only new files are ingested."""
     return Path(place).is_dir() or is_pattern(Path(place))
 
 
 def is_pattern(path: Path) -> bool:
-    """Whether a path stands for those that match it."""
+    """Return True if a path is a pattern."""
     return bool(WILDCARDS.intersection(str(path))) and not path.exists()
 
 

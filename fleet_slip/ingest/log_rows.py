@@ -43,15 +43,15 @@ REASONS = (
     "time_duplicate",
     "isolated",
 )
-"""What can be wrong with a row by itself; a problem is an index into this.
+"""Reasons to reject a row by itself; a problem is an index into this.
 
-The last three where a log has several time bases; of one, `DriveCutter` finds them.
+The last three apply to logs with several time bases; else `DriveCutter` detects them.
 """
 
 
 @dataclass(frozen=True)
 class RowField:
-    """One thing to take from a row, or a condition on it.
+    """A value to take from a row, or a condition on it.
 
     `value` is made of raw columns; `problem`, null where all is well, may also use the value under
     the field's name, so that a text is parsed once.
@@ -65,7 +65,7 @@ class RowField:
 
 
 def find_held(column: str, schema: pl.Schema) -> str:
-    """Return where a column's last value stands, in rows of several time bases."""
+    """Return the column with another column's last value, for rows of several time bases."""
     return HELD + column if RAW + HELD + column in schema else column
 
 
@@ -80,14 +80,14 @@ def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
 
 
 def _number_problems(name: str, present: pl.Expr, more: tuple[pl.Expr, str]) -> pl.Expr:
-    """Return what can be wrong with a number of a field; `present` says where there is a text."""
+    """Return the problems of a field's number; `present` is true where there is a text."""
     value = pl.col(name)
     unread, infinite = value.is_null() & present, ~value.is_finite()
     return find_problems((unread, "not_a_number"), (infinite, "not_finite"), more)
 
 
 def _time_problems(name: str, text: pl.Expr, *more: tuple[pl.Expr, str]) -> pl.Expr:
-    """Return what can be wrong with a day or a time of a field."""
+    """Return the problems of a field's day or time."""
     unread = pl.col(name).is_null()
     return find_problems((text.is_null(), "missing"), (unread, "not_a_time"), *more)
 
@@ -130,7 +130,7 @@ def without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:
 
 
 def unfit_column(column: str, kind: pl.DataType, needed: str) -> InputError:
-    """Return the error of a column whose type cannot be what the mapping says it is."""
+    """Return the error of a column whose type does not fit the mapping."""
     return InputError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
 
 
@@ -199,7 +199,7 @@ def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     return text.str.zfill(len(digits)) if digits.isdigit() else text
 
 
-# What a mapping takes from each row: values in SI units and their faults.
+# The fields of a mapping: values in SI units and their problems.
 
 LONGEST_TEXT = 200
 """Characters of offending values that are kept."""
@@ -208,7 +208,7 @@ LONGEST_TEXT = 200
 def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
     """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
 
-    Raises `InputError` if a column's type cannot be what the mapping says it is.
+    Raises `InputError` if a column's type does not fit the mapping.
     """
     fields: list[RowField] = []
     if mapping.drive.column is not None:
@@ -220,7 +220,7 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
     if mapping.time.key is not None:
         fields.append(time_field(mapping.time.key, schema, mapping))
         if RAW + DISORDER in schema:
-            # What a file of several time bases says of each time among those of its base.
+            # The faults of times within their base, found by `merge_bases`.
             reasons = ("time_backwards", "time_duplicate", "isolated")
             cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
             fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
@@ -273,7 +273,7 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
 def _signed(
     source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping
 ) -> tuple[pl.Expr, pl.Expr]:
-    """Return a column as `as_number` does, with the sign that stands in another one."""
+    """Return a column as `as_number` does, with the sign of another column."""
     number, present = as_number(column, schema, mapping)
     if source.sign is None:
         return number, present
@@ -310,7 +310,7 @@ def _is_faulty(name: str) -> bool:
 def _map_texts(
     function: Callable[[str], object], kind: pl.datatypes.DataTypeClass, texts: pl.Series
 ) -> pl.Series:
-    """Return what a function makes of each text, called once for each different one."""
+    """Apply a function to texts, once for each different one."""
     different = texts.drop_nulls().unique()
     values = pl.Series([function(text) for text in different], dtype=kind)
     return texts.replace_strict(different, values, default=None, return_dtype=kind)
@@ -344,12 +344,12 @@ class CheckedBlock(NamedTuple):
 
 
 class RowChecker:
-    """The rows of a file, good and bad, and what was counted on the way.
+    """Checks the rows of a file and counts them.
 
     Attributes:
         rows: read so far.
         left_out: of these, those that do not meet the mapping's conditions.
-        keys: what the numbers in the column `group` stand for.
+        keys: the metadata of each number in the column `group`.
     """
 
     def __init__(self, file: Path, mapping: Mapping) -> None:
@@ -416,7 +416,7 @@ class DriveKeys:
         """Begin without any."""
         self._numbers: dict[tuple[Any, ...], int] = {}
         self.metadata: list[dict[str, Any]] = []
-        """What each number stands for."""
+        """The metadata of each number."""
 
     def number(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
         """Add `group` to a batch with values: the row's number, null where its key is faulty.

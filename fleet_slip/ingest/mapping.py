@@ -44,7 +44,7 @@ from fleet_slip.ingest.formats.can import CanBus, read_can_database
 from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.reading import FileFormats
 from fleet_slip.ingest.formats.source import describe_unknown
-from fleet_slip.quality.plausibility import RADIUS_M
+from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
@@ -70,11 +70,11 @@ class LabelSensor(Config):
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether it is not at the centre of gravity."""
+        """True if it is not at the centre of gravity."""
         return bool(self.sensor_x_m or self.sensor_y_m)
 
     def require_signals(self, signals: Container[str], label: str) -> None:
-        """Raise `ValueError` for a mapping that lacks what the label is computed from."""
+        """Raise `ValueError` for a mapping without the signals that the label is computed from."""
         if self.from_velocities and label in signals:
             raise ValueError(f"label: from_velocities computes {label}: remove its column")
         needed = ["vx", "vy"] if self.from_velocities else [label]
@@ -87,7 +87,7 @@ class LabelSensor(Config):
             raise ValueError("label: moving it needs a speed: vx, vehicle_speed or four wheels")
 
 
-# What is known of each drive, from the mapping, a column or the path.
+# The metadata of drives, from the mapping, a column or the path.
 
 Fact = TypeVar("Fact")
 
@@ -110,13 +110,13 @@ def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
 
 
 class FromColumn(Config):
-    """A drive's metadata that stand in a column of the file; a new value begins a new drive."""
+    """A drive's metadata in a column of the file. A new value begins a new drive."""
 
     column: Name
 
 
 class FromPath(Config):
-    """A drive's metadata that stand in the path of its file, where a pattern of its end has `{}`.
+    """A drive's metadata in the path of its file, where the pattern has `{}`.
 
     `{}/*` is the name of the folder, `{}_*` the file's name up to its first underscore. Neither
     `{}` nor `*` reaches beyond a `/`.
@@ -132,7 +132,7 @@ class FromPath(Config):
         return path
 
     def find(self, file: Path) -> str:
-        """Return what stands there in a file's path. Raises `InputError` for another path."""
+        """Return the text of `{}` in a file's path. Raises `InputError` for another path."""
         components = self.path.split("/")
         path = os.path.abspath(file)  # noqa: PTH100 - follows no link
         names = path.split("/")[1:][-len(components) :]
@@ -194,7 +194,7 @@ OptionalFact = Annotated[
 
 
 class DriveMetadata(Config):
-    """What is known of each drive: given here, or from a column or the path; absent is null."""
+    """Metadata of drives: values, or their column or pattern of the path. Absent means null."""
 
     column: Name | None = None
     """Every value of this column is a drive of its own."""
@@ -218,7 +218,7 @@ class Mapping(Config):
     _signal_catalog: SignalCatalog = PrivateAttr()
     name: Identifier
     missing: tuple[str, ...] = ()
-    """Texts that mean "no value", besides the empty one; `nan` also clears NaN in binary files."""
+    """Texts that mean "no value", in addition to the empty one; `nan` includes NaN."""
     csv: CsvFormat = CsvFormat()
     can: CanBus | None = added(None)
     time: TimeBase
@@ -229,7 +229,7 @@ class Mapping(Config):
     label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
-    """Conditions that a row meets, all of them, or is left out and only counted."""
+    """Conditions on rows. A row that misses one is skipped and counted."""
 
     @field_validator("where", mode="before")
     @classmethod
@@ -268,7 +268,7 @@ class Mapping(Config):
         return self
 
     def __hash__(self) -> int:
-        """Return the hash of what identifies it."""
+        """Return the hash of the mapping's identity."""
         return hash(self.canonical_json())
 
     @property
@@ -277,7 +277,7 @@ class Mapping(Config):
         return self._signal_catalog
 
     def for_file(self, file: Path) -> "Mapping":
-        """Return the mapping with what a file's path says of its drives. Raises `InputError`."""
+        """Return the mapping with the metadata of a file's path. Raises `InputError`."""
         stated = {name: getattr(self.drive, name) for name in DriveMetadata.model_fields}
         from_path = {
             name: item.find(file) for name, item in stated.items() if isinstance(item, FromPath)
@@ -308,7 +308,7 @@ class Mapping(Config):
         }
 
     def common_columns(self) -> list[str]:
-        """Return the columns that say something of all signals: of the drive, and conditions."""
+        """Return the columns that apply to all signals: metadata of drives, and conditions."""
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)
         names = [self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
@@ -328,7 +328,7 @@ class Mapping(Config):
 
     @property
     def front_wheels(self) -> tuple[str, ...]:
-        """The signals that one angle of both front wheels stands for, where it is all there is."""
+        """The signals that are copies of one angle of both front wheels."""
         alone = "steer" in self.signals and not set(FRONT_WHEELS) & set(self.signals)
         return tuple(
             name for name in FRONT_WHEELS if alone and name in self._signal_catalog.signals
@@ -336,7 +336,7 @@ class Mapping(Config):
 
     @property
     def formats(self) -> FileFormats:
-        """What must be known of a file to open it."""
+        """The parameters to open a file."""
         return FileFormats(self.csv, self.can, self.name, self._plain_numbers)
 
     @property
@@ -356,7 +356,7 @@ class Mapping(Config):
 
 
 def is_number(text: str) -> bool:
-    """Whether a text that means "no value" is also a number."""
+    """Return True if a text that means "no value" is also a number."""
     try:
         float(text)
     except ValueError:
@@ -374,14 +374,14 @@ def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:
     return mapping
 
 
-# What a mapping leaves open, and which value stands for it: shown with every model of its logs. A
+# Assumed values for keys that a mapping does not state: shown with every model of its logs. A
 # data root keeps it by the name of the mapping, which is the column `campaign` of its drives.
 
 ASSUMPTIONS = "assumptions"
 
 
 def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
-    """Return what stands for whatever a mapping does not say, each with the key that says it."""
+    """Return the assumed values of keys that a mapping does not state, by key."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
     wheels = {
         name: signal.radius_m for name, signal in signals.items() if name.startswith(WHEEL_PREFIX)
@@ -410,14 +410,14 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
 
 
 def keep_assumptions(root: Folder, mapping: Mapping) -> None:
-    """Write down what a mapping of drives leaves open, unless it was the same before."""
+    """Store the assumptions of a mapping, unless the newest entry is equal."""
     folder, assumed = DocumentFolder(root, f"{ASSUMPTIONS}/{mapping.name}"), assumptions_of(mapping)
     if assumed != _newest(folder):
         folder.append({"assumed": assumed})
 
 
 def kept_assumptions(root: Folder, mappings: Iterable[str]) -> tuple[str, ...]:
-    """Return what the mappings of some drives leave open. Raises `StorageError`."""
+    """Return the assumptions of the mappings of some drives. Raises `StorageError`."""
     folders = (DocumentFolder(root, f"{ASSUMPTIONS}/{name}") for name in sorted(mappings))
     return tuple(dict.fromkeys(text for folder in folders for text in _newest(folder)))
 

@@ -1,4 +1,4 @@
-"""Keeps the rows of drives that have not ended, few of them in memory."""
+"""Collects the rows of drives until they end, few of them in memory."""
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -16,14 +16,14 @@ MOST_OPEN_VALUES = 2**21
 MOST_PARTS = 64
 """Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
 MOST_PIECES, BUNDLED_GROUPS = 512, 128
-"""Parts whose rows are put aside one by one; of more, those of so many groups stand together."""
+"""Maximum number of parts that are spilled one by one; beyond it groups are bundled."""
 
 
 @dataclass(frozen=True)
 class DriveRows:
-    """The rows of one drive, by number of their time base, in chunks that are not copied together.
+    """The rows of one drive by time base, in chunks that are not copied together.
 
-    Of several bases, each has the signals that have a value there.
+    Each of several bases has the signals with values in it.
     """
 
     bases: dict[int, pl.DataFrame]
@@ -77,7 +77,7 @@ class OpenDrives:
         self._bundled = False
         self._ended: list[int] = []
         self._group_of: dict[int, int] = {}
-        """Of each part that has rows in the file."""
+        """The group of each part with spilled rows."""
 
     def add(self, rows: pl.DataFrame) -> None:
         """Keep rows with their part."""

@@ -1,4 +1,4 @@
-"""What is in a file from a stranger: each channel's rate, range, and share of missing values."""
+"""Profiles an unfamiliar file: rate, range, and share of missing values of each channel."""
 
 import csv
 import re
@@ -60,7 +60,7 @@ def guess_layout(file: Path) -> tuple[CsvFormat, dict[str, str]]:
 
 
 def _guess_encoding(file: Path) -> Encoding | None:
-    """Return the encoding of a text, None for what is no text."""
+    """Return the encoding of a text file, None if it is none."""
     with file.open("rb") as stream:
         start = decompressed(stream).read(2**16)
     if start.startswith(_BOMS):
@@ -134,7 +134,7 @@ def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
     return {}
 
 
-# Finds what loggers write where there is no value: -9999, 65535, n.v.
+# Detection of markers for missing values: -9999, 65535, n.v.
 
 _FAR = 2.0
 """How many times the range of the others a number lies outside of it, to be none."""
@@ -142,10 +142,10 @@ _FEWEST = 20
 
 
 def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[float, ...]]:
-    """Return what means no value in channels, of their numbers and of texts among these.
+    """Return the markers for missing values in channels.
 
-    All as text, as a mapping has it under `missing`; and the numbers among them. A number that is a
-    value in some channel is none of them.
+    All as texts, for `missing` of a mapping; and the numbers among them. A number that is a value
+    in a channel is no marker.
     """
     markers = vocabulary()["missing"]
     texts = [
@@ -196,7 +196,7 @@ class Profile:
 
     @property
     def is_number(self) -> bool:
-        """Whether there are numbers in it."""
+        """True if there are numbers in it."""
         return self.time_format is None and bool(np.isfinite(self.values).any())
 
     @property
@@ -218,9 +218,9 @@ class FileProfile:
     formats: FileFormats
     profiles: tuple[Profile, ...]
     missing: tuple[str, ...] = ()
-    """What means that there is no value, as a mapping has it."""
+    """Markers for missing values, for `missing` of a mapping."""
     refused: tuple[str, ...] = ()
-    """What is wrong with channels that cannot be read."""
+    """Problems of channels that cannot be read."""
 
 
 def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
@@ -252,7 +252,7 @@ def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
 def _profile_base(
     source: Source, channels: list[Channel], csv: CsvFormat, refused: list[str]
 ) -> Iterator[Profile]:
-    """Yield what can be read of one time base; of a channel that cannot, note why."""
+    """Yield the profiles of one time base; notes the problems of unreadable channels."""
     try:
         table = _first_rows(source, channels)
     except InputError as error:
@@ -320,7 +320,7 @@ def _time_format(texts: pl.Series) -> str | None:
 
 
 def _read_times(texts: pl.Series, written: str) -> FloatArray:
-    """Return seconds since 1970, or midnight, NaN for what is no such time."""
+    """Return seconds since 1970, or midnight, NaN for other texts."""
     if "%d" not in written:
         clock = texts.str.to_time(written, strict=False).cast(pl.Int64)
         return np.asarray((clock.cast(pl.Float64) / 1e9).fill_null(np.nan).to_numpy())

@@ -21,34 +21,34 @@ from fleet_slip.catalog.counts import round_chunks
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
-from fleet_slip.quality.plausibility import RADIUS_M, SECOND, wrapped
+from fleet_slip.quality.drive_signals import RADIUS_M, TICKS_PER_S, wrap_angle
 
-# Which fixes of a satellite receiver show where the car goes, and at which ticks.
+# Fixes of a satellite receiver: which are valid, and at which ticks.
 
 STEP_S = float(SAMPLE_TIME_S)
 SAME_RAD = 1e-6
-"""A course is finer; of two velocities one that stands still differs by rounding."""
+"""Tolerance for an equal course, above the rounding of one that is computed from velocities."""
 HELD_RAD = 0.005
-"""What a car may turn while its course stays the same: half a degree is a coarse receiver's."""
+"""Turn of the car with an unchanged course: half a degree is the step of coarse receivers."""
 BACKWARDS_MPS = 8.0
 """Nobody drives backwards faster."""
 LEAST_TURNING_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
 
-GRIDS = tuple(ticks for ticks in range(1, SECOND + 1) if SECOND % ticks == 0)
+GRIDS = tuple(ticks for ticks in range(1, TICKS_PER_S + 1) if TICKS_PER_S % ticks == 0)
 """Spacings of fixes, in ticks, of which a whole number is a second."""
 REGULAR = 0.8
 LONGEST_BETWEEN = 25
 """Ticks between two fixes, in which the side-slip angle is nearly a straight line."""
 LONGEST_BESIDE = 5
-"""Ticks from the only fix near: it changes by some tenths of a degree at most."""
+"""Maximum ticks to a single near fix: the slip changes by some tenths of a degree."""
 
 
 def is_held(course: FloatArray, yaw_rate: FloatArray, place: IntArray) -> BoolArray:
-    """Return which fixes repeat a course from before the car turned on.
+    """Return a mask of fixes that repeat an outdated course.
 
     Receivers hold the course when they are slow, or report it less often than the speed. `place`
-    says at which tick each fix is; `course` is of the fixes, and `yaw_rate` of the ticks.
+    is the tick of each fix; `course` is of the fixes, and `yaw_rate` of the ticks.
     """
     heading = np.cumsum(np.nan_to_num(yaw_rate))[place] * STEP_S
     new = np.append(True, np.abs(np.diff(course)) > SAME_RAD)
@@ -80,9 +80,9 @@ def on_grid(
 ) -> tuple[FloatArray, FloatArray]:
     """Return course and speed at regular ticks, if the fixes are at irregular ones.
 
-    They are regular if most that have a fix about a second later have one exactly then. What is
-    interpolated is the course less the yaw rate's integral, that is the slip, between two fixes
-    that are near, or taken from one that is nearer. All arrays are of the ticks.
+    They are regular if most fixes with a successor about a second later have one exactly then.
+    Interpolates the course minus the integral of the yaw rate, which is the slip, between two near
+    fixes, or takes it from the nearest. All arrays are of the ticks.
     """
     fixes = np.flatnonzero(~np.isnan(course))
     if fixes.size < 2 or _is_regular(ticks[fixes]):
@@ -114,15 +114,17 @@ def find_ticks(
 
 def _is_regular(fixes: IntArray) -> bool:
     """Return whether most fixes that have one about a second later have one exactly then."""
-    later = find_ticks(fixes, fixes + SECOND)[1]
-    next_one = np.searchsorted(fixes, fixes + SECOND - SECOND // 10)
+    later = find_ticks(fixes, fixes + TICKS_PER_S)[1]
+    next_one = np.searchsorted(fixes, fixes + TICKS_PER_S - TICKS_PER_S // 10)
     has_next = next_one < fixes.size
-    has_next[has_next] = fixes[next_one[has_next]] <= fixes[has_next] + SECOND + SECOND // 10
+    has_next[has_next] = (
+        fixes[next_one[has_next]] <= fixes[has_next] + TICKS_PER_S + TICKS_PER_S // 10
+    )
     return not has_next.any() or bool(later[has_next].mean() >= REGULAR)
 
 
 def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
-    """Return values at ticks, by straight lines between near samples, else beside a nearer one."""
+    """Interpolate linearly between near samples, else take the nearest one."""
     present = np.flatnonzero(~np.isnan(values))
     times, present_values = ticks[present], values[present]
     right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
@@ -182,7 +184,7 @@ class Resampler:
     def resample(
         self, values: FloatArray, delay_s: float = 0.0, longest_gap_s: float = 0.1
     ) -> FloatArray:
-        """Return a signal on the ticks; what was measured at t stands in the file at t + delay."""
+        """Return a signal at the ticks; a value measured at t is in the file at t + delay."""
         resample = average if self.method == "average" else interpolate
         return resample(self.time_s - delay_s, values, self.at_s, longest_gap_s)
 
@@ -211,7 +213,7 @@ class Resampler:
 
 
 def build_resampler(time_s: FloatArray, method: Method) -> Resampler:
-    """Return what brings signals at these times onto the ticks of their drive.
+    """Return the resampler of signals at these times to the ticks of their drive.
 
     Tick 0 is the first sample, for averages half a tick later; samples are snapped to the nearest.
     """
@@ -286,13 +288,13 @@ def fixes_on_ticks(
     """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
 
     `fixes` are two columns of the resampler's samples: the velocities to the north and to the east,
-    or course and speed, as the `source` of the course says; `yaw_rate` in rad/s and `ay` in m/s²
-    are of the ticks. A sample that repeats the one before is no fix. There is no course without a
-    yaw rate, below `LEAST_SPEED_MPS`, where it `is_held` or `is_backwards`.
+    or course and speed, depending on `source`; `yaw_rate` in rad/s and `ay` in m/s² are of the
+    ticks. A sample that repeats the previous one is no fix. The course is NaN without a yaw rate,
+    below `LEAST_SPEED_MPS`, and where it `is_held` or `is_backwards`.
 
-    In the car's axes the antenna moves by (-r y, r x) against the centre of gravity, with the yaw
-    rate r; a slip β makes an error of r y β over speed. A fix that is measured a part of a tick
-    before its tick turns by r times that part.
+    In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
+    yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
+    tick before its tick is rotated by r times that time.
     """
     course, speed = fixes
     if source.component:
@@ -317,11 +319,11 @@ def fixes_on_ticks(
         sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
     courses, speeds = on_grid(resampler.ticks, courses, speeds, yaw_rate)
-    return wrapped(courses), speeds
+    return wrap_angle(courses), speeds
 
 
 def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
-    """Return where a sample is there and is not the one before again."""
+    """Return a mask of complete samples that differ from the previous one."""
     complete = np.flatnonzero(~np.isnan(course) & ~np.isnan(speed))
     same = np.zeros(complete.size, dtype=np.bool_)
     same[1:] = (np.diff(course[complete]) == 0) & (np.diff(speed[complete]) == 0)
@@ -341,15 +343,20 @@ def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) ->
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
-    """Return the counts of the label at the centre of gravity, and of velocities it is made of."""
+    """Return the counts of the label at the centre of gravity, and of velocities it is made of.
+
+    There is no label below `LEAST_SPEED_MPS`, where sensors of angles report noise.
+    """
     sensor, signals = mapping.label, mapping.signal_catalog
-    if sensor is None:
-        return {}
     columns: dict[str, FloatArray] = {}
-    if sensor.from_velocities:
+    if sensor is not None and sensor.from_velocities:
         columns = _velocities(signals, sensor, counts)
-    elif sensor.is_elsewhere:
-        columns = _angle(signals, sensor, _speed(mapping, counts), counts)
+    elif signals.label in counts and (speed := _speed(mapping, counts)) is not None:
+        if sensor is not None and sensor.is_elsewhere:
+            columns = _angle(signals, sensor, speed, counts)
+        elif (slow := speed < LEAST_SPEED_MPS).any():
+            angle = physical(signals, counts, signals.label)
+            columns = {signals.label: np.where(slow, np.nan, angle)}
     return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
 
 
@@ -377,8 +384,8 @@ def _angle(
     return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
 
 
-def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
-    """Return the car's speed: as it is logged, or that of its wheels."""
+def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:
+    """Return the car's speed: as it is logged, or that of its wheels; None without both."""
     for name in OWN_SPEEDS:
         if name in counts:
             return np.abs(physical(mapping.signal_catalog, counts, name))
@@ -388,4 +395,4 @@ def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray:
         * (mapping.signals[name].radius_m or RADIUS_M)
         for name in wheels
     ]
-    return np.asarray(np.median(speeds, axis=0), dtype=np.float64)
+    return np.asarray(np.median(speeds, axis=0), dtype=np.float64) if speeds else None

@@ -1,4 +1,4 @@
-"""From a measured file to drives in counts, piece by piece: few drives are in memory at once."""
+"""Reads a measured file as drives in counts, block by block, with few drives in memory."""
 
 import hashlib
 import json
@@ -41,16 +41,16 @@ from fleet_slip.quality.checks import Fault
 from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
-"""Short drives in one file. With more, time or the drive's column is not what the mapping says."""
+"""Maximum number of short drives in a file. More mean a wrong time or a wrong drive column."""
 SHORT_ROWS = 1000
 MAX_TICKS = 40_000_000
-"""Ticks of all drives of one file together, where it has few rows for so many."""
+"""Maximum ticks of all drives of a file that has few rows for them."""
 MOST_TICKS_A_ROW = 1000
 
 
 @dataclass
 class IngestCounts:
-    """What became of a file's rows: those read are left out, kept or quarantined.
+    """Counts of a file's rows: each row read is left out, kept or quarantined.
 
     Attributes:
         rows_left_out: rows that do not meet the mapping's conditions.
@@ -73,7 +73,7 @@ FEWEST_STEPS = 1000
 
 
 REFUSED_ROWS = 2**18
-"""Refused rows that are in memory at most; all others wait in a temporary file."""
+"""Maximum rejected rows in memory; the others are in a temporary file."""
 
 
 class MeasuredStream:
@@ -85,7 +85,7 @@ class MeasuredStream:
     """
 
     def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
-        """Take the file, the mapping, and what `_identity` returns."""
+        """Take the file, the mapping, and the two digests of `_identity`."""
         self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker = RowChecker(file, mapping)
@@ -126,8 +126,8 @@ class MeasuredStream:
     ) -> tuple[list[CheckedBlock], dict[int, float]]:
         """Return the first blocks, and the usual time between samples of each time base in them.
 
-        It is that of rows up to a number that is the same however a file is cut into blocks. Of a
-        time base that is not among them, its first drive gives it.
+        It is computed from a number of first rows that does not depend on the size of blocks. For a
+        base without rows among them it is that of its first drive.
         """
         early: list[CheckedBlock] = []
         enough = RATE_ROWS
@@ -149,7 +149,7 @@ class MeasuredStream:
         *,
         last: bool = False,
     ) -> Iterator[MeasuredDrive]:
-        """Yield the drives that ended in a block, and keep what was refused of it."""
+        """Yield the drives that ended in a block, and keep its rejected rows."""
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced = cutter.cut(block.rows, last=last)
         self._open.add(rows)
@@ -291,7 +291,7 @@ class MeasuredStream:
         return frame.to_arrow().cast(quarantine_schema())
 
     def suspicions(self) -> tuple[Fault, ...]:
-        """Return what looks wrong in the file as a whole, once all drives were taken."""
+        """Return the faults of the file as a whole. Call it after `drives` has ended."""
         counts, time = self.counts, self.mapping.time
         faults = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
@@ -328,7 +328,7 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
 
 
 FREE_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
-"""A file of more bytes than this is refused if it states so many times its space on disk."""
+"""A file of more bytes is refused if it states so many times its space on disk."""
 
 
 def _require_dense(file: Path, descriptor: int) -> None:
@@ -368,7 +368,7 @@ def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataF
     return DriveCutter(mapping.time).cut(rows, last=several)[0]
 
 
-# What looks wrong in a log as a whole: many refused rows, and several cars, where one is under way
+# Faults of a log as a whole: many rejected rows, and several cars, where one is under way
 # twice, or a column named like cars is not mapped.
 
 LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
@@ -412,9 +412,9 @@ def find_refusals(
 
 
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
-    """Yield columns named as cars or trips are of several values, and that a mapping passes by.
+    """Yield faults for unmapped columns with several values that are named like cars or trips.
 
-    `drives` is what the file fell into. Logs that have clocks of their own are those of one car.
+    `drives` is the number of drives of the file. Logs with clocks are those of one car.
     """
     unmapped = {
         key: words

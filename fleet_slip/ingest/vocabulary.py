@@ -1,4 +1,4 @@
-"""What departments call their signals and units: `vocabulary.toml`, and how a name is compared."""
+"""Compares names with `vocabulary.toml`, the usual names of signals and units."""
 
 import re
 import tomllib
@@ -38,14 +38,14 @@ def parts_of(name: str) -> list[str]:
 
 @lru_cache(maxsize=2**10)
 def split_unit(name: str) -> tuple[str, str]:
-    """Return a name without the unit that stands behind it in brackets, and that unit or ''."""
+    """Return a name without its unit in brackets, and that unit or ''."""
     match = _IN_BRACKETS.search(name)
     return (name[: match.start()], match[1]) if match else (name, "")
 
 
 @lru_cache(maxsize=2**10)
 def unit_called(text: str) -> str | None:
-    """Return a unit as a mapping writes it, None for what is not known."""
+    """Return a unit as a mapping writes it, None for an unknown one."""
     plain = text.strip().strip("[]()<>{} ").lower().replace("·", "*")
     called = {alias: unit for unit, aliases in vocabulary()["units"].items() for alias in aliases}
     return called.get(plain)
@@ -60,10 +60,10 @@ def unit_behind(name: str) -> str | None:
 
 @lru_cache(maxsize=2**14)
 def best_words(signal: str, name: str, section: str = "signals") -> tuple[float, str]:
-    """Return how well a name fits the words of a signal, 0 if not at all, and the words.
+    """Return the score of a name for the words of a signal, 0 for no match, and the words.
 
-    What stands behind the name of a message or a topic counts twice, and parts of it that no word
-    explains count against it.
+    Words after the name of a message or a topic count twice; unexplained parts of them lower the
+    score.
     """
     plain, _ = split_unit(name)
     behind = plain.partition(".")[2] or plain
@@ -91,13 +91,13 @@ def _called(signal: str, section: str) -> tuple[tuple[str, ...], ...]:
 
 
 def fits_any(words: Iterable[str], name: str) -> bool:
-    """Whether a name has one of the words."""
+    """Return True if a name has one of the words."""
     plain, _ = split_unit(name)
     return any(_fit(tuple(phrase.split()), plain, plain) > 0 for phrase in words)
 
 
 def is_called(words: Iterable[str], name: str) -> bool:
-    """Whether a name is one of the words and nothing but a number or a name of it."""
+    """Return True if a name is one of the words, with a number or not."""
     parts = [part for part in parts_of(split_unit(name)[0]) if not part.isdigit()]
     significant = [part for part in parts if part not in _NUMBERING]
     return any(
@@ -130,7 +130,7 @@ def _place(word: str, name: str) -> int | None:
 
 @lru_cache(maxsize=2**10)
 def _stems_of(name: str) -> list[list[str]]:
-    """Return for each part of a name the part, and what it is compounded of."""
+    """Return each part of a name, and the words that it is compounded of."""
     return [[part, *_pieces(part)] for part in parts_of(name)]
 
 

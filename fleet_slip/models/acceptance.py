@@ -176,7 +176,7 @@ class ChallengerEvaluation:
         groups = assign_folds(values, self.by, MAX_GROUPS)
         used, fold = np.unique(groups.fold[mask], return_inverse=True)
         names = tuple(groups.names[number] for number in used.tolist())
-        drives = cohort.part(mask)
+        drives = cohort.filter(mask)
         assignment = FoldAssignment(fold, names)
         return self.complete_folds(
             CohortFolds.from_tables(drives.tables, assignment, drives.drive_numbers)

@@ -64,9 +64,11 @@ def outlier_drives(served: CompleteCases, *, intercept: bool) -> dict[str, Downw
     """Return the drives that `robust` counts less, the most unusual first."""
     table = served.table if intercept else served.table.about_origin()
     weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
-    less = np.flatnonzero(weights.parts < FULL).tolist()
+    less = np.flatnonzero(weights.weights < FULL).tolist()
     names = served.drives["drive_id"].to_pylist()
-    return {names[i]: weights.of(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))}
+    return {
+        names[i]: weights.drive(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))
+    }
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
-"""What a model is published for: drives and courses that a car can have.
+"""Checks of the training data before a model is published: drives and courses that a car can have.
 
-A fault of all drives, such as a label with the other sign, shows in no comparison.
+A fault of all drives, such as a reversed label, shows in no comparison of drives.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,108 +13,66 @@ from fleet_slip.base import pluralize
 from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.calibration.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
-from fleet_slip.catalog.drive_sources import ALL_DRIVES, MEASURED
-from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
-from fleet_slip.quality.plausibility import Signals, check_plausibility, to_regular_grid
+from fleet_slip.quality.inspection import inspect_drives
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
-from fleet_slip.warehouse.predicate import guarded_query, parse_cohort, parse_predicate
-from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.predicate import parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 
-DRIVES = 5
-"""That are looked at, of as many cars if there are so many."""
-
-FEWEST_NEW = 3
-"""New drives that are looked at if there is a champion: one alone may be odd."""
-
-MOST_TICKS = 100_000
-
-_LONGEST = """
-    SELECT drive_id, day FROM drives WHERE source = $source AND ({predicate})
-    ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
-        rows DESC, drive_id
-"""
+MAX_DRIVES = 5
+"""Drives to inspect, each of a different vehicle where possible."""
+MIN_NEW_DRIVES = 3
+"""Fewest new drives to judge beside a champion: one alone may be odd."""
 
 
 def require_sound_drives(
-    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None = None, settled: int = 0
+    warehouse: Warehouse,
+    manifest: Manifest,
+    champion_drives: TrainedDrives | None = None,
+    champion_columns: int = 0,
 ) -> None:
-    """Raise `RefusedError` if most of some measured drives of a cohort contradict any car.
+    """Raise `RefusedError` if most of the inspected measured drives contradict the motion of cars.
 
-    `made` are the drives that made the champion, of `settled` columns: one of more columns needs as
-    much data for them as a first champion does. What is looked at is the label, and the signals
-    that a model has columns of. Simulated drives, and those of cars that sent no log, are passed
-    over.
+    Only faults of the label and of signals in columns of the model count. Beside a champion only
+    drives that it was not trained on are inspected; a model of more columns than the champion needs
+    as much data as a first one.
     """
-    found, looked_at, measured = _look(warehouse, manifest, made)
-    lacks = missing_evidence(load_thresholds(warehouse.configs), manifest)
-    if measured and len(manifest.terms) > settled and lacks:
+
+    def select_new(drives: Sequence[str]) -> Sequence[bool]:
+        if champion_drives is None:
+            return [True] * len(drives)
+        names = hash_names(pa.array(drives, pa.string()))
+        return [not is_trained for is_trained in champion_drives.among(names).tolist()]
+
+    predicate = parse_predicate(warehouse.catalog.signals, manifest.trained_on.cohort)
+    inspection = inspect_drives(warehouse, predicate, MAX_DRIVES, select_new)
+    missing = missing_evidence(load_thresholds(warehouse.configs), manifest)
+    if inspection.measured and len(manifest.terms) > champion_columns and missing:
         raise RefusedError(
-            f"{manifest.name} was not published: {'; '.join(lacks)}. Ingest more drives or choose "
-            "fewer columns. To publish it anyway: --force"
+            f"{manifest.name} was not published: {'; '.join(missing)}. Ingest more drives or "
+            "choose fewer columns. To publish it anyway: --force"
         )
-    if made is not None and looked_at < FEWEST_NEW:
+    inspected, has_champion = len(inspection.drives), champion_drives is not None
+    if has_champion and inspected < MIN_NEW_DRIVES:
         return
     used = {manifest.label.signal}
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}
-    for (_, signals), examples in found.items():
-        # Beside a champion, whose drives have no faults, half of them are enough.
-        if used.isdisjoint(signals) or 2 * len(examples) + (made is not None) <= looked_at:
+    for (_, signals), faults in inspection.by_fault().items():
+        # Drives of a champion have no faults, so that half of the new ones are enough beside it.
+        if used.isdisjoint(signals) or 2 * len(faults) + has_champion <= inspected:
             continue
         raise RefusedError(
-            f"{manifest.name} was not published: {len(examples)} of {looked_at} inspected drives "
-            f"contradict the motion of any car: {examples[0]} Correct the mapping and run: "
+            f"{manifest.name} was not published: {len(faults)} of {inspected} inspected drives "
+            f"contradict the motion of any car: {faults[0]} Correct the mapping and run: "
             "fleet-slip ingest LOGS --mapping M --replace. To publish it anyway: --force"
         )
-
-
-def _look(
-    warehouse: Warehouse, manifest: Manifest, made: TrainedDrives | None
-) -> tuple[dict[tuple[str, tuple[str, ...]], list[Fault]], int, int]:
-    """Return what looks wrong in some long drives, how many these are, and of how many."""
-    signals = warehouse.catalog.signals
-    found: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
-    predicate = parse_predicate(signals, manifest.trained_on.cohort)
-    query = _LONGEST.format(predicate=predicate.sql)
-    with (
-        connect_tables(warehouse, query + "log_counts") as database,
-        guarded_query(database, predicate),
-    ):
-        drives = database.execute(query, {"source": MEASURED}).fetchall()
-        measured = len(drives)
-        if made is not None:
-            numbers = hash_names(pa.array([drive for drive, _ in drives], pa.string()))
-            seen = made.among(numbers).tolist()
-            drives = [drive for drive, known in zip(drives, seen, strict=True) if not known]
-        chosen = drives[:DRIVES]
-        for drive, day in chosen:
-            columns = database.execute(
-                "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
-                f"LIMIT {MOST_TICKS}",
-                {"day": day, "drive": drive},
-            ).fetchnumpy()
-            for one in check_plausibility(signals, _signals(signals, columns)):
-                if one.does_harm:
-                    found.setdefault((one.kind, one.signals), []).append(one)
-    return found, len(chosen), measured
-
-
-def _signals(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
-    """Return the signals of a drive that has values of them."""
-    counts = {
-        name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
-        for name in signals.signals
-        if name in columns
-    }
-    some = {name: values for name, values in counts.items() if np.isfinite(values).any()}
-    return to_regular_grid(signals, np.asarray(columns["tick"], dtype=np.int32), some)
 
 
 # A course that is late looks like a side-slip angle, in all figures, and so does a heading.

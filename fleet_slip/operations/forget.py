@@ -74,7 +74,7 @@ class ForgetReport(Answer):
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """True if there was anything to do."""
         return bool(self.drives or self.old_files_deleted)
 
     def parts(self) -> Iterator[Part]:

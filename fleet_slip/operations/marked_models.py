@@ -60,7 +60,7 @@ def _may_have_seen(
     without: int | None,
     present: Callable[[str], Hashes],
 ) -> bool:
-    """Whether a version was, or may have been, trained on drives that Gram rows lack since then."""
+    """Return True if a version may be trained on drives without Gram rows since `without`."""
     if without is None:
         return True
     try:

@@ -54,7 +54,7 @@ class Limits:
         return cls(math.exp(logarithms.centre), None, math.exp(logarithms.upper))
 
     def beyond(self, value: float) -> bool:
-        """Whether a value is outside."""
+        """Return True if a value is outside."""
         return value > self.upper or (self.lower is not None and value < self.lower)
 
 

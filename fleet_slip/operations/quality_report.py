@@ -1,4 +1,4 @@
-"""Faulty sensors, drive by drive, from Gram rows alone."""
+"""Faulty sensors, drive by drive: from the Gram rows of all drives, and from the rows of some."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -17,12 +17,13 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.ingest.recordings import SourceRef
-from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.checks import SATURATED, Fault
 from fleet_slip.quality.course_relation import relate
+from fleet_slip.quality.inspection import inspect_drives
 from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
 from fleet_slip.quality.moments import DriveBatches
 from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
-from fleet_slip.quality.turning import find_implausible
+from fleet_slip.quality.turning import check_moments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.database import sql_text
@@ -45,49 +46,68 @@ class SensorFault(Record):
 
 BY_DAY = attrgetter("day", "drive_id")
 
+MAX_INSPECTED = 20
+"""Drives whose rows are checked: below as many the peers of a drive are too few to show a fault."""
+
 
 @dataclass(frozen=True)
 class QualityReport(Answer):
-    """What was examined and found.
+    """Faulty sensors and labels of a cohort.
 
     Attributes:
-        drives: Gram rows long enough to be examined.
-        compared: those among them that had enough peers to be compared with.
+        drives: number of drives that are long enough to be checked.
+        compared: those among them with enough peers to be compared with.
         findings: one for each faulty drive, by day and drive.
+        systematic: faults of most of the drives whose rows were checked. No drive shows what is
+            right, so that none is left out of training; `publish` refuses a first champion.
+        inspected: number of drives whose rows were checked.
     """
 
     drives: int
     compared: int
     findings: tuple[SensorFault, ...]
+    systematic: tuple[Fault, ...] = ()
+    inspected: int = 0
 
     def parts(self) -> Iterator[Part]:
         """Return a table of the findings."""
         peers = "other" if self.compared else "too few"
-        examined = (
+        checked = (
             f"{pluralize(self.drives, 'drive')} checked, {self.compared:,} of them against peers "
             f"({peers} drives of a car or vehicle model)"
         )
         if self.findings:
             header = "drive|car|fault|signals|what shows it"
             row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
-            yield TextTable(examined, header, self.findings, row, left=5)
+            yield TextTable(checked, header, self.findings, row, left=5)
+        elif self.systematic:
+            yield checked
         else:
-            yield f"{examined}: {'no faulty sensor' if self.drives else 'none long enough'}"
+            yield f"{checked}: {'no faulty sensor' if self.drives else 'none long enough'}"
+        for fault in self.systematic:
+            yield f"in most of {pluralize(self.inspected, 'inspected drive')}: {fault}"
 
     @property
     def problem(self) -> AlarmError | None:
-        """That some drives have faulty sensors."""
-        of = pluralize(self.drives, "drive")
-        found = len(self.findings)
-        return AlarmError(f"faulty sensors in {found} of {of}") if found else None
+        """Return an error if any drive is faulty."""
+        if self.systematic:
+            return AlarmError(
+                f"most of {pluralize(self.inspected, 'inspected drive')} contradict the motion of "
+                "any car. Correct the mapping and run: fleet-slip ingest LOGS --mapping M --replace"
+            )
+        if self.findings:
+            drives = pluralize(self.drives, "drive")
+            return AlarmError(f"faulty sensors in {len(self.findings)} of {drives}")
+        return None
 
 
 def examine_drives(
     warehouse: Warehouse, predicate: str | Predicate = TRAINING_DRIVES
 ) -> QualityReport:
-    """Examine the drives that satisfy a predicate: labels beside all others, then model by model.
+    """Run the checks of Gram rows on all drives of a cohort, and those of rows on some.
 
-    Each drive is examined, whatever signals it has.
+    Labels are compared among all drives, signals among those of a vehicle model. Drives with
+    different sets of signals are checked alike.
     Raises like `fleet_slip.grams.cohort.load_cohort`.
     """
     drives = parse_cohort(warehouse.catalog.signals, predicate)
@@ -96,11 +116,22 @@ def examine_drives(
         known = _faulty_courses(reader, drives)
         known |= find_wrong_labels(load_cohort(reader, drives))
         reports = [examine(load_cohort(reader, drives & of_model), known) for of_model in models]
-    findings = [finding for report in reports for finding in report.findings]
+    findings = {finding.drive_id: finding for report in reports for finding in report.findings}
+    inspection = inspect_drives(warehouse, drives, MAX_INSPECTED)
+    systematic: dict[tuple[str, tuple[str, ...]], Fault] = {}
+    for drive in inspection.drives:
+        for fault in drive.faults:
+            if inspection.is_systematic(fault):
+                systematic.setdefault((fault.kind, fault.signals), fault)
+            else:
+                finding = SensorFault(drive.drive_id, drive.vehicle_id, drive.day, fault)
+                findings.setdefault(drive.drive_id, finding)
     return QualityReport(
         sum(report.drives for report in reports),
         sum(report.compared for report in reports),
-        tuple(sorted(findings, key=BY_DAY)),
+        tuple(sorted(findings.values(), key=BY_DAY)),
+        tuple(systematic.values()),
+        len(inspection.drives),
     )
 
 
@@ -131,56 +162,55 @@ def _vehicle_models(reader: GramReader, predicate: Predicate) -> list[Predicate]
 
 
 def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
-    """Return the drives whose label contradicts that of the others, of whatever vehicle model.
+    """Return the drives whose label contradicts that of the others, of all vehicle models.
 
-    One that is reversed, and one with another factor or zero since a day or in a file: what is
-    wrong with many drives at once may be the usual in one vehicle model.
+    Such a label is reversed, or has another factor or zero since a day or in a file. A fault of
+    many drives at once may be usual within one vehicle model.
     """
     catalog = cohort.catalog
     limits = thresholds(catalog.configs).quality
-    found: dict[str, Fault] = {}
+    faults: dict[str, Fault] = {}
     for table, metadata in _long_drives(cohort, limits.min_rows):
         in_order = np.ones(len(table), dtype=np.bool_)
-        in_order[list(find_implausible(table, catalog.signals, limits.min_correlation))] = False
+        in_order[list(check_moments(table, catalog.signals, limits.min_correlation))] = False
         if in_order.sum() >= limits.min_drives:
-            faults = find_reversed_labels(table, in_order, catalog.signals.label)
-            in_order[list(faults)] = False
+            wrong = find_reversed_labels(table, in_order, catalog.signals.label)
+            in_order[list(wrong)] = False
             by_group = _days_and_files(metadata)
-            faults |= find_odd_days(catalog.signals, table, in_order, *by_group, limits)
+            wrong |= find_odd_days(catalog.signals, table, in_order, *by_group, limits)
             names = metadata["drive_id"].to_pylist()
-            found |= {names[drive]: fault for drive, fault in faults.items()}
-    return found
+            faults |= {names[drive]: fault for drive, fault in wrong.items()}
+    return faults
 
 
 def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> QualityReport:
-    """Examine each drive of a cohort, beside other drives of its car and of its vehicle model.
+    """Run the checks of Gram rows on each drive, with its car's and its vehicle model's drives.
 
-    First for what no car does (`find_implausible`), then by comparison with its peers, if it has
-    `min_drives` of them; see `_peer_groups`. `known` are faulty drives.
+    First those that need no peers, then the comparison with peers, if there are `min_drives` of
+    them; see `_peer_groups`. `known` are faulty drives. A drive with several sets of signals has
+    several Gram rows, and is one drive.
     """
     catalog = cohort.catalog
     limits = thresholds(catalog.configs).quality
-    drives = compared = 0
+    drives, compared = set[str](), set[str]()
     known = {**(known or {}), **find_repeated(cohort.drives)}
-    findings = []
+    findings: dict[str, SensorFault] = {}
     for table, metadata in _groups(cohort, limits.min_rows):
-        names = metadata["drive_id"].to_pylist()
-        faults = find_implausible(table, catalog.signals, limits.min_correlation)
+        names = np.array(metadata["drive_id"].to_pylist(), dtype=object)
+        faults = check_moments(table, catalog.signals, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
         faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
-        beside_peers = np.zeros(len(table), dtype=np.bool_)
         for group in _peer_groups(metadata, limits.min_drives):
             if in_order[group].sum() >= limits.min_drives:
-                beside_peers[group] = True
-                found = _unlike_peers(catalog.signals.label, table, group, in_order, limits)
-                faults |= {drive: fault for drive, fault in found.items() if drive not in faults}
-        drives += len(table)
-        compared += int(beside_peers.sum())
-        named = enumerate(metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist())
-        findings += [SensorFault(**row, fault=faults[i]) for i, row in named if i in faults]
-    findings.sort(key=BY_DAY)
-    return QualityReport(drives, compared, tuple(findings))
+                compared |= set(names[group])
+                unlike = _unlike_peers(catalog.signals.label, table, group, in_order, limits)
+                faults |= {drive: fault for drive, fault in unlike.items() if drive not in faults}
+        drives |= set(names)
+        rows = metadata.select(["drive_id", "vehicle_id", "day"]).to_pylist()
+        for drive, fault in faults.items():
+            findings.setdefault(names[drive], SensorFault(**rows[drive], fault=fault))
+    return QualityReport(len(drives), len(compared), tuple(sorted(findings.values(), key=BY_DAY)))
 
 
 def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
@@ -236,7 +266,7 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
     clipped = np.array([count or 0 for count in metadata["saturated"].to_pylist()])
     fraction = clipped / table.n
     return {
-        int(drive): Fault("saturated", (), f"{clipped[drive]:,} values at the end of their range")
+        int(drive): SATURATED.fault(count=clipped[drive])
         for drive in np.flatnonzero(fraction > limits.max_saturated_per_row)
     }
 

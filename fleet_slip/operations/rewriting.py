@@ -263,7 +263,7 @@ class CompactionReport:
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """True if there was anything to do."""
         return bool(self.rows_rewritten)
 
 
@@ -340,7 +340,7 @@ class MigrationReport(Answer):
 
     @property
     def changed(self) -> bool:
-        """Whether there was anything to do."""
+        """True if there was anything to do."""
         return bool(self.added or self.sealed)
 
     def parts(self) -> Iterator[Part]:

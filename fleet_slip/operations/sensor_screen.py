@@ -23,7 +23,7 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
 from fleet_slip.grams.update import ensure_grams
 from fleet_slip.operations.quality_report import SensorFault, examine_drives
-from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
@@ -169,7 +169,7 @@ def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     for piece in _pieces(warehouse, predicate) if _has_measured(grams) else []:
         about = {"cohort": predicate.text, "from": piece.first, "root": warehouse.root.uri}
         limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
-        state = [piece.rows, sha256(canonical_json(limits).encode()).hexdigest()]
+        state = [piece.rows, sha256(f"{CHECKS}{canonical_json(limits)}".encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
         kept = cache_folder("examined") / f"{name[:32]}.json"
         parts.append(
@@ -220,7 +220,7 @@ def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
 
 
 def _has_measured(grams: Snapshot) -> bool:
-    """Whether any Gram row is of a measured drive; of many files a query tells it as fast."""
+    """Return True if there may be Gram rows of measured drives. Does not search many files."""
     if len(grams.files) > FEW_FILES:
         return True
     read = (grams.table.read_combinations(file.path, ["source"]) for file in grams.files)

@@ -83,7 +83,7 @@ class Damage:
 
     @property
     def damage(self) -> bool:
-        """Whether something is lost, or would be computed wrongly."""
+        """True if something is lost, or would be computed wrongly."""
         return self.kind not in {"unreferenced", "backlog"}
 
 

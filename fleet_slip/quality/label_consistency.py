@@ -179,7 +179,7 @@ def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
     if np.median(explained**2 / np.maximum(variance, least)) < LEAST_EXPLAINED:
         return None
     gains = explained / np.maximum(predicted, least)
-    means = drives.each(lambda batch: batch.matrices[:, 0, 1:])
+    means = drives.evaluate(lambda batch: batch.matrices[:, 0, 1:])
     offsets = means[:, label] - np.delete(means, label, axis=1) @ weights
     return np.stack([offsets, np.log(np.maximum(gains, LEAST_GAIN))], axis=1)
 

@@ -13,8 +13,8 @@ from fleet_slip.arrays import BoolArray, FloatArray
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
 
-AT_ONCE = 2**12
-"""Drives whose matrices are held at once: some 1.4 KB each."""
+BATCH = 2**12
+"""Drives whose matrices are held together: some 1.4 KB each."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class MeanMoments:
     @classmethod
     def of_rows(cls, values: Mapping[str, FloatArray], rows: BoolArray) -> "MeanMoments":
         """Return the moments of some rows of one drive, each signal about its mean."""
-        table = np.array([one[rows] for one in values.values()])
+        table = np.array([signal[rows] for signal in values.values()])
         table -= table.mean(axis=1, keepdims=True)
         matrix = np.eye(len(table) + 1)
         matrix[1:, 1:] = table @ table.T / table.shape[1]
@@ -49,11 +49,11 @@ class MeanMoments:
         return len(self.matrices)
 
     def position(self, signal: str) -> int:
-        """Return where a signal stands in u."""
+        """Return the index of a signal in u."""
         return self.signals.index(signal) + 1
 
     def exchanged(self, a: str, b: str) -> "MeanMoments":
-        """Return the moments as they would be with two signals exchanged."""
+        """Return the moments with two signals exchanged."""
         order = np.arange(len(self.signals) + 1)
         i, j = self.position(a), self.position(b)
         order[[i, j]] = order[[j, i]]
@@ -67,20 +67,20 @@ class MeanMoments:
 
 @dataclass(frozen=True)
 class DriveBatches:
-    """The mean moments of some drives of a table, a batch of drives at a time.
+    """The mean moments of some drives of a table, in batches.
 
     Attributes:
         table: Gram rows, which are half as large as the matrices.
-        rows: which of them, in this order.
+        rows: positions of the drives in the table.
     """
 
     table: "GramTable"
     rows: NDArray[np.intp]
 
     @classmethod
-    def of(cls, table: "GramTable", wanted: BoolArray | None = None) -> "DriveBatches":
+    def of(cls, table: "GramTable", mask: BoolArray | None = None) -> "DriveBatches":
         """Take all drives of a table, or those of a mask."""
-        return cls(table, np.arange(len(table)) if wanted is None else np.flatnonzero(wanted))
+        return cls(table, np.arange(len(table)) if mask is None else np.flatnonzero(mask))
 
     def __len__(self) -> int:
         """Return the number of drives."""
@@ -88,18 +88,18 @@ class DriveBatches:
 
     def __iter__(self) -> Iterator[MeanMoments]:
         """Yield the moments of the drives in their order."""
-        for first in range(0, len(self), AT_ONCE):
-            yield MeanMoments.of(self.table.take(self.rows[first : first + AT_ONCE]))
+        for first in range(0, len(self), BATCH):
+            yield MeanMoments.of(self.table.take(self.rows[first : first + BATCH]))
 
     @cached_property
     def mean(self) -> FloatArray:
-        """The mean matrix, added up in the order of the drives; every drive counts the same."""
+        """The mean matrix, summed in the order of the drives; all drives have equal weight."""
         size = len(self.table.signals) + 1
         total = np.zeros((size, size))
         for batch in self:
             total = np.concatenate([total[None], batch.matrices]).sum(axis=0)
         return np.asarray(total / len(self))
 
-    def each(self, figures: Callable[[MeanMoments], FloatArray]) -> FloatArray:
-        """Return the figures of all drives, from those of each batch, drives first."""
+    def evaluate(self, figures: Callable[[MeanMoments], FloatArray]) -> FloatArray:
+        """Return the figures of all drives, computed by batch; the first axis is the drive."""
         return np.concatenate([figures(batch) for batch in self])

@@ -124,7 +124,7 @@ class Prediction:
             used = [0, *(p for p in predictors if p != target)]
             weights[row, used] = solve(total[np.ix_(used, used)], total[used, target])
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
-        figures = reference.each(bare.figures)
+        figures = reference.evaluate(bare.figures)
         middle, spread = _middle_and_spread(figures)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
         return cls(at, weights, middle, np.maximum(spread, floors))
@@ -183,7 +183,7 @@ class Peers:
 
     def suspects(self, drives: DriveBatches) -> BoolArray:
         """Say which drives have a figure beyond the limit."""
-        worst = drives.each(lambda batch: self.worst(self.full, batch))
+        worst = drives.evaluate(lambda batch: self.worst(self.full, batch))
         return np.asarray(worst > self.limits.limit)
 
     def worst(self, prediction: Prediction, moments: MeanMoments) -> FloatArray:

@@ -1,9 +1,8 @@
-"""What can be wrong with signals of a drive, and the checks of it that need no other drive.
+"""Signs of turning: signals that are positive in a left turn (ISO 8855) and must agree.
 
-In a left turn (ISO 8855) ay, yaw rate and every steering angle are positive, and the right wheels
-run faster than the left. Each of these is a witness; one that contradicts the others is reversed,
-and a reversed difference of two wheels means that the two are swapped. Ingest and publish ask this
-of a drive's rows, quality and nights of its Gram row.
+They are ay, yaw rate, every steering angle, and the right wheels' speed less the left wheels'. Each
+is a witness. One that contradicts the others is reversed; a reversed difference of two wheels means
+that the two are swapped. The checks read the moments of a drive, from its rows or its Gram row.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,13 +13,20 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SignalCatalog
-from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.moments import AT_ONCE, DriveBatches, MeanMoments
+from fleet_slip.quality.checks import (
+    CONSTANT,
+    CONTRADICTION,
+    ONE_SIDED,
+    SWAPPED_AXES,
+    SWAPPED_STEERING,
+    SWAPPED_WHEELS,
+    TURNING_SIGN,
+    Fault,
+)
+from fleet_slip.quality.moments import BATCH, DriveBatches, MeanMoments
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
-
-# What no car does.
 
 WITNESSES: Mapping[str, Mapping[str, int]] = {
     "ay": {"ay": 1},
@@ -34,105 +40,110 @@ WITNESSES: Mapping[str, Mapping[str, int]] = {
 }
 """What is positive in a left turn, as a combination of signals."""
 AXLES = ("front wheels", "rear wheels")
-FEWEST_WITNESSES = 3
-"""Of a Gram row, which has the rows of a car that stands or drives backwards too."""
-_CLEAR = 0.2
+MIN_WITNESSES = 3
+"""In a Gram row, which includes rows of a car that stands or drives backwards."""
+MIN_LOADING = 0.2
 """A loading nearer to zero has no clear sign."""
-_ROUNDING = 1e-12
-"""Part of the variances of two signals that is left of their difference where they are equal."""
+ROUNDING = 1e-12
+"""Share of the variances of two equal signals that rounding leaves in their difference."""
 
-STEERING_RATIO = (0.25, 1.0)
-"""Track over wheelbase is about 0.5 to 0.65 in a car; less if steering is nearer to parallel."""
-
+MAX_STEERING_RATIO = 1.0
+"""Of track over wheelbase: beyond it a sensor is biased."""
 UNBIASED_STEERING = 0.8
-"""Part of the drives that must have such a ratio, of either sign, for its sign to mean anything:
-the wheels differ by some 0.04 deg in the mean, and sensors by more."""
-
-AGREEING, LONE = 0.8, 0.5
-ONE_SIDED, TURNING_BOTH_WAYS = 0.5, 0.3
+"""Share of drives that must have such a ratio, of either sign, for its sign to mean anything: the
+wheels differ by some 0.04 deg in the mean, and sensors by more."""
+MIN_AGREEMENT, MAX_LONE_CORRELATION = 0.8, 0.5
+"""Correlation of witnesses that agree, and of one that has lost its sign with them."""
+MIN_MEAN_RATIO, MAX_TURNING_MEAN_RATIO = 0.5, 0.3
 """Mean over root mean square: a magnitude has about 0.8, a drive with bends to both sides 0.1."""
 
 
-def find_implausible(
+def check_moments(
     table: "GramTable", signals: SignalCatalog, min_correlation: float
 ) -> dict[int, Fault]:
-    """Return the drives whose sensors contradict one another or stand still, with the fault."""
+    """Return the drives whose signals contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
-    for first, moments in zip(count(0, AT_ONCE), DriveBatches.of(table)):
-        found = steering_swapped(moments, signals)
-        if len(_witnesses(moments)) >= FEWEST_WITNESSES:
+    for first, moments in zip(count(0, BATCH), DriveBatches.of(table)):
+        in_batch = find_swapped_steering(moments, signals)
+        if len(_witnesses(moments)) >= MIN_WITNESSES:
             turning = find_reversed_or_swapped(moments, min_correlation)
-            found |= {drive: _joined(several) for drive, several in turning.items()}
-            found |= find_magnitudes(moments)
-        found |= axes_swapped(moments)
-        faults |= {first + drive: fault for drive, fault in found.items()}
-    return faults | find_stuck(table)
+            in_batch |= {drive: _join(several) for drive, several in turning.items()}
+            in_batch |= find_magnitudes(moments)
+        in_batch |= find_swapped_axes(moments)
+        faults |= {first + drive: fault for drive, fault in in_batch.items()}
+    return faults | find_constant(table)
 
 
-def _joined(faults: Sequence[Fault]) -> Fault:
+def _join(faults: Sequence[Fault]) -> Fault:
     """Return several faults of one drive as one."""
-    kind = "swapped" if all(one.kind == "swapped" for one in faults) else "reversed"
-    return Fault(kind, tuple(s for one in faults for s in one.signals), faults[0].figure)
+    kind = "swapped" if all(fault.kind == "swapped" for fault in faults) else "reversed"
+    return Fault(kind, tuple(s for fault in faults for s in fault.signals), faults[0].figure)
 
 
-def find_stuck(table: "GramTable") -> dict[int, Fault]:
+def find_constant(table: "GramTable") -> dict[int, Fault]:
     """Return drives in which a signal, unlike most others, never changed: its variance is 0."""
     at = [row * (row + 3) // 2 for row in range(len(table.signals))]
     squares = table.products[:, at]
     # n sum(x^2) may not fit 64 bits, the difference from sum(x)^2 is right modulo 2^64.
     constant = table.n[:, None] * squares - table.sums * table.sums == 0
     moving = constant.mean(axis=1) < 0.5
-    faults = {}
-    for drive in np.flatnonzero(constant.any(axis=1) & moving).tolist():
-        names = tuple(np.array(table.signals)[constant[drive]].tolist())
-        faults[drive] = Fault("stuck", names, "variance 0")
-    return faults
+    names = np.array(table.signals)
+    return {
+        drive: CONSTANT.fault(*names[constant[drive]].tolist(), value=": its variance is 0")
+        for drive in np.flatnonzero(constant.any(axis=1) & moving).tolist()
+    }
 
 
 def find_reversed_or_swapped(
-    moments: MeanMoments, min_correlation: float = 0.3
+    moments: MeanMoments, min_correlation: float | None = None
 ) -> dict[int, list[Fault]]:
     """Return the drives in which witnesses of the turning direction contradict the others.
 
-    The first principal component of their correlations parts them in two; the fewer are in doubt.
-    Where no more than two are against both axles, it is these: their axes are not ISO 8855. A
-    witness is at fault if the median of its correlations with the others' part is below
-    -`min_correlation`.
+    The first principal component of their correlations divides them in two groups. The smaller one
+    is in doubt; of two witnesses both are. Where no more than two contradict both axles, it is
+    these: their axes are not ISO 8855. A witness is at fault if the median of its correlations with
+    the other group is below -`min_correlation`, by default the threshold of the check.
     """
     names = _witnesses(moments)
     if len(names) < 2:
         return {}
+    lowest = TURNING_SIGN.low if min_correlation is None else -min_correlation
     correlations = _correlations(moments, names)
+    if len(names) == 2:
+        both = [signal for name in names for signal in WITNESSES[name]]
+        return {
+            drive: [CONTRADICTION.fault(*both, correlation=correlations[drive, 0, 1])]
+            for drive in np.flatnonzero(correlations[:, 0, 1] < lowest).tolist()
+        }
     loadings = np.linalg.eigh(correlations)[1][:, :, -1]
     signs = np.sign(loadings.sum(axis=1))
     axles = loadings[:, [names.index(name) for name in AXLES if name in names]]
-    agree = np.abs(np.where(np.abs(axles) > _CLEAR, np.sign(axles), 0).sum(axis=1)) == 2
+    agree = np.abs(np.where(np.abs(axles) > MIN_LOADING, np.sign(axles), 0).sum(axis=1)) == 2
     if len(names) <= 4:
         signs = np.where(agree, np.sign(axles.sum(axis=1)), signs)
     loadings *= np.where(signs == 0, 1, signs)[:, None]
-    found: dict[int, list[Fault]] = {}
-    for drive, i in np.argwhere(loadings < -_CLEAR).tolist():
-        others = correlations[drive, i, loadings[drive] > _CLEAR]
-        if not others.size or np.median(others) > -min_correlation:
+    faults: dict[int, list[Fault]] = {}
+    for drive, i in np.argwhere(loadings < -MIN_LOADING).tolist():
+        others = correlations[drive, i, loadings[drive] > MIN_LOADING]
+        if not others.size or np.median(others) > lowest:
             continue
-        signals = tuple(WITNESSES[names[i]])
-        figure = f"correlation {np.median(others):+.2f} with the other signs of turning"
+        signals, correlation = WITNESSES[names[i]], float(np.median(others))
         if len(signals) == 1:
-            fault = Fault("reversed", signals, figure, "Write negate = true.")
+            fault = TURNING_SIGN.fault(*signals, correlation=correlation)
         else:
-            remedy = "Swap their columns."
-            if agree[drive]:
-                remedy += " If all others are positive to the right (SAE J670), negate these."
-            fault = Fault("swapped", signals, figure, remedy)
-        found.setdefault(drive, []).append(fault)
-    return found
+            hint = " If all others are positive to the right (SAE J670), negate these."
+            fault = SWAPPED_WHEELS.fault(
+                *signals, correlation=correlation, others=hint if agree[drive] else ""
+            )
+        faults.setdefault(drive, []).append(fault)
+    return faults
 
 
 def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
-    """Return the drives in which a signal has lost its sign, as from buses that send it apart.
+    """Return the drives in which a signal has lost its sign, which some buses send separately.
 
-    Such a witness is far from zero in the mean and hardly goes with the others, which agree with
-    one another and turn to both sides.
+    The mean of such a witness is far from zero. It hardly correlates with the others, which agree
+    with one another and turn to both sides.
     """
     names = _witnesses(moments)
     weights = _weights(moments, names)
@@ -142,51 +153,45 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
     away = np.divide(np.abs(means), np.sqrt(squares), out=np.zeros_like(means), where=squares > 0)
     agreement = np.abs(_correlations(moments, names))
     others = ~np.eye(len(names), dtype=bool)
-    found = {}
+    faults = {}
     for i, name in enumerate(names):
         if len(WITNESSES[name]) == 2:
             continue
-        rest = others[i]
-        within = agreement[:, rest][:, :, rest]
-        agree = np.median(within[:, ~np.eye(rest.sum(), dtype=bool)], axis=1) > AGREEING
-        lone = agreement[:, i, rest].max(axis=1) < LONE
-        signed = np.median(away[:, rest], axis=1) < TURNING_BOTH_WAYS
-        for drive in np.flatnonzero(agree & lone & signed & (away[:, i] > ONE_SIDED)):
-            figure = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
-            found[int(drive)] = Fault("magnitude", tuple(WITNESSES[name]), figure)
-    return found
+        peers = others[i]
+        within = agreement[:, peers][:, :, peers]
+        agree = np.median(within[:, ~np.eye(peers.sum(), dtype=bool)], axis=1) > MIN_AGREEMENT
+        lone = agreement[:, i, peers].max(axis=1) < MAX_LONE_CORRELATION
+        signed = np.median(away[:, peers], axis=1) < MAX_TURNING_MEAN_RATIO
+        for drive in np.flatnonzero(agree & lone & signed & (away[:, i] > MIN_MEAN_RATIO)).tolist():
+            evidence = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
+            faults[drive] = ONE_SIDED.fault(*WITNESSES[name], evidence=evidence)
+    return faults
 
 
-def axes_swapped(moments: MeanMoments) -> dict[int, Fault]:
+def find_swapped_axes(moments: MeanMoments) -> dict[int, Fault]:
     """Return the drives in which `ax` follows the turns, and `ay` does not."""
-    rest = [name for name in ("yaw_rate", "steering_wheel") if name in moments.signals]
-    if not {"ax", "ay"} <= set(moments.signals) or not rest:
+    turning = [name for name in ("yaw_rate", "steering_wheel") if name in moments.signals]
+    if not {"ax", "ay"} <= set(moments.signals) or not turning:
         return {}
-    at = [moments.signals.index(name) for name in ("ax", "ay", *rest)]
+    at = [moments.signals.index(name) for name in ("ax", "ay", *turning)]
     covariances = moments.covariances()[:, at][:, :, at]
-    spread = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
-    product = spread[:, :2, None] * spread[:, None, 2:]
+    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+    product = std[:, :2, None] * std[:, None, 2:]
     shared = np.abs(covariances[:, :2, 2:])
     agreement = np.divide(shared, product, out=np.zeros_like(shared), where=product > 0)
     ax, ay = agreement[:, 0].min(axis=1), agreement[:, 1].max(axis=1)
     return {
-        int(drive): Fault(
-            "swapped",
-            ("ax", "ay"),
-            f"correlation with the turns: ax {ax[drive]:.2f}, ay {ay[drive]:.2f}",
-            "Swap their columns.",
-        )
-        for drive in np.flatnonzero((ax > AGREEING) & (ay < LONE))
+        drive: SWAPPED_AXES.fault("ax", "ay", ax=ax[drive], ay=ay[drive])
+        for drive in np.flatnonzero((ax > SWAPPED_AXES.high) & (ay < SWAPPED_AXES.low)).tolist()
     }
 
 
-def steering_swapped(moments: MeanMoments, signals: SignalCatalog) -> dict[int, Fault]:
+def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[int, Fault]:
     """Return the drives in which the outer front wheel steers more than the inner one.
 
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
-    the mean of left - right is about that ratio times the mean of left * right, in radians.
-    `STEERING_RATIO` bounds the ratio with the sign turned: beyond it a sensor is biased instead.
-    Where the sensors of many drives are, the ratio says nothing of the others.
+    the mean of left - right is about that ratio times the mean of left * right, in radians. Where
+    the sensors of many drives are biased, the ratio shows nothing.
     """
     left, right = "steer_fl", "steer_fr"
     if not {left, right} <= set(moments.signals):
@@ -196,21 +201,19 @@ def steering_swapped(moments: MeanMoments, signals: SignalCatalog) -> dict[int, 
     product = m[:, i, j] * scale**2
     difference = (m[:, 0, i] - m[:, 0, j]) * scale
     ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
-    low, high = STEERING_RATIO
+    low, high = -SWAPPED_STEERING.low, MAX_STEERING_RATIO
     if ((np.abs(ratio) > low) & (np.abs(ratio) < high)).mean() < UNBIASED_STEERING:
         return {}
     return {
-        int(drive): Fault(
-            "swapped", (left, right), f"inner wheel over outer {ratio[drive]:+.2f}, not +0.5"
-        )
-        for drive in np.flatnonzero((-ratio > low) & (-ratio < high))
+        drive: SWAPPED_STEERING.fault(left, right, ratio=ratio[drive])
+        for drive in np.flatnonzero((-ratio > low) & (-ratio < high)).tolist()
     }
 
 
 def _witnesses(moments: MeanMoments) -> list[str]:
-    """Return the witnesses of which all signals are there; of equal signals the first alone.
+    """Return the witnesses that have all their signals; of equal signals only the first.
 
-    One angle of both front wheels stands for three signals, and is one witness.
+    One angle of both front wheels fills three signals, and is one witness.
     """
     signals: list[str] = []
     for name in (*WITNESSES, *moments.signals):
@@ -220,7 +223,7 @@ def _witnesses(moments: MeanMoments) -> list[str]:
 
 
 def _are_equal(moments: MeanMoments, a: str, b: str) -> bool:
-    """Whether two signals have one column: no product tells them apart, in any drive."""
+    """Return True if two signals have equal products in all drives: they are one column."""
     i, j, m = moments.position(a), moments.position(b), moments.matrices
     return bool(np.array_equal(m[:, i, :], m[:, j, :]) and m[:, i, i].any())
 
@@ -239,8 +242,8 @@ def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
     covariances = weights @ of_signals @ weights.T
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     summed = np.diagonal(of_signals, axis1=1, axis2=2) @ (weights**2).T
-    spread = np.sqrt(np.where(variances > _ROUNDING * summed, variances, 0))
-    product = spread[:, :, None] * spread[:, None, :]
+    std = np.sqrt(np.where(variances > ROUNDING * summed, variances, 0))
+    product = std[:, :, None] * std[:, None, :]
     return np.asarray(
         np.divide(covariances, product, out=np.zeros_like(covariances), where=product > 0)
     )

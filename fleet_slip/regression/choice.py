@@ -93,12 +93,12 @@ class RmseGap:
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is larger than its standard error."""
+        """True if it is larger than its standard error."""
         return self.rmse > self.standard_error
 
     @property
     def negligible(self) -> bool:
-        """Whether the best model is no reason to do without this one."""
+        """True if the best model is no reason to do without this one."""
         return self.within_tolerance or not self.is_significant
 
     def as_dict(self) -> dict[str, Any]:

@@ -183,7 +183,7 @@ class _Search:
         return sorted(taken)
 
     def _far_from_dependent(self) -> bool:
-        """Whether no combination of inputs has twice as little variance as `DEPENDENT`.
+        """Return True if no combination of inputs has twice as little variance as `DEPENDENT`.
 
         What others leave of an input is no less than the least eigenvalue of the matrix.
         """

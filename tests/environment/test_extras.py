@@ -94,6 +94,6 @@ def test_what_needs_more_says_which_extra() -> None:
 
 def test_every_extra_that_is_named_is_one() -> None:
     sources = "".join(path.read_text() for path in (REPOSITORY / "fleet_slip").rglob("*.py"))
-    named = set(re.findall(r'needed\(\s*"(\w+)"', sources))
+    named = set(re.findall(r'require_extra\(\s*"(\w+)"', sources))
     assert named
     assert named <= EXTRAS.keys()

@@ -201,7 +201,7 @@ def kernel_rows(
     if not warehouse.logs.snapshot().files:
         land(warehouse, "one", table)
     files = warehouse.logs.snapshot().files
-    rows = aggregate(warehouse, files, feature_set=name, late={"car-1": late})
+    rows = aggregate(warehouse, files, feature_set=name, delays={"car-1": late})
     if "course_late" not in rows.column_names:
         rows = rows.append_column("course_late", pa.nulls(len(rows), pa.int64()))
     found: list[dict[str, Any]] = rows.to_pylist()

@@ -17,7 +17,7 @@ from fleet_slip.ingest.drives import MeasuredDrive
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.stream import IngestCounts, open_measured
 from fleet_slip.ingest.vocabulary import unit_called
-from fleet_slip.quality.plausibility import RADIUS_M, WHEELS
+from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
 from tests.support.catalog import CATALOG
 from tests.support.measured import read_measured
 from tests.support.reported import call

@@ -89,7 +89,7 @@ def test_groups_of_an_mdf_file_keep_their_own_times(tmp_path: Path) -> None:
         signals={
             **signals("a_x", "beta"),
             "yaw_rate": {"column": "fast", "unit": "rad/s"},
-            "vx": {"column": "beta", "unit": "m/s", "interpolate": False},
+            "vy": {"column": "beta", "unit": "m/s", "interpolate": False},
         }
     )
     log = read_measured(write_mdf(tmp_path, [a_x()], [slow], [fast]), mapping)
@@ -103,7 +103,7 @@ def test_groups_of_an_mdf_file_keep_their_own_times(tmp_path: Path) -> None:
     expected = np.interp(at_s[inside], TIME_S[::5], np.radians(BETA_DEG[::5]))
     np.testing.assert_allclose(sideslip[inside], expected, atol=0.00006)
     assert np.isnan(sideslip[~inside]).all()
-    placed = log.drives["vx"].drop_null().to_numpy() * 0.005
+    placed = log.drives["vy"].drop_null().to_numpy() * 0.005
     np.testing.assert_allclose(placed, BETA_DEG[::5], atol=0.0026)
 
 

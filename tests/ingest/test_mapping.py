@@ -18,7 +18,7 @@ from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
 from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
 from fleet_slip.ingest.resampling import build_resampler
-from fleet_slip.quality.plausibility import RADIUS_M
+from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.resources import SHIPPED_CONFIGS
 from tests.support.catalog import CATALOG, configs_with
 from tests.support.measured import (

@@ -22,7 +22,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import SignalColumn, conversion_factor
 from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.profile import profile_file
-from fleet_slip.quality.plausibility import RADIUS_M
+from fleet_slip.quality.drive_signals import RADIUS_M
 from tests.support.catalog import SIGNALS
 from tests.support.textbook_car import a_car
 

@@ -204,7 +204,7 @@ def test_vehicle_models_are_examined_one_after_the_other(
 
 def test_signs_need_no_peers_and_offsets_do(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = fleet(multiply("yaw_rate", -1))
-    report = examine(whole.part(np.arange(DRIVES) >= DRIVES - 2))
+    report = examine(whole.filter(np.arange(DRIVES) >= DRIVES - 2))
     assert report.compared == 0
     assert only_finding(report).kind == "reversed"
     choose_limits(monkeypatch, min_rows=TICKS + 1)

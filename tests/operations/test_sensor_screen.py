@@ -142,8 +142,9 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
         fleet.gram()
         if name == "a":
             assert fleet.models.publish("m", fleet.cohort()).new
-    chosen = fleet.cohort().select()
-    with pytest.raises(RefusedError, match="differ from its training set"):
+    assert fleet.cohort().examine().faults == {"late sideslip": 4}
+    chosen = fleet.cohort(include_faulty=True).select()
+    with pytest.raises(RefusedError, match=r"of 4 inspected drives .*late sideslip\? it is \+0\.6"):
         fleet.models.publish("m", chosen)
     assert fleet.models.publish("m", chosen, candidate=True).candidate
 
@@ -255,10 +256,10 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
         and "Run: fleet-slip gram" in told
     )
     with monkeypatch.context() as patch:
-        patch.setattr(sensor_screen, "READ_ON_THE_WAY", 100)
+        patch.setattr(sensor_screen, "CHECK_ROWS", 100)
         with pytest.raises(NotScreenedError, match=r"6 measured drives .* --include-faulty"):
             fleet.models.publish("m")
     done = run_command("publish", "m", "--models", "table1")
     assert done.exit_code == 0, done.stderr
-    assert "computed missing Gram rows of 6 measured drives" in done.stderr
+    assert "computing Gram rows of signals from 2 log files" in done.stderr
     assert fleet.models.get("m").manifest.trained_on.drives == 4

@@ -15,7 +15,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.stream import find_refusals, open_measured
 from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.plausibility import RADIUS_M, WHEELS, check_plausibility, find_one_sided
+from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
+from fleet_slip.quality.plausibility import check_plausibility, find_one_sided
 from tests.support.catalog import SIGNALS
 from tests.support.commands import run_on
 from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
@@ -277,8 +278,9 @@ def test_a_magnitude_without_its_sign_is_told() -> None:
 def test_a_car_on_an_oval_has_its_sign() -> None:
     turning = {"yaw_rate": np.full(9000, 0.2) + 0.05 * np.sin(np.arange(9000))}
     wheels = {"wheel_rl": np.full(9000, 40.0), "wheel_rr": np.full(9000, 42.0)}
-    assert list(find_one_sided(turning, None))
-    assert not list(find_one_sided({**turning, **wheels}, None))
+    everywhere = np.ones(9000, dtype=np.bool_)
+    assert list(find_one_sided(turning, everywhere, "sideslip"))
+    assert not list(find_one_sided({**turning, **wheels}, everywhere, "sideslip"))
 
 
 def cars(number: int) -> list[pl.DataFrame]:

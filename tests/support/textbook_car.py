@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.quality.plausibility import RADIUS_M, TRACK_M
+from fleet_slip.quality.drive_signals import RADIUS_M, TRACK_M
 
 Car = dict[str, FloatArray]
 

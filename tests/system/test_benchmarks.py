@@ -21,6 +21,7 @@ DEADLINE_S = 1800
 TINY = {
     "billion": "--root {folder} --rows 3e4",
     "cluster": "--days 1 --workers 1",
+    "exact_columns": "8",
     "flips": "--flips 1",
     "fuzz": "--cases 10 --target config",
     "goals": "{root} few --roads 1",

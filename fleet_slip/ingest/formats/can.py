@@ -1,11 +1,11 @@
-"""Reads CAN traces: BLF, ASC, candump and what else python-can does, with a database of messages.
+"""Reads CAN traces: BLF, ASC, candump and others of python-can, with a database of messages.
 
-Each message is a time base, a column is `Message.Signal`. Frames of errors and remote requests are
-passed over. A value that the database gives a name, such as `SNA`, is no number: it is null, or in
-a signal that has no other values the name itself.
+Each message is a time base, a column is `Message.Signal`. Error frames and remote requests are
+skipped. A value with a name in the database, such as `SNA`, is null; in a signal with named values
+only it is the name.
 
-The meaning of start bit, byte order and multiplexing is that of the DBC format, as cantools parses
-it; its own decoder, one frame at a time, is what the tests compare with.
+Start bit, byte order and multiplexing are those of the DBC format, as cantools parses it. The tests
+compare with its decoder, which takes one frame at a time.
 """
 
 import hashlib
@@ -52,7 +52,7 @@ PIECE_FRAMES = 2**12
 
 
 def is_possible(signal: Any) -> bool:
-    """Whether a frame can have a signal: at most 64 bits in 64 bytes, floats of their sizes."""
+    """Return True if a signal fits a frame: at most 64 bits in 64 bytes, floats of their sizes."""
     if not 0 <= signal.start < 8 * MOST_BYTES or not 1 <= signal.length <= 64:
         return False
     return needed_bytes(signal) <= MOST_BYTES and (not signal.is_float or signal.length in _FLOATS)
@@ -111,9 +111,9 @@ def _bits(signal: Any) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class FrameBlock:
-    """Frames in the order of the file: numbers, whether they are of 29 bits, times in s, buses.
+    """Frames in the order of the file: identifiers, flags for 29 bits, times in s, buses.
 
-    `data`, shape (frames, bytes), is filled up to the longest; `sizes` say how much of it counts.
+    `data`, shape (frames, bytes), is padded to the longest frame; `sizes` are the bytes of each.
     """
 
     numbers: IntArray
@@ -140,7 +140,7 @@ class CanFrames:
     """The frames of one message, in the order in which they came."""
 
     def __init__(self, spool: Spool) -> None:
-        """Begin without any; what is too much for the memory goes to `spool`."""
+        """Begin without frames; those beyond the limit of memory go to `spool`."""
         self._spool = spool
         self._waiting: list[FrameBlock] = []
         self._frame_counts: Counter[tuple[str, int]] = Counter()
@@ -177,7 +177,7 @@ class CanFrames:
                 yield selected.times_s, selected.data[:, :size]
 
 
-# What a mapping says of a CAN trace: the database of its messages, and the bus.
+# The keys of a mapping for CAN traces: the database of messages, and the bus.
 
 DATABASES = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym"}
 MAX_DATABASE_BYTES = 2**28
@@ -191,13 +191,13 @@ class CanBus(Config):
     channel: Name | None = None
     """The bus, as the trace calls it; needed where a message occurs on several."""
     text: str = Field(default="", exclude=True, repr=False)
-    """What is in the database, once the mapping was loaded."""
+    """The content of the database, read when the mapping is loaded."""
     digest: str = ""
     """SHA-256 of it."""
 
     @property
     def format(self) -> str:
-        """What the database is written in."""
+        """The encoding of the database."""
         return DATABASES[Path(self.database).suffix.lower()]
 
 
@@ -251,7 +251,7 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
     passes_over.setLevel(logging.WARNING)
     passes_over.addFilter(_refuse_unknown)
     with can.LogReader(budget.file) as trace:
-        # A BLF file says how long it is; python-can reads what is there of one that was cut.
+        # A BLF file states its length; python-can reads a cut file without an error.
         stated = getattr(trace, "file_size", 0)
         if stated > budget.size:
             raise InputError(
@@ -273,7 +273,7 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
 
 
 def _refuse_unknown(record: logging.LogRecord) -> bool:
-    """Raise `ValueError` for a container that python-can would pass over; say no other warning."""
+    """Raise `ValueError` for a container that python-can skips; suppress other warnings."""
     if "compression" in record.msg:
         raise ValueError(record.getMessage())
     return False
@@ -300,16 +300,16 @@ class CanSource(FormatSource):
     """The messages of a CAN trace, or of a file with bus logging."""
 
     def __init__(self, file: Path, bus: CanBus, blocks: Callable[[], Iterator[FrameBlock]]) -> None:
-        """Take a file, what the mapping says of it, and what reads its frames."""
+        """Take a file, its keys in the mapping, and the function that reads its frames."""
         self._file, self._bus, self._spool, self._blocks = file, bus, Spool(), blocks
         self._database = parse_database(bus)
         self._messages = {message.name: message for message in self._database.messages}
         self._identifiers_to_keep: set[_Key] = set()
         self._numbers: set[_Key] = set()
-        """Of the messages in the trace, once it was read."""
+        """Identifiers of the messages in the trace, after it was read."""
 
     def channels(self) -> list[Channel]:
-        """Return the signals of all messages of the trace that the database knows."""
+        """Return the signals of all messages of the trace that the database contains."""
         self._want({_key(message) for message in self._database.messages})
         return [
             Channel(f"{message.name}.{signal.name}", signal.unit or "", message.name)
@@ -374,7 +374,7 @@ class CanSource(FormatSource):
             yield pl.DataFrame(frame).filter(has_value)
 
     def _has_names_only(self, message: Any, signal: Any) -> bool:
-        """Whether the database gives all values of a signal a name, and there is one."""
+        """Return True if a signal has values, and all have names in the database."""
         is_multiplexed = False
         needed = needed_bytes(signal)
         for _, payloads in self._frames[_key(message)].take(self._bus.channel, needed):
@@ -386,7 +386,7 @@ class CanSource(FormatSource):
         return is_multiplexed
 
     def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
-        """Return the frames of a message. Raises `InputError` if they are not what it says."""
+        """Return the frames of a message. Raises `InputError` if their sizes differ."""
         frames = self._frames[_key(message)]
         if _key(message) not in self._numbers:
             known_ids = sum(_key(m) in self._numbers for m in self._database.messages)

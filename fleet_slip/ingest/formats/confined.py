@@ -1,4 +1,4 @@
-"""A file that another process reads, which is trusted with nothing.
+"""Reads files by another process, which is not trusted.
 
 The process that forks readers (`confined_reader`) is started once, and ends with this one.
 """
@@ -53,7 +53,7 @@ _ONE_AT_A_TIME = Lock()
 
 @cache
 def _server(_pid: int) -> tuple["subprocess.Popen[bytes]", socket.socket]:
-    """Start what forks readers, for this process and not for one that it was forked from."""
+    """Start the server that forks readers. A forked process starts its own."""
     ours, theirs = socket.socketpair()
     inherited = {name: os.environ[name] for name in _INHERITED if name in os.environ}
     with theirs:
@@ -78,7 +78,7 @@ def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
 
 
 def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
-    """Return what a reader is asked through, and a handle by which it is ended."""
+    """Return the socket of a new reader, and the handle to kill it."""
     ours, theirs = socket.socketpair()
     handles: list[int] = []
     with _ONE_AT_A_TIME, theirs:
@@ -98,10 +98,10 @@ def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
 
 
 class ConfinedSource(Source):
-    """A file that another process reads. It is trusted with nothing: its answers are checked."""
+    """A file read by another process, whose answers are checked."""
 
     def __init__(self, channel: socket.socket, budget: Budget, folder: Path, handle: int) -> None:
-        """Take what a reader is asked through, what it may become, its folder and its handle."""
+        """Take the reader's socket, the file's limits, the reader's folder and its handle."""
         self._channel, self._budget = channel, budget
         self._folder, self._handle = folder, handle
         self.has_clock = bool(self._receive()[0])
@@ -129,13 +129,13 @@ class ConfinedSource(Source):
             yield frame
 
     def _ask(self, *question: Any) -> tuple[Any, bytearray]:
-        """Return what the reader answers, and rows. Raises `InputError`."""
+        """Send a question; return the reader's answer and rows. Raises `InputError`."""
         with suppress(OSError):  # then nothing comes back
             self._channel.sendall(json.dumps(question).encode() + b"\n")
         return self._receive()
 
     def _receive(self) -> tuple[Any, bytearray]:
-        """Return what the reader says, and rows."""
+        """Receive an answer and rows. Raises `InputError`."""
         until_s = time.monotonic() + self._budget.seconds
         self._require_disk()
         text, size = SIZES.unpack(self._take(SIZES.size, until_s))

@@ -1,13 +1,12 @@
-"""Reads a stranger's file in a process of its own, which can do no harm, for `reading`.
+"""Reads an untrusted file in a confined process, for `reading`.
 
-A server, started once, imports what formats need and forks one reader for each file. A reader
-confines itself, opens the file, and answers what it is asked: lines of JSON on a socket. An answer
-is two sizes, JSON, and rows as an Arrow stream. Who asks bounds the sum of its temporary files.
+A server, started once, imports the libraries of formats and forks one reader for each file. A
+reader confines itself, opens the file, and answers questions: lines of JSON on a socket. An answer
+is two sizes, JSON, and rows as an Arrow stream. The caller limits the sum of temporary files.
 
-A reader keeps that file, a folder for its temporary files, and the installed code, of which
-libraries import parts late. It cannot connect, start programs or processes, or signal, slow or
-limit others. Where the kernel has no Landlock (before 5.13, or switched off) other files stay
-readable.
+A reader can read that file, a folder for its temporary files, and the installed code, which
+libraries import late. It cannot connect, start programs or processes, or signal, slow or limit
+others. Where the kernel has no Landlock (before 5.13, or disabled) other files stay readable.
 """
 
 import contextlib
@@ -41,7 +40,7 @@ from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 
 
 class Format(NamedTuple):
-    """What a file of a format begins with, which module opens it, and what that imports."""
+    """The first bytes of a format's files, the module that opens them, and its packages."""
 
     begins: tuple[bytes, ...]
     module: str
@@ -63,7 +62,7 @@ SIZES = struct.Struct("<QQ")
 
 @dataclass(frozen=True)
 class Job:
-    """What a reader is to read, and what it may take for it."""
+    """The task of a reader: a file and its limits."""
 
     format: str
     file: str
@@ -85,7 +84,7 @@ def open_here(name: str, bus: CanBus | None, budget: Budget) -> AbstractContextM
 
 
 def serve(control: int) -> None:
-    """Fork a reader for each socket that comes, until nobody is left who sends one."""
+    """Fork a reader for each socket that is received, until the parent closes the connection."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     parent = os.getpid()
     with socket.socket(fileno=control) as asking:
@@ -96,7 +95,7 @@ def serve(control: int) -> None:
             _, module, packages = FORMATS[name.decode()]
             importlib.import_module(f"{__package__}.{module}")
             for package in packages:
-                with contextlib.suppress(ImportError):  # who reads says which one is missing
+                with contextlib.suppress(ImportError):  # the reader reports the missing package
                     importlib.import_module(package)
             reader = os.fork()
             if not reader:
@@ -113,7 +112,7 @@ def serve(control: int) -> None:
 
 
 class _Reader:
-    """An open file, who asks for what is in it, and what of it is being read."""
+    """An open file, the caller's socket, and the batches that are being read."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
@@ -122,7 +121,7 @@ class _Reader:
         self._ahead: dict[int, Future[pl.DataFrame | None] | None] = {}
 
     def serve(self, parent: int) -> None:
-        """Answer what is asked of a file, confined to it."""
+        """Confine this process to a file and answer questions on it."""
         with self._channel.makefile("rb") as requests, contextlib.ExitStack() as opened:
             job: Job = pickle.load(requests)  # noqa: S301 - of our own parent
             os.chdir(job.cwd)
@@ -143,7 +142,7 @@ class _Reader:
                     self._look_ahead(*arguments)
 
     def _answer(self, file: str, find: Callable[[], Any]) -> bool:
-        """Send what is found, or what is wrong; return whether it was found."""
+        """Send the result of a function, or its error. Returns False for an error."""
         try:
             answer = find()
             if isinstance(answer, pl.DataFrame):
@@ -184,7 +183,7 @@ class _Reader:
         return next(self._batches[number], None) if ahead is None else ahead.result()
 
     def _look_ahead(self, number: int) -> None:
-        """Read what is likely asked for next, while the other process is at what it has."""
+        """Read the next rows while the other process handles the last ones."""
         if number not in self._ahead:  # many want the first rows alone
             self._ahead[number] = None
             return
@@ -195,13 +194,13 @@ class _Reader:
             ahead.set_exception(error)
 
 
-# What the kernel takes from a reader.
+# Restrictions of a reader by the kernel.
 
 _PDEATHSIG, _NO_NEW_PRIVS, _SECCOMP, _FILTER = 1, 38, 22, 2
 _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _ASK_VERSION, _BENEATH = 1, 1
 _RIGHTS = {1: 13, 2: 14, 3: 15, 4: 15}
-"""By version of Landlock how many rights on files it knows; later ones know 16."""
+"""Number of rights on files by version of Landlock; later versions have 16."""
 _READ_FILE, _READ = 1 << 2, 1 << 2 | 1 << 3
 _EVERYTHING_HERE = (1 << 13) - 1
 _OURS = (str(Path(__file__).parents[2]),)
@@ -243,7 +242,7 @@ _FORBIDDEN_COMMANDS = (
 )
 """By system call the second arguments that let the kernel signal, or type for, other processes."""
 _PASSED_BY = ((90, None), (91, 52), (268, 53), (452, 452))
-"""Those that seem to work and do nothing, since who copies a file calls them: chmod and others."""
+"""Calls that succeed without effect, since copying a file calls them: chmod and others."""
 _CLONE, _CLONE3, _CLONE_THREAD = (56, 220), 435, 0x10000
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
@@ -256,7 +255,8 @@ def confine(parent: int, file: str, folder: str, memory: int, disk: int, seconds
     """Confine this process, a child of `parent`, to a file and a folder; it cannot be undone.
 
     `memory` are the bytes that it may take beyond what it has, `disk` those of a temporary file,
-    `seconds` those of a processor. It goes with its parent, and first where memory lacks.
+    `seconds` those of a processor. The process ends with its parent; if the machine runs out of
+    memory, the kernel kills it first.
     """
     _call(_LIBC.prctl(_PDEATHSIG, signal.SIGKILL, 0, 0, 0))
     if os.getppid() != parent:
@@ -287,13 +287,13 @@ def _close_files(file: str, folder: str) -> None:
     ports, beyond = 3 if version >= 4 else 0, 3 if version >= 6 else 0
     attributes = struct.pack("QQQ", handled, ports, beyond)
     rules = _call(_LIBC.syscall(_CREATE_RULESET, attributes, len(attributes), 0))
-    # Of the folder, all that the first version knows, and to cut files.
+    # For the folder: all rights of the first version, and truncating files.
     allowed = {file: _READ_FILE, folder: (_EVERYTHING_HERE | 1 << 14) & handled}
     for place, rights in {**dict(_readable()), **allowed}.items():
         try:
             opened = os.open(place, os.O_PATH | os.O_CLOEXEC)
         except OSError:
-            continue  # who reads it says what is wrong
+            continue  # the reader reports the problem
         rule = struct.pack("=Qi", rights, opened)
         _call(_LIBC.syscall(_ADD_RULE, rules, _BENEATH, rule, 0))
         os.close(opened)
@@ -302,7 +302,7 @@ def _close_files(file: str, folder: str) -> None:
 
 
 def _readable() -> Iterator[tuple[str, int]]:
-    """Yield what the libraries may still read, which says nothing of anybody."""
+    """Yield the paths of code and time zones, which contain no private data."""
     code = (sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     for place in (*code, *_OURS, *_TIME_ZONES):
         yield place, _READ if Path(place).is_dir() else _READ_FILE

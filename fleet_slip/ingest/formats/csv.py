@@ -20,12 +20,12 @@ from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
-# What the text of a CSV file is made of: encoding, separator, and which of its lines are data.
+# The layout of a CSV file: encoding, separator, and the lines of header and data.
 
 BUFFER_BYTES = 2**22
 MAX_LINE_BYTES = 2**20
 COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
-"""What compressed files begin with."""
+"""First bytes of compressed files."""
 
 
 Encoding = Literal["utf-8", "utf-16", "cp1252"]
@@ -35,7 +35,7 @@ Line = Annotated[int, Field(ge=1, le=1000)]
 class CsvFormat(Config):
     """How a CSV file is written. Lines are counted from 1, as editors do.
 
-    What came after the first release is left out of the mapping's identity where it is usual.
+    Keys that came after the first release are not part of the mapping's identity at their default.
     """
 
     separator: str = ","
@@ -69,7 +69,7 @@ def decompressed(stream: BinaryIO) -> BinaryIO:
     stream.seek(0)
     for magic, codec in COMPRESSED.items():
         if start.startswith(magic):
-            # Text is read in blocks: what a small file may become is never in memory at once.
+            # Text is read in blocks: a small file may decompress to more than the memory.
             plain = pa.CompressedInputStream(stream, codec)
             return BufferedReader(plain, BUFFER_BYTES)
     return stream
@@ -99,10 +99,10 @@ LINE_BLOCKS = 4
 """Blocks that one line may fill. Where it fills more, usually a quote was not closed."""
 
 EXTRA_FIELDS = "\0extra fields"
-"""Column of a CSV batch: what a line has after the header's last column, null if nothing."""
+"""Column of a CSV batch: the text of a line after the header's last column, null if none."""
 
 CUT = "the file ends within this line"
-"""What stands there for a last line that is cut: no line break, and fewer fields than others."""
+"""Its value for a last line that is cut: without a line break, with fewer fields than others."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class PlainNumbers:
     missing: tuple[float, ...] = ()
 
     def are_in(self, column: pl.Series) -> bool:
-        """Whether a column that was parsed as numbers has one in every row."""
+        """Return True if a column that was parsed as numbers has one in every row."""
         if column.null_count() or not is_finite(column.to_numpy()):
             return False
         return not (self.missing and column.is_in(self.missing).any())
@@ -143,7 +143,7 @@ class CsvSource(FormatSource):
         return [Channel(name) for name in self._names if self._names.count(name) == 1]
 
     def find(self, column: str) -> tuple[str, int]:
-        """Return where a column stands. Raises `InputError`."""
+        """Return the position of a column. Raises `InputError`."""
         return "", find_column(self._file, self._names, column)
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
@@ -245,7 +245,7 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
 
 
 def _with_cut_marked(line: bytes, before: bytes, padding: bytes) -> bytes:
-    """Return the last line, which says in `EXTRA_FIELDS` if it is cut."""
+    """Return the last line; a cut one has `CUT` in `EXTRA_FIELDS`."""
     last, separator, fields = line[len(padding) :], padding[:1], len(padding) - 1
     separators = last.count(separator)
     if not last.strip() or b'"' in before + last:

@@ -26,7 +26,7 @@ _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
 _MOST_COLUMNS = 64
 _NUMBERS = re.compile(r"u?int(8|16|32|64)|double|single|logical")
 _PACKED = {"scale_factor", "add_offset"}
-"""What netCDF says of counts in a dataset."""
+"""Attributes of netCDF for integers that encode physical values."""
 _LINK = "is a link, which is not followed. Map what it links to."
 _COUNTS = (
     f"has counts, with {' and '.join(sorted(_PACKED))} of netCDF, which are not applied. Export it "
@@ -39,19 +39,19 @@ Array = np.ndarray[Any, Any]
 
 
 class Matrix:
-    """An array of HDF5, which has the axes of MATLAB in reverse; those of length 1 are left out."""
+    """An array of HDF5, with the axes of MATLAB reversed. Axes of length 1 are ignored."""
 
     unit = ""
-    """Neither MATLAB nor HDF5 knows one."""
+    """Empty: neither MATLAB nor HDF5 has units."""
 
     def __init__(self, values: Any) -> None:
-        """Take what numpy or h5py give for it."""
+        """Take an array of numpy or a dataset of h5py."""
         self._values = values
         self.shape = tuple(size for size in reversed(values.shape) if size != 1)
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows and columns; what has more axes has no rows of one value."""
+        """Rows and columns. Arrays with more axes are no signals."""
         if len(self.shape) == 1:
             return self.shape[0], 1
         return (self.shape[0], self.shape[1]) if len(self.shape) == 2 else (0, 0)
@@ -180,7 +180,7 @@ def open_mat73(budget: Budget) -> Iterator[Vectors]:
 
 
 def _is_plain(attributes: Any) -> bool:
-    """Whether a dataset has values of its own: of an object it has references, or only sizes."""
+    """Return True if a dataset contains values, not the references or sizes of an object."""
     kind = attributes.get("MATLAB_class", "double")
     kind = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
     return bool(_NUMBERS.fullmatch(kind)) and "MATLAB_empty" not in attributes

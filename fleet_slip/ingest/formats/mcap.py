@@ -1,8 +1,8 @@
 """Reads MCAP files: messages of ROS 2 (CDR), and of JSON. Each topic is a time base.
 
 A column is `TOPIC.FIELD`, such as `/imu/data.linear_acceleration.y`, and `/joints.velocity[2]` of
-an array. A message was taken when its header's stamp says, else when it was published. The file is
-read once for what is in it, and once more for the columns that are asked for.
+an array. The time of a message is its header's stamp, else the time of publication. The file is
+read once for its topics, and once more for the columns of a mapping.
 """
 
 import io
@@ -78,7 +78,7 @@ def value_at(message: Any, path: _Path) -> Any:
 
 
 def stamp_s(message: Any, published_ns: int) -> float:
-    """Return when a message was taken: as its header says, else when it was published."""
+    """Return the time of a message in s: its header's stamp, else the time of publication."""
     for paths in _STAMPS:
         seconds, nanoseconds = (value_at(message, path) for path in paths)
         if isinstance(seconds, int) and isinstance(nanoseconds, int) and (seconds or nanoseconds):
@@ -87,7 +87,7 @@ def stamp_s(message: Any, published_ns: int) -> float:
 
 
 def _decoder_of(channel: Any, schema: Any) -> Decode | None:
-    """Return what reads the messages of a channel, None if nothing does."""
+    """Return the decoder of a channel's messages, None if there is none."""
     from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415 - of the extra `logs`
 
     if channel.message_encoding == "json":

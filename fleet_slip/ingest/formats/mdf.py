@@ -47,7 +47,7 @@ _KINDS = {
         11: _TEXT, 12: _RANGES_TO_TEXT,
     },
 }  # fmt: skip
-"""What becomes of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
+"""The function of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
 _NOT_COMPUTED = "its conversion is a formula, which is not evaluated"
 
 Array = np.ndarray[Any, Any]
@@ -67,7 +67,7 @@ def require_arithmetic(conversion: Any) -> None:
 
 
 def to_physical(conversion: Any, raw: Array) -> Array:
-    """Return physical values, texts as bytes. Raises `ValueError` for what cannot be applied."""
+    """Return physical values, texts as bytes. Raises `ValueError` for other conversions."""
     kind = _kind_of(conversion)
     if kind == _NONE:
         return raw
@@ -101,7 +101,7 @@ def _listed(conversion: Any, name: str) -> Array:
 
 
 def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
-    """Return what a table says of ranges, or of single values; integers include the upper end."""
+    """Apply a table of ranges, or of single values. Integers include the upper end."""
     points = kind == _VALUES_TO_TEXT
     lower, upper = (_listed(conversion, "val" if points else end) for end in ("lower", "upper"))
     order = np.argsort(lower, kind="stable")
@@ -140,7 +140,7 @@ class MdfSource(FormatSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
     def __init__(self, mdf: Any, budget: Budget) -> None:
-        """Take what asammdf has opened."""
+        """Take a file opened by asammdf."""
         self._file, self._mdf = budget.file, mdf
         start = mdf.start_time.timestamp()
         self._start_s = start if start > EARLIEST_S else 0.0
@@ -181,7 +181,7 @@ class MdfSource(FormatSource):
         return f"group {places[0][0]}", places[0]
 
     def read(self, _base: str, places: dict[str, tuple[int, int]]) -> Iterator[pl.DataFrame]:
-        """Read channels of a group, some records at a time; what is marked as invalid is null."""
+        """Read channels of a group in windows of records. Invalid values are null."""
         [number] = {number for number, _ in places.values()}
         for signals in self._windows(number, {name: index for name, (_, index) in places.items()}):
             frame = {OWN_TIME: pl.Series(self._times_s(signals[0]))}
@@ -206,11 +206,11 @@ class MdfSource(FormatSource):
             yield self._signals(number, indices, start, min(WINDOW_RECORDS, records - start))
 
     def _times_s(self, signal: Any) -> FloatArray:
-        """Return when a signal's samples were taken, since 1970 if the file knows the date."""
+        """Return the times of a signal's samples, since 1970 if the file contains the date."""
         return np.asarray(self._start_s + signal.timestamps.astype(np.float64))
 
     def _signals(self, number: int, indices: dict[str, int], start: int, records: int) -> list[Any]:
-        # Of 200 MiB and more `select` reads all records, however few it is asked for.
+        # For files of 200 MiB and more `select` reads all records, also for a small window.
         select = getattr(self._mdf, "_select_fallback", self._mdf.select)
         signals = select(
             [(None, number, index) for index in indices.values()],
@@ -255,7 +255,7 @@ class MdfSource(FormatSource):
         master = self._mdf.masters_db.get(number)
         group = self._mdf.groups[number]
         kind = None if master is None else getattr(group.channels[master], "sync_type", _TIME_SYNC)
-        # MDF 3 knows no kinds: its masters are times.
+        # MDF 3 has no types of masters: all are times.
         if master is None or kind not in {_TIME_SYNC, None}:
             raise InputError(
                 f"{quote_name(self._file)}: channel {name!r} is in group {number}, whose master is "
@@ -351,7 +351,7 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
         budget.file, temporary_folder=tempfile.gettempdir(), process_bus_logging=False
     )
     if getattr(mdf._mdf, "_delete_on_close", False):
-        mdf._mdf.name.unlink()  # it stays open, and goes with the process however that ends
+        mdf._mdf.name.unlink()  # it stays open until the process ends
     mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
     try:
         yield MdfSource(mdf, budget)

@@ -1,6 +1,6 @@
-"""Opens measured files of any format: tables here, all others through a process of their own.
+"""Opens measured files of any format: text and Parquet here, others by a confined process.
 
-What a file is, its first bytes say; only what is text goes by the mapping and the name.
+The first bytes identify the format; for text also the mapping and the file's suffix.
 """
 
 from collections.abc import Iterator
@@ -37,13 +37,13 @@ _BINARY = {
 
 @dataclass(frozen=True)
 class FileFormats:
-    """What must be known of a file's format beside the file.
+    """Parameters of a file's format that the file does not contain.
 
     Attributes:
         csv: separator and decimal sign of text.
         can: the database of a CAN trace.
-        name: the mapping that says it, for messages.
-        plain_numbers: which columns of text are numbers, wherever they are used.
+        name: the mapping, for messages.
+        plain_numbers: columns of text that are numbers wherever they are used.
     """
 
     csv: CsvFormat = field(default_factory=CsvFormat)
@@ -78,10 +78,10 @@ def _size_and_time(file: Path) -> tuple[int, int]:
 
 
 def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Source]:
-    """Open a file, in the format that its first bytes say. Raises `InputError`.
+    """Open a file in the format that its first bytes identify. Raises `InputError`.
 
-    Each format makes sure that the file stands for itself: that no value of it is to be fetched
-    from another file, or computed, and that it is not far more than its `Budget` once decoded.
+    Each format ensures that the file needs no other file, that no value is a program, and that the
+    decoded file does not exceed its `Budget`.
     """
     budget = Budget.for_file(file)
     with file.open("rb") as stream:
@@ -125,7 +125,7 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
 
 @contextmanager
 def file_errors(file: Path) -> Iterator[None]:
-    """Turn what the operating system, Polars and pyarrow raise into an `InputError`."""
+    """Convert errors of the operating system, Polars and pyarrow to an `InputError`."""
     try:
         yield
     except (

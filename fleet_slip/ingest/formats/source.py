@@ -1,8 +1,7 @@
-"""What every format is read as: a table of named columns for each time base of a file.
+"""The common interface of formats: a table of named columns for each time base of a file.
 
-A format whose files say when each sample was taken (MDF, CAN traces) has clocks of its own: its
-times stand in the column `OWN_TIME`, in s, since 1970 where the file has the date. In all others
-time is a column like any other.
+A format that stores the times of samples (MDF, CAN traces) has a clock: its times are the column
+`OWN_TIME`, in s, since 1970 if the file has the date. In other formats time is an ordinary column.
 """
 
 import difflib
@@ -27,7 +26,7 @@ from fleet_slip.errors import InputError
 OWN_TIME = "\0time"
 """Column of times in s, where the file has clocks of its own."""
 BASE = "\0base"
-"""Column with the number of the time base that a row is of, where there are several."""
+"""Column with the number of a row's time base, if there are several."""
 
 EARLIEST_S = 10**8
 """A start before 1973 is no date: of loggers without a clock it is 0, of LabVIEW 1904."""
@@ -42,10 +41,10 @@ class Channel:
     """A column that a file has.
 
     Attributes:
-        name: as a mapping names it.
-        unit: as the file names it, empty if it does not.
-        base: which time base it is of; what has the same stands in one table.
-        title: what it is, where the format fixes that by its name.
+        name: its name in a mapping.
+        unit: its unit in the file, empty if there is none.
+        base: its time base; channels of one base form a table.
+        title: its meaning, where the format defines that by the name.
     """
 
     name: str
@@ -58,7 +57,7 @@ class Source(ABC):
     """A file that is open for reading."""
 
     has_clock = True
-    """Whether its times are in `OWN_TIME`."""
+    """True if its times are in `OWN_TIME`."""
 
     @abstractmethod
     def channels(self) -> list[Channel]:
@@ -80,7 +79,7 @@ class Source(ABC):
 
 
 class FormatSource(Source):
-    """What a format says of a file: where a column is, and how those of one base are read."""
+    """A file of a format: finds columns, and reads those of one base."""
 
     @abstractmethod
     def find(self, column: str) -> tuple[str, Any]:
@@ -104,7 +103,7 @@ class FormatSource(Source):
 
 
 def load_library(file: Path, package: str) -> Any:
-    """Return a package of the extra `logs`, which then logs nothing; what it raises is its own."""
+    """Import a package of the extra `logs` and silence its log. Passes on its errors."""
     with require_extra("logs", f"{quote_name(file)}: its format"):
         module = import_module(package)
     logging.getLogger(package.partition(".")[0]).setLevel(logging.CRITICAL)
@@ -145,7 +144,7 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
 
 
 def find_column(file: Path, names: Sequence[str], column: str) -> int:
-    """Return where a column stands. Raises `InputError` for none or two of its name."""
+    """Return the position of a column. Raises `InputError` for none or two of its name."""
     if len(names) > MAX_COLUMNS:
         raise InputError(
             f"{quote_name(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
@@ -163,7 +162,7 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
 
 
 def describe_unknown(signal: str, signals: Iterable[str]) -> str:
-    """Return what to say of a signal that the catalog does not have."""
+    """Return the message for a signal that the catalog does not contain."""
     names = list(signals)
     similar = difflib.get_close_matches(signal, names, n=2, cutoff=0.7)
     similar += [name for name in names if signal in name.split("_") and name not in similar]
@@ -203,7 +202,7 @@ FREE_S, BYTES_PER_S = 60.0, 10**5
 
 @dataclass(frozen=True)
 class Budget:
-    """What one file may become."""
+    """The limits of decoding a file."""
 
     file: Path
     size: int
@@ -216,22 +215,22 @@ class Budget:
 
     @property
     def rows(self) -> int:
-        """Rows that are decoded at most."""
+        """Maximum number of rows."""
         return max(FREE_ROWS, ROWS_PER_BYTE * self.size)
 
     @property
     def unfolded(self) -> int:
-        """Bytes that it unfolds to at most."""
+        """Maximum number of bytes after decompression."""
         return max(FREE_BYTES, BYTES_PER_BYTE * self.size)
 
     @property
     def memory(self) -> int:
-        """Bytes of memory that its reader takes at most, where that is a process of its own."""
+        """Maximum bytes of memory of a confined reader."""
         return FREE_MEMORY + MEMORY_PER_BYTE * self.size
 
     @property
     def seconds(self) -> float:
-        """How long decoding takes at most."""
+        """Maximum time of decoding, in s."""
         return max(FREE_S, self.size / BYTES_PER_S)
 
     def require_rows(self, rows: int) -> None:

@@ -39,7 +39,7 @@ class ParquetSource(FormatSource):
     has_clock = False
 
     def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
-        """Take the bytes of a file, and what it may become."""
+        """Take the bytes of a file, and its limits."""
         self._file, self._stream = budget.file, stream
         _require_within(budget, read_footer(stream, budget.file))
         self._schema = pq.ParquetFile(stream).schema_arrow
@@ -52,7 +52,7 @@ class ParquetSource(FormatSource):
         return [Channel(name) for name in (*readable, *self._keys)]
 
     def find(self, column: str) -> tuple[str, str | None]:
-        """Return what a folder says of a column, or None. Raises `InputError`."""
+        """Return the text of a folder's key, or None. Raises `InputError`."""
         find_column(self._file, [*self._schema.names, *self._keys], column)
         if column in self._keys:
             return "", self._keys[column]
@@ -95,7 +95,7 @@ def open_parquet(budget: Budget) -> Iterator[ParquetSource]:
 
 
 def partition_keys(file: Path) -> dict[str, str]:
-    """Return what the folders above a file say of it, as Hive writes it: `key=value`."""
+    """Return the keys of the folders above a file, written as by Hive: `key=value`."""
     named = (part.partition("=") for part in file.parts[:-1])
     return {key: unquote(text) for key, equals, text in named if key and equals}
 
@@ -126,7 +126,7 @@ def _require_within(budget: Budget, groups: Sequence[RowGroup]) -> None:
 
 
 def is_readable(kind: pa.DataType) -> bool:
-    """Whether a column of this type is text, a number or a time."""
+    """Return True if a column of this type is text, a number or a time."""
     if pa.types.is_dictionary(kind):
         kind = kind.value_type
     tests = (_is_text, pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
@@ -142,7 +142,7 @@ def _is_text(arrow_type: pa.DataType) -> bool:
 
 def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
     """Return a readable column as text, float64, date or timestamp. Raises `InputError`."""
-    array.validate(full=True)  # what Parquet calls text need not be UTF-8, and Polars trusts it
+    array.validate(full=True)  # text of Parquet may be invalid UTF-8, which Polars does not check
     if pa.types.is_dictionary(array.type):
         longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
         if longest is not None and longest > MAX_TEXT:

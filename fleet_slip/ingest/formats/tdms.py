@@ -1,7 +1,7 @@
 """Reads TDMS files of LabVIEW through npTDMS, some values at once.
 
-Times are from the properties of waveforms. Of a file without any, time is one of its channels. A
-channel of several groups is named `CHANNEL@GROUP`.
+Times come from the properties of waveforms. Without these, time is one of the channels. A channel
+name of several groups becomes `CHANNEL@GROUP`.
 """
 
 import re
@@ -35,7 +35,7 @@ _APPLIED = {
 
 
 class _Vector(Matrix):
-    """The values of a channel; `base` says their times, and is empty where nothing says them."""
+    """The values of a channel; `base` identifies their times, empty if there are none."""
 
     def __init__(self, channel: Any) -> None:
         self._channel, self._first, self._ahead = channel, 0, np.zeros(0)
@@ -69,7 +69,7 @@ class TdmsSource(Vectors):
         return [Channel(name, vector.unit, vector.base) for name, vector in self._matrices.items()]
 
     def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
-        """Return what has the same times, and a waveform. Raises `InputError`."""
+        """Return the time base and the position of a column. Raises `InputError`."""
         _, place = super().find(column)
         return self._matrices[column].base, place
 
@@ -84,7 +84,7 @@ class TdmsSource(Vectors):
 
 @contextmanager
 def open_tdms(budget: Budget) -> Iterator[Vectors]:
-    """Open a TDMS file; an index beside it may be that of another one, and is not read.
+    """Open a TDMS file without its index, which may belong to another file.
 
     Raises `InputError`, also for a file that ends too early, or has counts of a converter.
     """

@@ -31,9 +31,9 @@ _KNOWN = {
     "lat": ("latitude", "deg"), "long": ("longitude", "deg"), "velocity": ("gnss speed", "km/h"),
     "heading": ("course", "deg"), "height": ("height", "m"),
 }  # fmt: skip
-"""What columns of these names are, and their units unless the file names others."""
+"""The meaning of columns by name, and their units unless the file states others."""
 _DEGREES = {"lat": 1 / 60, "long": -1 / 60}
-"""Of a count of minutes, west positive; degrees are positive to the east."""
+"""Degrees, positive to the east, of minutes, positive to the west."""
 _FLAGS = 64
 """To the number of satellites 64 is added while the brake is pressed, and 128 by a correction."""
 
@@ -44,7 +44,7 @@ class VboSource(CsvSource):
     has_clock = True
 
     def __init__(self, budget: Budget, numbers: PlainNumbers) -> None:
-        """Take a file, and read what stands above its data. Raises `InputError`."""
+        """Take a file and read its header. Raises `InputError`."""
         lines = first_lines(budget.file, CsvFormat(), _MOST_HEAD_LINES)
         self._places = {line.strip().lower(): number for number, line in enumerate(lines, 1)}
         for section in ("[column names]", "[data]"):

@@ -92,12 +92,12 @@ def test_a_part_of_a_cohort_has_the_tables_of_its_drives_alone(warehouse: Wareho
     cohort = load_cohort(warehouse)
     assert sorted(map(len, cohort.tables)) == [2, 3]
     ids = np.array(cohort.drives["drive_id"].to_pylist())
-    part = cohort.part(ids == "fewer-1")
+    part = cohort.filter(ids == "fewer-1")
     assert part.drives["drive_id"].to_pylist() == ["fewer-1"]
     (table,) = part.tables
     assert len(table) == 1
     assert "ax" not in table.signals
-    assert cohort.part(np.char.startswith(ids, "whole")).tables[0].n.tolist() == [40, 40]
+    assert cohort.filter(np.char.startswith(ids, "whole")).tables[0].n.tolist() == [40, 40]
 
 
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
@@ -205,7 +205,7 @@ def drives_of(seed: int, lost: dict[int, float], drives: int = 40, rows: int = 1
 
 def fitted(table: GramTable, found: DriveWeights) -> np.ndarray:
     """Slopes of the exactly weighted sum."""
-    m = DriveMoments.from_table(weighted(table, found.parts))
+    m = DriveMoments.from_table(weighted(table, found.weights))
     matrix = m.moments.sum(axis=0)
     slopes = np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])[1:]
     return np.asarray(slopes * m.spread[-1] / m.spread[:-1])
@@ -213,7 +213,7 @@ def fitted(table: GramTable, found: DriveWeights) -> np.ndarray:
 
 def test_honest_drives_keep_all_of_their_weight() -> None:
     for seed in range(20):
-        assert (robust_weights(DriveMoments.from_table(drives_of(seed, {}))).parts == FULL).all()
+        assert (robust_weights(DriveMoments.from_table(drives_of(seed, {}))).weights == FULL).all()
 
 
 def test_lost_drives_count_next_to_nothing() -> None:
@@ -221,8 +221,8 @@ def test_lost_drives_count_next_to_nothing() -> None:
     for seed in range(10):
         table = drives_of(seed, {3: -1.0, 17: 4.0})
         found = robust_weights(DriveMoments.from_table(table))
-        assert set(np.flatnonzero(found.parts < FULL).tolist()) == {3, 17}
-        assert found.parts[[3, 17]].max() <= 2
+        assert set(np.flatnonzero(found.weights < FULL).tolist()) == {3, 17}
+        assert found.weights[[3, 17]].max() <= 2
         known = np.where(np.isin(np.arange(40), [3, 17]), 0, FULL)
         told = fitted(table, DriveWeights(known, found.times))
         assert fitted(table, found) == pytest.approx(told, abs=0.012)
@@ -233,24 +233,24 @@ def test_lost_drives_count_next_to_nothing() -> None:
 def test_no_more_than_a_tenth_of_the_weight_is_lost() -> None:
     table = drives_of(1, dict.fromkeys(range(8), 3.0))
     found = robust_weights(DriveMoments.from_table(table))
-    lost = (table.n * (FULL - found.parts)).sum() / (FULL * table.n.sum())
+    lost = (table.n * (FULL - found.weights)).sum() / (FULL * table.n.sum())
     assert 0 < lost <= MAX_LOST_SHARE
 
 
 def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     table = drives_of(2, {5: -1.0})
     order = np.random.default_rng(3).permutation(len(table))
-    parts = robust_weights(DriveMoments.from_table(table)).parts
+    parts = robust_weights(DriveMoments.from_table(table)).weights
     assert np.array_equal(
-        robust_weights(DriveMoments.from_table(table.take(order))).parts, parts[order]
+        robust_weights(DriveMoments.from_table(table.take(order))).weights, parts[order]
     )
     origin = robust_weights(DriveMoments.from_table(table.about_origin()), intercept=False)
-    assert np.array_equal(origin.parts, parts)
+    assert np.array_equal(origin.weights, parts)
 
 
 def test_each_weight_has_its_reason() -> None:
     found = robust_weights(DriveMoments.from_table(drives_of(4, {7: 5.0})))
-    assert "times that of the median drive: robust gives it the weight 0.0" in found.of(7).reason
+    assert "times that of the median drive: robust gives it the weight 0.0" in found.drive(7).reason
 
 
 def test_whole_numbers_beyond_64_bits_stay_exact() -> None:
