@@ -214,7 +214,7 @@ def render(data: ReportData, pictures: Sequence[Drawn]) -> str:
         tally={status: counted[status] for status in Status},
         measured=MEASURED in data.trained.selection.cohort.drives["source"].to_pylist(),
         missing=[name for name in data.shipped if name not in data.evaluated.scenarios],
-        provenance=_provenance(data),
+        cohort=data.trained.selection.cohort,
         commands=_commands(data),
     )
 
@@ -240,27 +240,6 @@ def _tiles(data: ReportData, tally: Mapping[Status, int]) -> list[Tile]:
         )
         tiles.append(Tile(degrees(reported), label))
     return tiles
-
-
-def _provenance(data: ReportData) -> list[tuple[str, str]]:
-    manifest, document = data.version.manifest, data.evaluated.document
-    trained, cohort = manifest.trained_on, data.trained.selection.cohort
-    return [
-        ("model version", data.version.reference),
-        ("its SHA-256", data.version.sha256),
-        ("signals", ", ".join(manifest.signals)),
-        ("cohort", trained.cohort),
-        ("trained on", f"{pluralize(trained.drives, 'drive')}, {count(trained.rows)} rows"),
-        (
-            "table versions",
-            f"logs {trained.logs_version}, grams {trained.grams_version} when it was published; "
-            f"logs {cohort.logs_version}, grams {cohort.grams_version} now",
-        ),
-        ("model list", f"{manifest.selected_by.model_list}, {manifest.selected_by.config_sha256}"),
-        ("evaluation", f"evaluations/{document.number}.json"),
-        ("its SHA-256", document.sha256),
-        ("package", f"fleet-slip {document.content['package_version']}"),
-    ]
 
 
 def _commands(data: ReportData) -> list[str]:
