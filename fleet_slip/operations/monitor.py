@@ -1,7 +1,7 @@
 """Drift charts: the error of a published model on each day since its training.
 
 Errors are exact, from Gram rows: with v = (coefficients, -1) the sum of squared errors of a day is
-v'Gv. The chart is one of individuals, where a day is an individual: days differ more than their rows
+v'Gv. The chart is one of individuals, a day each: days differ more than their rows
 explain (Montgomery, Introduction to Statistical Quality Control, ch. 6). The training days give
 mean and standard deviation. Each is predicted by the model's signals, fitted on the other
 training days: no day is predicted by a model trained on it. The limits of a new day are
