@@ -39,10 +39,10 @@ from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import (
     ASSUMED_RATE,
+    MANY_REFUSED,
     OVERLAPPING_ROWS,
     REFUSED_INFINITE,
     REFUSED_RANGE,
-    REFUSED_ROWS,
     REFUSED_TEXTS,
     REFUSED_TIMES,
     REFUSED_VALUES,
@@ -397,7 +397,7 @@ def find_refusals(
 
     `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    limit = max(rows * REFUSED_ROWS.high, FEWEST_REFUSED)
+    limit = max(rows * MANY_REFUSED.high, FEWEST_REFUSED)
     several = {key: count for key, count in refused.items() if count > limit}
     for (name, reason), count in several.items():
         check = _REFUSED.get(reason, REFUSED_VALUES)
@@ -414,7 +414,7 @@ def find_refusals(
         mixed = ", and set vehicle_id or drive.column if the file mixes cars or trips"
         yield REFUSED_TIMES.fault("time", mixed=mixed if is_mixed else "", **figures)
     else:
-        yield REFUSED_ROWS.fault("rows", **figures)
+        yield MANY_REFUSED.fault("rows", **figures)
 
 
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:

@@ -141,7 +141,7 @@ REFUSED_TIMES = Check(
     "refused times", "values", ROW, LOG,
     "{count:,} of {rows:,} rows were refused, {most:,} of them: {reason}", _TENTH, "of the rows",
     "Check the column of times, its unit and its format{mixed}.")
-REFUSED_ROWS = Check(
+MANY_REFUSED = Check(
     "refused rows", "values", ROW, LOG,
     "{count:,} of {rows:,} rows were refused, {most:,} of them: {reason}", _TENTH, "of the rows",
     "Look at the view quarantine.")
