@@ -3,6 +3,7 @@
 MLflow and pandas are the extra `fleet-slip[mlflow]`, imported on use.
 """
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from http.client import HTTPException
@@ -17,13 +18,17 @@ from urllib.parse import urlsplit
 from urllib.request import urlopen
 
 from fleet_slip.base import pluralize
+from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.config import parse_document
 from fleet_slip.errors import ConfigError, StorageError, UsageError
 from fleet_slip.export.compile import Check
 from fleet_slip.export.files import Subject, document_of, render
 from fleet_slip.export.program import Program
+from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import predict
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.warehouse.warehouse import open_warehouse
 
-LOADER = "fleet_slip.export.mlflow_model"
 DOCUMENT = "estimator.json"
 EXAMPLE_ROWS = 50
 ANSWER_S = 10.0
@@ -133,7 +138,7 @@ def _log(mlflow: Any, subject: Subject, folder: Path) -> str:
         mlflow.log_metrics(_metrics(version))
         logged = mlflow.pyfunc.log_model(
             name=manifest.name,
-            loader_module=LOADER,
+            loader_module=__name__,
             data_path=str(folder / DOCUMENT),
             signature=_signature(mlflow, program),
             input_example=_example(program, subject.checks[0]),
@@ -224,3 +229,32 @@ def _example(program: Program, check: Check) -> Any:
     kinds = _columns(program)
     frame = pd.DataFrame({name: columns.get(name, [None] * len(samples)) for name in kinds})
     return frame.astype({n: "float64" for n, kind in kinds.items() if kind == "double"})
+
+
+class LoggedVersion:
+    """A version as a pyfunc model.
+
+    Parameters
+    ----------
+    signals
+        Signals of the configs that the environment names, or the shipped ones.
+    manifest
+        Manifest of the version.
+    """
+
+    def __init__(self, signals: SignalCatalog, manifest: Manifest) -> None:
+        self.signals = signals
+        self.manifest = manifest
+
+    def predict(self, model_input: Any, params: Any = None) -> Any:  # noqa: ARG002 - MLflow passes it
+        """Return a frame with the angle of each row in rad. Raises as `predict`."""
+        angles = predict(self.signals, self.manifest, model_input)
+        return angles.to_frame()
+
+
+def _load_pyfunc(path: str) -> LoggedVersion:
+    """Load the model of an exported document, for MLflow."""
+    content = json.loads(Path(path).read_text("utf-8"))
+    signals = open_warehouse().catalog.signals
+    manifest = content["model"]["manifest"]
+    return LoggedVersion(signals, parse_document(manifest, Manifest, path, "its manifest", signals))

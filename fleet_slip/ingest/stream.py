@@ -37,7 +37,19 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
-from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.checks import (
+    ASSUMED_RATE,
+    MANY_REFUSED,
+    OVERLAPPING_ROWS,
+    REFUSED_INFINITE,
+    REFUSED_RANGE,
+    REFUSED_TEXTS,
+    REFUSED_TIMES,
+    REFUSED_VALUES,
+    UNUSED_CARS,
+    Check,
+    Fault,
+)
 from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
@@ -295,13 +307,10 @@ class MeasuredStream:
         counts, time = self.counts, self.mapping.time
         faults = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
-            figure = f"drives of one car overlap in time ({twice:,} times)"
-            faults += [Fault("repeated", ("time",), figure, "Set vehicle_id or drive.column.")]
+            faults.append(OVERLAPPING_ROWS.fault("time", count=twice))
         faults += _unmapped_cars(self.file, self.mapping, counts.drives)
         if time.assumed:
-            figure = f"the log has no time column; {time.rate_hz:g} Hz is assumed"
-            remedy = "Set the true rate_hz and remove assumed = true."
-            faults += [Fault("time", ("rate_hz",), figure, remedy)]
+            faults.append(ASSUMED_RATE.fault("rate_hz", rate_hz=time.rate_hz))
         return tuple(faults)
 
 
@@ -371,14 +380,13 @@ def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataF
 # Faults of a log as a whole: many rejected rows, and several cars, where one is under way
 # twice, or a column named like cars is not mapped.
 
-LARGEST_REFUSED, FEWEST_REFUSED = 0.1, 10
-_REFUSED = {
-    "out_of_range": ("scaled", "Check its unit."),
-    "not_a_number": ("texts", "Name those that mean no value under missing."),
-    "not_finite": ("values", 'Write missing = ["nan"] if they mean no value.'),
+FEWEST_REFUSED = 10
+_REFUSED: dict[str, Check] = {
+    "out_of_range": REFUSED_RANGE,
+    "not_a_number": REFUSED_TEXTS,
+    "not_finite": REFUSED_INFINITE,
 }
 _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
-OVERLAP_S = 1.0
 MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
 
 
@@ -389,26 +397,24 @@ def find_refusals(
 
     `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    limit = max(rows * LARGEST_REFUSED, FEWEST_REFUSED)
+    limit = max(rows * MANY_REFUSED.high, FEWEST_REFUSED)
     several = {key: count for key, count in refused.items() if count > limit}
     for (name, reason), count in several.items():
-        kind, remedy = _REFUSED.get(reason, ("values", "Look at the column."))
-        figure = f"{count:,} of {rows:,} rows were refused: {reason}"
-        yield Fault(kind, (name,), figure, remedy)
+        check = _REFUSED.get(reason, REFUSED_VALUES)
+        yield check.fault(name, count=count, rows=rows, reason=reason)
     remaining = Counter(reasons)
     for (_, reason), count in several.items():
         remaining[reason] -= count
     if remaining.total() <= limit:
         return
     ((reason, count),) = remaining.most_common(1)
-    figure = f"{remaining.total():,} of {rows:,} rows were refused, {count:,} of them: {reason}"
+    figures = {"count": remaining.total(), "rows": rows, "most": count, "reason": reason}
     if reason.startswith(_OF_TIME):
-        remedy = "Check the column of times, its unit and its format"
-        if reason in {"time_duplicate", "time_backwards"}:
-            remedy += ", and set vehicle_id or drive.column if the file mixes cars or trips"
-        yield Fault("values", ("time",), figure, f"{remedy}.")
+        is_mixed = reason in {"time_duplicate", "time_backwards"}
+        mixed = ", and set vehicle_id or drive.column if the file mixes cars or trips"
+        yield REFUSED_TIMES.fault("time", mixed=mixed if is_mixed else "", **figures)
     else:
-        yield Fault("values", ("rows",), figure, "Look at the view quarantine.")
+        yield MANY_REFUSED.fault("rows", **figures)
 
 
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
@@ -431,11 +437,12 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
                 if name in used or names.count(name) > 1 or not is_called(words, name):
                     continue
                 values, runs = _values_and_runs(batch[name] for batch in source.batches([name]))
-                if values > 1 and (key == "vehicle_id" or runs > values or values > drives):
-                    figure = f"it has {values:,} values, and the mapping does not use it"
+                if values > UNUSED_CARS.high and (
+                    key == "vehicle_id" or runs > values or values > drives
+                ):
                     where = f"column = {json.dumps(name, ensure_ascii=False)}"
                     where = f"{key} = {{ {where} }}" if key != "column" else where
-                    yield Fault("cars", (name,), figure, f"Write {where} under [drive].")
+                    yield UNUSED_CARS.fault(name, count=values, where=where)
 
 
 def _values_and_runs(pieces: Iterable[pl.Series]) -> tuple[int, int]:
@@ -459,5 +466,6 @@ def _overlaps(under_way: list[tuple[float, float]]) -> int:
     ordered = sorted(under_way)
     latest = accumulate((end for _, end in ordered), max)
     return sum(
-        start < end - OVERLAP_S for (start, _), end in zip(ordered[1:], latest, strict=False)
+        start < end - OVERLAPPING_ROWS.high
+        for (start, _), end in zip(ordered[1:], latest, strict=False)
     )

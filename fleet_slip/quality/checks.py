@@ -127,14 +127,21 @@ MONITOR = "`{}` in `configs/monitor.toml`"
 _REFUSED = "{count:,} of {rows:,} rows were refused: {reason}"
 _TENTH = (-inf, 0.1)
 # fmt: off
-REFUSED_VALUES = Check(
-    "refused values", "values", ROW, LOG, _REFUSED, _TENTH, "of the rows", "Look at the column.")
 REFUSED_RANGE = Check(
     "values out of range", "scaled", ROW, LOG, _REFUSED, _TENTH, "of the rows", "Check its unit.")
 REFUSED_TEXTS = Check(
     "texts in place of numbers", "texts", ROW, LOG, _REFUSED, _TENTH, "of the rows",
     "Name those that mean no value under missing.")
-REFUSED_ROWS = Check(
+REFUSED_INFINITE = Check(
+    "values that are not finite", "values", ROW, LOG, _REFUSED, _TENTH, "of the rows",
+    'Write missing = ["nan"] if they mean no value.')
+REFUSED_VALUES = Check(
+    "refused values", "values", ROW, LOG, _REFUSED, _TENTH, "of the rows", "Look at the column.")
+REFUSED_TIMES = Check(
+    "refused times", "values", ROW, LOG,
+    "{count:,} of {rows:,} rows were refused, {most:,} of them: {reason}", _TENTH, "of the rows",
+    "Check the column of times, its unit and its format{mixed}.")
+MANY_REFUSED = Check(
     "refused rows", "values", ROW, LOG,
     "{count:,} of {rows:,} rows were refused, {most:,} of them: {reason}", _TENTH, "of the rows",
     "Look at the view quarantine.")

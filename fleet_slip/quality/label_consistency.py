@@ -1,14 +1,14 @@
-"""Days and files whose labels have another factor, or another zero, than all others.
+"""Labels that contradict those of other drives: sign, factor and zero.
 
 In one drive the car, its tyres and the road hide a label that is half as large again. But a mapping
 or a logger that changes does so for many cars at once: the median over the drives of a day shows
-what none of them does. So each drive's label is compared with what the relation of all drives
-predicts, and the medians of a day, and of a file, with those of all others. Where the road is icy
-or all cars are laden, medians differ as well, by less than `FACTOR` and `LEAST_OFFSET`.
+what no single drive does. So each drive's label is compared with the prediction by the relation of
+all drives, and the medians of a day, and of a file, with those of all others.
 """
 
 import math
 from collections.abc import Iterator, Sequence
+from operator import itemgetter
 
 import numpy as np
 import pyarrow as pa
@@ -16,34 +16,34 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.checks import (
+    LABEL_GAIN,
+    LABEL_GAIN_SIGN,
+    LABEL_OFFSET,
+    REPEATED,
+    Fault,
+)
 from fleet_slip.quality.moments import DriveBatches
 from fleet_slip.quality.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import open_scratch
 
-# Drives whose label has the sign turned, however many they are.
-#
-# Where the label of a few drives is reversed, they are unlike their peers. Where it is that of
-# half of them, as after a car was logged again with another sign, there is no usual drive to be
-# unlike. But each drive still keeps to one relation between the signals and the label, or to its
-# opposite. So the sign of each drive is found together with the relation, by turns: least squares
-# over all drives with their signs, then the sign with which each drive agrees with it.
+# Reversed labels. A few drives with a reversed label are unlike their peers. Among halves, as after
+# a car was logged again with another sign, no drive is usual. But each drive follows one relation
+# between the signals and the label, or its opposite. So signs and relation are estimated in turns:
+# least squares over all drives with their signs, then the sign that agrees with it.
 
 ROUNDS = 20
-LEAST_EXPLAINED = 0.5
-"""Part of the label's variance that the relation must explain, else signs mean nothing."""
-
-REVERSED_GAIN = -0.5
-"""A label on its prediction: 1 without a fault, -1 reversed."""
+MIN_EXPLAINED = 0.5
+"""Share of the label's variance that the relation must explain, else signs mean nothing."""
 
 
 def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> dict[int, Fault]:
     """Return otherwise sound drives whose label contradicts that of the others, with the fault.
 
-    The fewer drives are the reversed ones; of two halves, the one without the first drive, since
-    drives come in the order of their names, which begin with the day.
+    The smaller group is reversed. Of two halves it is the one without the first drive: drives are
+    in the order of their names, which begin with the day.
     """
     if label not in table.signals or len(table.signals) < 2 or in_order.sum() < 2:
         return {}
@@ -52,36 +52,36 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
     if gains is None:
         return {}
     return {
-        int(drive): Fault("reversed", (label,), f"gain {gain:.3f} on the prediction from others")
+        int(drive): LABEL_GAIN_SIGN.fault(label, gain=gain)
         for drive, gain in zip(drives.rows, gains, strict=True)
-        if gain < REVERSED_GAIN
+        if gain < LABEL_GAIN_SIGN.low
     }
 
 
 def _gains(drives: DriveBatches, label: int) -> FloatArray | None:
-    """Return the gain of each drive's label on the relation that most keep to; None without one."""
-    parts = [label_parts(batch.covariances(), label) for batch in drives]
-    inputs = sum(part[0].sum(axis=0) for part in parts)
-    with_label = np.concatenate([part[1] for part in parts])
-    variance = float(sum(part[2].sum() for part in parts))
+    """Return the gain of each drive's label on the common relation; None without one."""
+    blocks = [label_blocks(batch.covariances(), label) for batch in drives]
+    inputs = sum(block[0].sum(axis=0) for block in blocks)
+    with_label = np.concatenate([block[1] for block in blocks])
+    variance = float(sum(block[2].sum() for block in blocks))
     starts = [np.ones(len(drives)), _leading_signs(inputs, with_label)]
-    found = [_settle(drives, label, inputs, with_label, start) for start in starts]
-    explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in found]
-    signs, _, gains = found[int(np.argmax(explained))]
-    if not max(explained) > LEAST_EXPLAINED * variance:
+    fits = [_fit_signs(drives, label, inputs, with_label, start) for start in starts]
+    explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in fits]
+    signs, _, gains = fits[int(np.argmax(explained))]
+    if not max(explained) > MIN_EXPLAINED * variance:
         return None
     majority = np.sign(signs.sum()) or signs[0]
     return np.asarray(gains * majority)
 
 
-def _settle(
+def _fit_signs(
     drives: DriveBatches,
     label: int,
     inputs: FloatArray,
     with_label: FloatArray,
     signs: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return signs that agree with the relation that they make, the relation, and the gains."""
+    """Return signs that agree with the relation fitted with them, the relation, and the gains."""
     for _ in range(ROUNDS):
         weights = solve(inputs, signs @ with_label)
         gains = np.concatenate([_gain(b.covariances(), label, weights) for b in drives])
@@ -92,7 +92,7 @@ def _settle(
     return signs, weights, gains
 
 
-def label_parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def label_blocks(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariances of the inputs, theirs with the label, and the label's variances."""
     others = np.delete(np.arange(covariances.shape[1]), label)
     inputs = covariances[:, others[:, None], others]
@@ -100,14 +100,14 @@ def label_parts(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatA
 
 
 def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:
-    inputs, with_label, _ = label_parts(covariances, label)
+    inputs, with_label, _ = label_blocks(covariances, label)
     predicted = np.einsum("i,dij,j->d", weights, inputs, weights)
     least = np.finfo(np.float64).tiny
     return np.asarray(with_label @ weights / np.maximum(predicted, least))
 
 
 def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
-    """Return on which side of the direction that most drives share each of them is."""
+    """Return the sign of each drive's projection on the leading direction."""
     scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
     directions = with_label / scale
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
@@ -116,19 +116,14 @@ def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
     return np.where(directions @ vectors[:, -1] < 0, -1.0, 1.0)
 
 
-FACTOR = 1.4
-"""A label's median gain on its prediction, over that of others: 0.77 where all cars are laden."""
-
-LEAST_OFFSET = math.radians(0.4)
-"""Of a label's median residual, in rad: 0.1 deg on ice and with load."""
-
-FEWEST_CARS = 4
+MIN_CARS = 4
+"""Of a day or file, and of the others: a median of fewer cars shows their differences."""
 
 OFFSET, GAIN = 0, 1
-"""Of a drive's figures: the mean residual in counts, and the logarithm of the gain."""
+"""Columns of a drive's figures: the mean residual in counts, and the logarithm of the gain."""
 
-LEAST_GAIN = 1e-3
-"""Of a label that does not follow its prediction at all."""
+MIN_GAIN = 1e-3
+"""Of a label that does not follow its prediction at all, so that it has a logarithm."""
 
 
 def find_odd_days(
@@ -141,14 +136,15 @@ def find_odd_days(
 ) -> dict[int, Fault]:
     """Return the drives of days or files whose labels are unlike the others', with the fault.
 
-    `groups` are ways to number the drives of the table, such as by day. The most unlike group is
-    taken out and the rest is judged again; a group of more than half of the drives is no odd one.
+    `groups` are numberings of the drives of the table, such as by day. The most unlike group is
+    removed and the others are compared again. A group of more than half of the drives is usual.
     """
     label = signals.label
     if label not in table.signals or len(table.signals) < 2:
         return {}
     # The gain comes first: it decides where a group differs in both.
-    least = {GAIN: math.log(FACTOR), OFFSET: LEAST_OFFSET / float(signals[label].scale)}
+    scale = float(signals[label].scale)
+    bounds = {GAIN: math.log(LABEL_GAIN.high), OFFSET: math.radians(LABEL_OFFSET.high) / scale}
     faults: dict[int, Fault] = {}
     usual = in_order.copy()
     while usual.sum() >= limits.min_drives:
@@ -156,12 +152,12 @@ def find_odd_days(
         if figures is None:
             break
         chosen = [group[usual] for group in groups]
-        found = list(_odd(figures, chosen, cars[usual], label, least, limits.limit))
-        if not found:
+        odd = list(_odd_groups(figures, chosen, cars[usual], label, bounds, limits.limit))
+        if not odd:
             rows = np.flatnonzero(usual)
-            alone = _alone(figures, label, least, limits.limit)
+            alone = _odd_drives(figures, label, bounds, limits.limit)
             return faults | {int(rows[drive]): fault for drive, fault in alone.items()}
-        _, mask, fault = max(found, key=lambda one: one[0])
+        _, mask, fault = max(odd, key=itemgetter(0))
         rows = np.flatnonzero(usual)[mask]
         faults |= dict.fromkeys(rows.tolist(), fault)
         usual[rows] = False
@@ -170,92 +166,91 @@ def find_odd_days(
 
 def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
     """Return offset and gain of each drive's label; None if the others hardly explain labels."""
-    parts = [label_parts(batch.covariances(), label) for batch in drives]
-    inputs, with_label = (np.concatenate([part[at] for part in parts]) for at in (0, 1))
+    blocks = [label_blocks(batch.covariances(), label) for batch in drives]
+    inputs, with_label = (np.concatenate([block[at] for block in blocks]) for at in (0, 1))
     weights = solve(inputs.sum(axis=0), with_label.sum(axis=0))
     explained = with_label @ weights
     predicted, least = np.einsum("i,dij,j->d", weights, inputs, weights), np.finfo(np.float64).tiny
-    variance = predicted * np.concatenate([part[2] for part in parts])
-    if np.median(explained**2 / np.maximum(variance, least)) < LEAST_EXPLAINED:
+    variance = predicted * np.concatenate([block[2] for block in blocks])
+    if np.median(explained**2 / np.maximum(variance, least)) < MIN_EXPLAINED:
         return None
     gains = explained / np.maximum(predicted, least)
     means = drives.evaluate(lambda batch: batch.matrices[:, 0, 1:])
     offsets = means[:, label] - np.delete(means, label, axis=1) @ weights
-    return np.stack([offsets, np.log(np.maximum(gains, LEAST_GAIN))], axis=1)
+    return np.stack([offsets, np.log(np.maximum(gains, MIN_GAIN))], axis=1)
 
 
-def _alone(
-    figures: FloatArray, label: str, least: dict[int, float], limit: float
+def _odd_drives(
+    figures: FloatArray, label: str, bounds: dict[int, float], limit: float
 ) -> dict[int, Fault]:
-    """Return single drives that are far off by twice what a group may be."""
-    apart = figures - np.median(figures, axis=0)
-    spread = MAD_TO_STD * np.median(np.abs(apart), axis=0)
-    found: dict[int, Fault] = {}
-    for at in reversed(least):
-        far = np.abs(apart[:, at]) > max(2 * least[at], limit * spread[at])
-        for drive in np.flatnonzero(far).tolist():
-            found[drive] = _fault(label, at, float(apart[drive, at]), "of other drives")
-    return found
+    """Return single drives that differ by twice the bounds of a group."""
+    differences = figures - np.median(figures, axis=0)
+    scale = MAD_TO_STD * np.median(np.abs(differences), axis=0)
+    faults: dict[int, Fault] = {}
+    for column in reversed(bounds):
+        is_odd = np.abs(differences[:, column]) > max(2 * bounds[column], limit * scale[column])
+        for drive in np.flatnonzero(is_odd).tolist():
+            faults[drive] = _fault(label, column, float(differences[drive, column]), "drives")
+    return faults
 
 
-def _fault(label: str, at: int, difference: float, of: str) -> Fault:
-    if at == GAIN:
-        return Fault("scaled", (label,), f"gain {math.exp(difference):.3f} of that {of}")
-    return Fault("biased", (label,), f"offset {difference:+.1f} counts from that {of}")
+def _fault(label: str, column: int, difference: float, others: str) -> Fault:
+    if column == GAIN:
+        return LABEL_GAIN.fault(label, gain=math.exp(difference), others=others)
+    return LABEL_OFFSET.fault(label, offset=difference, others=others)
 
 
-def _odd(
+def _odd_groups(
     figures: FloatArray,
     groups: Sequence[IntArray],
     cars: IntArray,
     label: str,
-    least: dict[int, float],
+    bounds: dict[int, float],
     limit: float,
 ) -> Iterator[tuple[float, BoolArray, Fault]]:
-    """Yield how sure it is that a group is odd, which drives are of it, and the fault.
+    """Yield the standard errors by which a group is odd, its drives, and the fault.
 
     Medians of the group and of all others are compared, with the standard error of a median.
     """
-    several = len(np.unique(cars)) > 1
+    has_cars = len(np.unique(cars)) > 1
     for mask in (numbers == number for numbers in groups for number in np.unique(numbers)):
-        parts = mask, ~mask
-        many = [len(np.unique(cars[part])) if several else int(part.sum()) for part in parts]
-        if 2 * mask.sum() > len(mask) or min(many) < FEWEST_CARS:
+        sides = mask, ~mask
+        sizes = [len(np.unique(cars[side])) if has_cars else int(side.sum()) for side in sides]
+        if 2 * mask.sum() > len(mask) or min(sizes) < MIN_CARS:
             continue
-        own, others = middles = [np.median(figures[part], axis=0) for part in parts]
+        in_group, others = medians = [np.median(figures[side], axis=0) for side in sides]
         variance = np.full(2, np.finfo(np.float64).tiny)
-        for part, middle, number in zip(parts, middles, many, strict=True):
-            spread = MAD_TO_STD * np.median(np.abs(figures[part] - middle), axis=0)
-            variance += math.pi / 2 * spread**2 / number
-        scores = np.abs(own - others) / np.sqrt(variance)
-        for at, difference in least.items():
-            if abs(own[at] - others[at]) > difference and scores[at] > limit:
-                fault = _fault(label, at, float(own[at] - others[at]), "of other days")
-                to_own, to_others = (np.abs(figures[:, at] - one[at]) for one in (own, others))
-                yield float(scores[at]), mask & (to_own < to_others), fault
+        for side, median, size in zip(sides, medians, sizes, strict=True):
+            scale = MAD_TO_STD * np.median(np.abs(figures[side] - median), axis=0)
+            variance += math.pi / 2 * scale**2 / size
+        differences = in_group - others
+        scores = np.abs(differences) / np.sqrt(variance)
+        for column, bound in bounds.items():
+            if abs(differences[column]) > bound and scores[column] > limit:
+                fault = _fault(label, column, float(differences[column]), "days")
+                to_group, to_others = (np.abs(figures[:, column] - m[column]) for m in medians)
+                yield float(scores[column]), mask & (to_group < to_others), fault
                 break
 
 
 # Drives of one car that overlap in time: a car drives once, so that their rows count twice.
 
-LEAST_OVERLAP_S = 1.0
-"""Clocks of two loggers differ by less."""
-
 
 def find_repeated(drives: pa.Table) -> dict[str, Fault]:
-    """Return what is wrong with each drive during which another one of its car was under way.
+    """Return the fault of each drive during which another one of its car was under way.
 
     `drives` has the columns that `jobs/repeated_drives.sql` reads, a row or more for each drive.
     """
-    given = {
+    parameters = {
         "received": RECEIVED,
-        "least_s": LEAST_OVERLAP_S,
+        "least_s": REPEATED.high,
         "sample_time_s": float(SAMPLE_TIME_S),
     }
     with open_scratch() as database:
         database.register("drives", drives)
-        found = database.execute(read_sql("jobs", "repeated_drives.sql"), given).fetchall()
+        query = read_sql("jobs", "repeated_drives.sql")
+        overlaps = database.execute(query, parameters).fetchall()
     return {
-        named: Fault("repeated", (), f"{common_s:.0f} s overlap with {other}")
-        for named, common_s, other in found
+        drive: REPEATED.fault(overlap_s=overlap_s, other=other)
+        for drive, overlap_s, other in overlaps
     }

@@ -1,13 +1,13 @@
-"""How a drive's signals relate to one another, compared with the other drives of its cohort.
+"""Signals of a drive, predicted from one another, compared with other drives of its cohort.
 
-Each signal is predicted from the others by the cohort's own least squares. In a drive three
-figures say how the signal keeps to that: the mean of the residual (offset), the slope through the
+Each signal is predicted from the others by the cohort's least squares. Three figures of a drive
+describe its relation to the prediction: the mean of the residual (offset), the slope through the
 origin of the signal on its prediction (gain), and the logarithm of the residual's standard
 deviation (noise). Each is compared with the cohort's drives by median and median absolute
 deviation, which a faulty minority does not move (Huber, Robust Statistics, 1981).
 
-A faulty sensor also spoils the predictions of the others. It is the one without which all the
-others keep to theirs: structured residuals (Gertler, Fault Detection and Diagnosis in Engineering
+A faulty sensor also spoils the predictions of the others. It is the one without which all others
+agree with theirs: structured residuals (Gertler, Fault Detection and Diagnosis in Engineering
 Systems, 1998).
 """
 
@@ -21,7 +21,15 @@ from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.config import Config, load_config
-from fleet_slip.quality.checks import Fault
+from fleet_slip.quality.checks import (
+    EXCHANGED,
+    PEERS_NOISE,
+    PEERS_OFFSET,
+    PEERS_SCALE,
+    PEERS_SIGN,
+    UNEXPLAINED,
+    Fault,
+)
 from fleet_slip.quality.moments import DriveBatches, MeanMoments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import Configs
@@ -30,23 +38,23 @@ from fleet_slip.resources import Configs
 
 
 class StatusThresholds(Config):
-    """When `status` calls for attention."""
+    """Thresholds of `status`."""
 
     min_free_fraction: float = Field(ge=0, lt=1)
-    """Least free part of the disk that holds the data root."""
+    """Smallest free share of the disk that holds the data root."""
 
 
 class QualityThresholds(Config):
-    """When `quality` finds a drive's sensors faulty.
+    """Thresholds of `quality`.
 
     Attributes:
-        min_rows: shorter drives are not examined.
-        min_drives: fewest drives without faults of a vehicle model to compare others with.
-        min_correlation: a sign of turning contradicts the others at less than minus this.
-        limit: how many spreads from the cohort's median a figure may be.
-        offset_floor_counts, gain_floor, noise_floor: least spread of the figures between drives;
-            noise_floor is of the logarithm of the noise.
-        max_saturated_per_row: most values at the end of their range, per row.
+        min_rows: shorter drives are not checked.
+        min_drives: smallest number of sound drives of a vehicle model to compare others with.
+        min_correlation: a sign of turning contradicts the others below minus this.
+        limit: largest distance of a figure from the cohort's median, in standard deviations.
+        offset_floor_counts, gain_floor, noise_floor: smallest standard deviation of the figures
+            between drives; noise_floor is of the logarithm of the noise.
+        max_saturated_per_row: largest number of values at the end of their range, per row.
     """
 
     min_rows: int = Field(gt=0)
@@ -60,10 +68,10 @@ class QualityThresholds(Config):
 
 
 class MonitorThresholds(Config):
-    """When `monitor` calls a day an alarm.
+    """Thresholds of `monitor`.
 
     Attributes:
-        min_training_days: fewest days to learn from what is usual.
+        min_training_days: smallest number of days to learn usual figures from.
         false_alarms_per_day: probability that a usual day is beyond a figure's limits.
     """
 
@@ -95,18 +103,18 @@ ROUNDS = 5
 
 @dataclass(frozen=True)
 class Prediction:
-    """The cohort's prediction of some signals, and how its drives keep to it.
+    """The cohort's prediction of some signals, and the figures of its drives.
 
     Attributes:
         targets: positions in u of the signals that are predicted.
         weights: shape (targets, k+1): the prediction is weights @ u.
-        middle, spread: of each figure over the cohort's drives, shape (targets, 3).
+        median, scale: of each figure over the cohort's drives, shape (targets, 3).
     """
 
     targets: NDArray[np.intp]
     weights: FloatArray
-    middle: FloatArray
-    spread: FloatArray
+    median: FloatArray
+    scale: FloatArray
 
     @classmethod
     def fit(
@@ -116,7 +124,7 @@ class Prediction:
         predictors: Sequence[int],
         limits: QualityThresholds,
     ) -> "Prediction":
-        """Fit on drives without faults; every drive counts the same."""
+        """Fit on sound drives; all have equal weight."""
         total = reference.mean
         at = np.array(targets, dtype=np.intp)
         weights = np.zeros((len(at), len(total)))
@@ -125,9 +133,9 @@ class Prediction:
             weights[row, used] = solve(total[np.ix_(used, used)], total[used, target])
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
         figures = reference.evaluate(bare.figures)
-        middle, spread = _middle_and_spread(figures)
+        median, scale = _median_and_scale(figures)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
-        return cls(at, weights, middle, np.maximum(spread, floors))
+        return cls(at, weights, median, np.maximum(scale, floors))
 
     def figures(self, moments: MeanMoments) -> FloatArray:
         """Return offset in counts, gain and log noise of drives, shape (drives, targets, 3)."""
@@ -143,15 +151,15 @@ class Prediction:
         return np.stack([offset, own / predicted, noise], axis=2)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
-        """Return the spreads from the middle, (drives, targets, 3); of noise upwards only."""
-        scores = (self.figures(moments) - self.middle) / self.spread
+        """Return standard deviations from the median, (drives, targets, 3); above it for noise."""
+        scores = (self.figures(moments) - self.median) / self.scale
         scores[:, :, :2] = np.abs(scores[:, :, :2])
         return np.asarray(scores)
 
 
 @dataclass(frozen=True)
 class Peers:
-    """What is normal in a cohort: predictions from all other signals, and without each of them."""
+    """Predictions of a cohort: from all other signals, and without each of them."""
 
     reference: DriveBatches
     label: str
@@ -168,11 +176,11 @@ class Peers:
         return {name: self._prediction(without=name) for name in self.reference.table.signals}
 
     def _prediction(self, without: str | None) -> Prediction:
-        known = self.reference.table.signals
-        signals = [name for name in known if name != without]
+        columns = self.reference.table.signals
+        signals = [name for name in columns if name != without]
 
         def position(name: str) -> int:
-            return known.index(name) + 1
+            return columns.index(name) + 1
 
         return Prediction.fit(
             self.reference,
@@ -182,7 +190,7 @@ class Peers:
         )
 
     def suspects(self, drives: DriveBatches) -> BoolArray:
-        """Say which drives have a figure beyond the limit."""
+        """Return a mask of the drives with a figure beyond the limit."""
         worst = drives.evaluate(lambda batch: self.worst(self.full, batch))
         return np.asarray(worst > self.limits.limit)
 
@@ -191,10 +199,10 @@ class Peers:
         return np.asarray(prediction.scores(moments).max(axis=(1, 2)))
 
     def explain(self, drives: DriveBatches) -> list[Fault]:
-        """Return the fault of each drive: the repair that leaves the least to explain.
+        """Return the fault of each drive: the repair that brings other figures within the limit.
 
-        Two signals exchanged back, or one signal left out. If neither brings all other figures
-        within the limit, the fault is unexplained.
+        A repair exchanges two signals, or leaves one out. Without a repair the fault is
+        unexplained.
         """
         return [fault for batch in drives for fault in self._explain(batch)]
 
@@ -202,73 +210,72 @@ class Peers:
         signals = moments.signals
         pairs = [pair for pair in PAIRS if set(pair) <= set(signals)]
         exchanged = [self.worst(self.full, moments.exchanged(*pair)) for pair in pairs]
-        left_out = [self.worst(self.without[name], moments) for name in signals]
-        scores = self.full.scores(moments)
+        without = [self.worst(self.without[name], moments) for name in signals]
+        scores = self.full.scores(moments).max(axis=2)
         figures = self.full.figures(moments)
         faults = []
         for drive in range(len(moments)):
             after = [float(worst[drive]) for worst in exchanged]
             if after and min(after) <= self.limits.limit:
-                pair = pairs[int(np.argmin(after))]
-                faults.append(Fault("swapped", pair, "exchanged, they match other drives"))
+                faults.append(EXCHANGED.fault(*pairs[int(np.argmin(after))]))
                 continue
-            rest = np.array([worst[drive] for worst in left_out])
-            # Of the sensors that explain all the rest, the one that is itself furthest off.
-            own = np.where(rest <= self.limits.limit, scores[drive].max(axis=1), -np.inf)
-            if np.isinf(own).all():
-                worst = int(scores[drive].max(axis=1).argmax())
-                figure = f"{scores[drive].max():.1f} spreads from the cohort"
-                faults.append(Fault("unexplained", (signals[worst],), figure))
-            else:
-                faults.append(self._kind(int(own.argmax()), drive, moments, figures))
+            is_explained = np.array([worst[drive] for worst in without]) <= self.limits.limit
+            if not is_explained.any():
+                worst = int(scores[drive].argmax())
+                faults.append(UNEXPLAINED.fault(signals[worst], score=scores[drive, worst]))
+                continue
+            # The sensor that explains all others, and is itself furthest off.
+            target = int(np.where(is_explained, scores[drive], -np.inf).argmax())
+            faults.append(self._fault(target, drive, moments, figures))
         return faults
 
-    def _kind(self, target: int, drive: int, moments: MeanMoments, figures: FloatArray) -> Fault:
-        """Name the fault of a sensor by what would mend it: a sign, an offset, a factor."""
-        name = (moments.signals[target],)
+    def _fault(self, target: int, drive: int, moments: MeanMoments, figures: FloatArray) -> Fault:
+        """Return the fault of a sensor by its repair: a sign, an offset or a factor."""
+        name = moments.signals[target]
         offset, gain, log_noise = figures[drive, target]
-        noise = np.exp(log_noise - self.full.middle[target, 2])
-        usual = np.exp(2 * self.full.middle[target, 2])
+        noise = np.exp(log_noise - self.full.median[target, 2])
+        usual = np.exp(2 * self.full.median[target, 2])
         w = self.full.weights[target]
         m = moments.matrices[drive]
-        own = m[target + 1, target + 1]
-        shifted = np.exp(2 * log_noise)
-        scaled = own - gain**2 * (w @ m @ w)
-        if gain < -0.5:
-            return Fault("reversed", name, f"gain {gain:.3f}")
-        if min(shifted, scaled) > usual * np.exp(2 * self.limits.limit * self.limits.noise_floor):
-            return Fault("noisy", name, f"{noise:.1f} times the usual noise, gain {gain:.3f}")
-        if scaled < shifted:
-            return Fault("scaled", name, f"gain {gain:.4f}")
-        return Fault("biased", name, f"offset {offset:+.1f} counts")
+        square = m[target + 1, target + 1]
+        if gain < PEERS_SIGN.low:
+            return PEERS_SIGN.fault(name, gain=gain)
+        without_offset = np.exp(2 * log_noise)
+        without_factor = square - gain**2 * (w @ m @ w)
+        max_noise = usual * np.exp(2 * self.limits.limit * self.limits.noise_floor)
+        if min(without_offset, without_factor) > max_noise:
+            return PEERS_NOISE.fault(name, noise=noise, gain=gain)
+        if without_factor < without_offset:
+            return PEERS_SCALE.fault(name, gain=gain)
+        return PEERS_OFFSET.fault(name, offset=offset)
 
 
 def settle(
     table: GramTable, in_order: BoolArray, label: str, limits: QualityThresholds
 ) -> tuple[Peers, BoolArray]:
-    """Fit peers on plausible drives, leaving suspects out until they stay; return both."""
+    """Fit peers on sound drives without suspects, until these stay the same; return both."""
     suspects = ~in_order
     for _ in range(ROUNDS):
         peers = Peers(DriveBatches.of(table, ~suspects), label, limits)
-        now = peers.suspects(DriveBatches.of(table)) | ~in_order
-        if (now == suspects).all() or (~now).sum() < limits.min_drives:
+        beyond = peers.suspects(DriveBatches.of(table)) | ~in_order
+        if (beyond == suspects).all() or (~beyond).sum() < limits.min_drives:
             break
-        suspects = now
+        suspects = beyond
     return peers, suspects & in_order
 
 
-def _middle_and_spread(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return median and scaled MAD of each figure over the drives, one by one: each is copied."""
-    middle, spread = np.empty(figures.shape[1:]), np.empty(figures.shape[1:])
+def _median_and_scale(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return median and scaled MAD of each figure over the drives, one by one to save memory."""
+    median, scale = np.empty(figures.shape[1:]), np.empty(figures.shape[1:])
     for at in np.ndindex(*figures.shape[1:]):
         column = figures[(slice(None), *at)]
-        middle[at] = np.median(column)
-        spread[at] = MAD_TO_STD * np.median(np.abs(column - middle[at]))
-    return middle, spread
+        median[at] = np.median(column)
+        scale[at] = MAD_TO_STD * np.median(np.abs(column - median[at]))
+    return median, scale
 
 
 def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
-    """Return the weights of least squares, scaled so that units do not matter."""
+    """Return the weights of least squares, solved with scaled units."""
     scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
     solution, *_ = np.linalg.lstsq(inputs / np.outer(scale, scale), with_label / scale, rcond=1e-12)
     return np.asarray(solution / scale)

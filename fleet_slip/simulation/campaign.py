@@ -34,9 +34,8 @@ from fleet_slip.simulation.drive_plans import (
     configs_of,
 )
 from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
-from fleet_slip.simulation.receivers import Receiver, Receivers
 from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Sensors
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Receiver, Receivers, Sensors
 from fleet_slip.vehicle.batch import Surface
 
 if TYPE_CHECKING:

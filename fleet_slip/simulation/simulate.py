@@ -22,9 +22,14 @@ from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import RefusedError
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec
-from fleet_slip.simulation.receivers import ReceiverLog
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, road_with
-from fleet_slip.simulation.sensors import GPS_SIGNALS, SAMPLE_RATE_HZ, Measurement, Recorder
+from fleet_slip.simulation.sensors import (
+    GPS_SIGNALS,
+    SAMPLE_RATE_HZ,
+    Measurement,
+    ReceiverLog,
+    Recorder,
+)
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts, retrying
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.parameters import PERFECT

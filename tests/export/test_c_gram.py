@@ -41,9 +41,9 @@ from tests.export.compiled import (
     run_compiled,
 )
 from tests.export.models import MODELS, model_of
-from tests.grams.rows.test_course_sums import hostile_drive
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counted_rows import parse_messages, rows_of_messages, write_counted
+from tests.support.course_drives import hostile_drive
 from tests.support.logs import land
 
 pytestmark = needs_cc

@@ -19,7 +19,7 @@ from cantools.database.can.database import Database
 from fleet_slip.errors import InputError
 from fleet_slip.export import fmu
 from fleet_slip.export.files import export_files
-from fleet_slip.export.mlflow_model import LoggedVersion
+from fleet_slip.export.mlflow import LoggedVersion
 from fleet_slip.export.templating import distinct
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain

@@ -17,9 +17,9 @@ import fleet_slip
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import confined
 from fleet_slip.ingest.formats import source as budget
-from tests.ingest.test_tdms import own_clock, wave, write
 from tests.support.commands import until
 from tests.support.measured import failure, read_measured
+from tests.support.tdms_files import own_clock, wave, write
 
 HARM = """
 def open_other(): open({secret!r}).read()

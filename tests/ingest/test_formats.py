@@ -4,7 +4,6 @@ import gc
 import re
 import tempfile
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,18 @@ from fleet_slip.ingest.load import preview_logs
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import profile_file
 from tests.support.catalog import SIGNALS
+from tests.support.format_values import (
+    AX,
+    AX_COUNTS,
+    BETA_COUNTS,
+    BETA_DEG,
+    START,
+    TIME_S,
+    require_the_drive,
+)
 from tests.support.fuzz import logs
 from tests.support.fuzz.logs import FORMATS, sound_file
 from tests.support.measured import (
-    MeasuredLog,
     a_mapping,
     failure,
     own_clock,
@@ -37,20 +44,6 @@ from tests.support.measured import (
     read_measured,
     ticks,
 )
-
-START = datetime(2024, 5, 31, 12, tzinfo=UTC)
-TIME_S = np.arange(100) / 100
-AX = np.round(2 * np.sin(5 * TIME_S), 3)
-BETA_DEG = np.round(np.cos(3 * TIME_S), 2)
-AX_COUNTS = np.rint(AX / 0.001).astype(int).tolist()
-BETA_COUNTS = np.rint(np.radians(BETA_DEG) / 0.0001).astype(int).tolist()
-
-
-def require_the_drive(log: MeasuredLog) -> None:
-    assert ticks(log) == list(range(100))
-    assert log.drives["ax"].to_pylist() == AX_COUNTS
-    assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
-    assert log.drives["day"].unique().to_pylist() == [START.date()]
 
 
 def signals(ax: str, beta: str, **beta_keys: Any) -> dict[str, Any]:

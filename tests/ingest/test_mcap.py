@@ -15,7 +15,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import mcap as mcap_log
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
-from tests.ingest.test_formats import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
+from tests.support.format_values import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
 from tests.support.measured import failure, own_clock, read_measured
 from tests.support.reported import call
 

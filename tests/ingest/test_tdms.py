@@ -1,7 +1,7 @@
 """TDMS files of LabVIEW: values and times are those that were written, whatever the layout."""
 
 import struct
-from datetime import UTC, date, datetime
+from datetime import date
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -11,39 +11,18 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nptdms import ChannelObject, TdmsWriter
+from nptdms import ChannelObject
 
 from fleet_slip.ingest.formats import matlab, tdms
 from fleet_slip.ingest.formats.reading import FileFormats, open_source
 from fleet_slip.ingest.formats.source import OWN_TIME
-from tests.support import measured
 from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
-
-START = datetime(2024, 5, 31, 12, tzinfo=UTC)
-SIGNALS = {
-    "ax": {"column": "ax", "unit": "m/s^2"},
-    "sideslip": {"column": "beta", "unit": "deg", "longest_gap_s": 0.3},
-}
-
-
-def wave(step_s: float, **more: Any) -> dict[str, Any]:
-    return {"wf_start_time": START.replace(tzinfo=None), "wf_increment": step_s, **more}
-
-
-def write(file: Path, *segments: list[ChannelObject]) -> Path:
-    with TdmsWriter(file) as writer:
-        for channels in segments:
-            writer.write_segment(channels)
-    return file
+from tests.support.tdms_files import START, own_clock, wave, write
 
 
 def read(file: Path, *columns: str) -> pl.DataFrame:
     with open_source(file, FileFormats()) as source:
         return pl.concat(source.batches(columns))
-
-
-def own_clock(**changes: Any) -> Any:
-    return measured.own_clock(**{"signals": SIGNALS, **changes})
 
 
 def test_groups_of_several_rates_are_one_drive(tmp_path: Path) -> None:

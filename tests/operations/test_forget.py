@@ -6,12 +6,9 @@ import shutil
 import time
 from datetime import date
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -37,32 +34,9 @@ from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand
-from tests.support.logs import ask, land, log_rows, random_counts
+from tests.support.erasure import CARS, drive, fill, mentions
+from tests.support.logs import ask, land
 from tests.support.measured import a_mapping, csv_text, good_columns, ingest_file
-
-CARS = ("alfa", "beta", "gamma")
-
-
-def drive(car: str, number: int, day: date = date(2024, 5, 1)) -> pa.Table:
-    rng = np.random.default_rng([CARS.index(car), number])
-    counts = {name: (values // 8) for name, values in random_counts(rng, 200).items()}
-    return log_rows(f"{car}-{number}", counts, day, vehicle_id=car)
-
-
-def fill(root: Path, *cars: str) -> Warehouse:
-    """A warehouse where some cars drove; files mix them."""
-    shutil.copytree(_filled(cars).name, root, dirs_exist_ok=True)
-    return Warehouse(LocalFolder(root))
-
-
-@cache
-def _filled(cars: tuple[str, ...]) -> TemporaryDirectory[str]:
-    folder = TemporaryDirectory()
-    warehouse = Warehouse(LocalFolder(Path(folder.name)))
-    for number in range(3):
-        land(warehouse, f"f{number}", *(drive(car, number) for car in cars))
-    update_grams(warehouse)
-    return folder
 
 
 def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:
@@ -73,12 +47,6 @@ def coefficients(warehouse: Warehouse) -> dict[str, Fraction]:
         "intercept": model.intercept,
         **dict(zip(model.signals, model.coefficients, strict=True)),
     }
-
-
-def mentions(root: Path, name: str) -> list[Path]:
-    return [
-        file for file in root.rglob("*") if file.is_file() and name.encode() in file.read_bytes()
-    ]
 
 
 def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_drove(

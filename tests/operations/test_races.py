@@ -36,9 +36,9 @@ from fleet_slip.storage.runs import recording
 from fleet_slip.storage.table import Change, Snapshot, Table
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.warehouse import Warehouse
-from tests.operations.test_forget import CARS, drive, fill, mentions
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, run
+from tests.support.erasure import CARS, drive, fill, mentions
 from tests.support.logs import ask, land, path_of
 from tests.support.measured import SIGNALS, a_mapping, csv_text, good_columns, ingest_file
 

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.receivers import Receiver, ReceiverLog
-from fleet_slip.simulation.sensors import Measurement
+from fleet_slip.simulation.sensors import Measurement, Receiver, ReceiverLog
 from fleet_slip.simulation.simulate import simulate_logs
 from tests.support.catalog import SIGNALS
 

@@ -1,6 +1,5 @@
 """Sensors: noise, counts as a CAN bus has them, and imperfections against closed forms."""
 
-from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
 
@@ -20,15 +19,14 @@ from fleet_slip.simulation.sensors import (
     GaussMarkov,
     Gps,
     LowPass,
-    Measurement,
     Pulses,
-    Recorder,
     Sensors,
     noisy_counts,
 )
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections
 from tests.support.catalog import SIGNALS
+from tests.support.measurements import measure
 
 TICKS = 200_000
 GPS = Gps(rate_hz=10, velocity_std_mps=0.05, time_between_outages_s=60, outage_duration_s=5)
@@ -295,15 +293,6 @@ def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
     pieces = GaussMarkov(3, 10.0, np.random.default_rng(6))
     parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
     np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])
-
-
-def measure(
-    truth: Mapping[str, FloatArray], sensors: Sensors, generator: np.random.Generator
-) -> Measurement:
-    """Measure one drive in one block; see `Recorder`."""
-    recorder = Recorder(SIGNALS, sensors, generator)
-    recorder.record(truth)
-    return recorder.measurement()
 
 
 def quantise(physical: FloatArray, signal: Signal) -> tuple[NDArray[np.int16], int]:

@@ -24,9 +24,9 @@ from fleet_slip.simulation.simulate import DriveLog, simulate_batch, simulate_lo
 from fleet_slip.vehicle.batch import LaneDrive, Road
 from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.simulation.test_sensors import measure
 from tests.support.catalog import SIGNALS
 from tests.support.logs import schema_without
+from tests.support.measurements import measure
 from tests.support.rolling import simulate_drives
 
 SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)

@@ -24,8 +24,8 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
 from fleet_slip.warehouse.warehouse import Warehouse
-from tests.models.acceptance.test_champion_rules import publish_from, write
 from tests.support.catalog import CATALOG
+from tests.support.champions import publish_from, write
 from tests.support.commands import RunCommand
 from tests.support.logs import land, log_rows, path_of, random_counts
 from tests.support.s3_server import Server, forget_clients
