@@ -7,7 +7,7 @@ and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics" (2012), s
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, cast
 
 import duckdb
 import numpy as np
@@ -174,10 +174,7 @@ def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArra
     return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
 
 
-L = TypeVar("L", bound=LabelledDrive)
-
-
-def without_rest(drive: L, car: VehicleParameters) -> L:
+def without_rest(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
     """Drop the labels of rows in which the car rests or creeps.
 
     Raises `MissingSignalError` without wheel speeds.
