@@ -262,6 +262,6 @@ def test_five_drives_are_five_folds(count: FoldCount) -> None:
 
 
 def test_more_folds_than_can_be_fitted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(folding, "MOST_FOLDS", 4)
+    monkeypatch.setattr(folding, "MAX_FOLDS", 4)
     with pytest.raises(DataError, match="the cohort has 5, and at most 4 can be folds"):
         assign_folds(list("abcde"), "drive", EACH)
