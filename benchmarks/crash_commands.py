@@ -20,7 +20,8 @@ SIMULATE = ("simulate", "{campaign}", "--threads", "1")
 INGEST = ("ingest", "{measured}", "--mapping", "{mapping}")
 REPLACE = ("ingest", "{measured}", "--mapping", "{corrected}", "--replace")
 PUBLISH = ("publish", "sideslip")
-WORSE = ("publish", "sideslip", "--order", "ax", "--force")
+LISTS = Path(__file__).parent / "lists"
+WORSE = ("publish", "sideslip", "--force", "--models", str(LISTS / "ax.toml"))
 
 MAPPING = """
 name = "logger"

@@ -178,9 +178,10 @@ def _replace(text: str, pairs: tuple[tuple[str, str], ...]) -> str:
 def fill(root: Path) -> None:
     """Make a small data root with every kind of file, and a day of logs without Gram rows."""
     given = str(campaign(root))
+    models = str(Path(__file__).parent / "lists" / "ay_yaw_rate.toml")
     for step in (
         ("run", "--campaign", given, "--days", "8", "--threads", "1"),
-        ("publish", "smoke", "--order", "ay,yaw_rate", "--force"),
+        ("publish", "smoke", "--force", "--models", models),
         ("forget", "--drive", "smoke-2024-05-01-0000", "--now"),
     ):
         _require_done(command(root, *step))

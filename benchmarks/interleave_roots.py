@@ -46,8 +46,9 @@ description = "Pressure in a tyre"
 
 """
 
-TRAINING = ("--cohort", "vehicle_model = 'van'", "--group-by", "vehicle")
-PUBLISH = ("publish", "sideslip", *TRAINING, "--order", "ay", "--force")
+LISTS = Path(__file__).parent / "lists"
+TRAINING = ("publish", "sideslip", "--cohort", "vehicle_model = 'van'", "--force", "--models")
+PUBLISH = (*TRAINING, str(LISTS / "ay_by_vehicle.toml"))
 
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "simulate": ("simulate", "{campaign}", "--threads", "1"),
@@ -164,7 +165,7 @@ def _fill(root: Path, inputs: Inputs) -> None:
         ("ingest", known["old"], "--mapping", known["mapping"]),
         ("gram",),
         PUBLISH,
-        ("publish", "sideslip", *TRAINING, "--order", "ax", "--force"),
+        (*TRAINING, str(LISTS / "ax_by_vehicle.toml")),
         ("ingest", known["later"], "--mapping", known["mapping"]),
     ):
         ended = Running(root, arguments, inputs.environment()).end()

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from fleet_slip.regression.drives import ClusterUnit
     from fleet_slip.warehouse.warehouse import Warehouse
 
-WINDOW_ROWS = 4_000_000
-"""Maximum number of log rows whose window columns `select` computes: they take seconds."""
-
 
 @dataclass(frozen=True)
 class FleetCohort:
@@ -158,25 +155,16 @@ class FleetCohort:
 
     def run_request(self, request: "SelectionRequest") -> "Selection":
         """Select as `select` does, with the options of a request."""
-        from fleet_slip.grams.update import ensure_grams
-        from fleet_slip.models.line import with_line_fitted
-        from fleet_slip.models.request import DEFAULT_MODELS
-        from fleet_slip.models.select import SelectionPlan, run_selection
+        from fleet_slip.models.request import SelectionPlan
+        from fleet_slip.models.select import run_plan
+        from fleet_slip.models.stacking import ensure_rows
 
-        examined = self.examine()
-        with examined.explaining():
-            request = with_line_fitted(self.warehouse, request, self.predicate, examined.cohort)
-            plan = SelectionPlan.of(self.warehouse.catalog, request)
-            if plan.request.models == DEFAULT_MODELS:
-                ensure_grams(
-                    self.warehouse,
-                    plan.feature_set,
-                    examined.cohort,
-                    reason=f"model list {DEFAULT_MODELS} needs them",
-                    max_rows=WINDOW_ROWS,
-                )
-            selection = run_selection(self.warehouse, request, examined.cohort)
-        return replace(selection, examined=str(examined))
+        plan = SelectionPlan.of(self.warehouse.catalog, request)
+        screen = self.examine()
+        with screen.explaining():
+            plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)
+            selection = run_plan(self.warehouse, plan, screen.cohort)
+        return replace(selection, examined=str(screen))
 
     def diagnose(
         self,

@@ -1,5 +1,6 @@
 """Commands that choose a model: select, publish, diagnose."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -35,6 +36,7 @@ from fleet_slip.cli.options import (
 )
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
 from fleet_slip.storage.runs import step
+from fleet_slip.storage.storage_errors import storage_errors
 
 
 def select(
@@ -59,6 +61,14 @@ def select(
     max_features: MaxFeatures = None,
     half_life: HalfLife = None,
     prior: Prior = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="LIST.toml",
+            help="Write what was compared as a model list, for publish --models.",
+            show_default=False,
+        ),
+    ] = None,
     everything: All = False,
     json: Json = False,
 ) -> None:
@@ -71,6 +81,8 @@ def select(
     Choose among many columns: fleet-slip select --features windows --search exchange
 
     Search all subsets: fleet-slip select --all-subsets --criterion cv
+
+    Keep the choice: fleet-slip select --order ay,yaw_rate --save own.toml
     """
     selection = (
         fleet_of(context)
@@ -97,6 +109,11 @@ def select(
         )
     )
     print_answer(selection, json, everything=everything)
+    if save is not None:
+        with storage_errors(save):
+            save.write_text(selection.as_model_list().as_toml(), encoding="utf-8")
+        if not json:
+            say(f"written to {save}. Publish it: fleet-slip publish NAME --models {save}")
 
 
 @recorded
@@ -113,21 +130,8 @@ def publish(
     ] = None,
     include_faulty: IncludeFaulty = False,
     models: ModelList = None,
-    model: OneModel = None,
-    order: Order = None,
-    features: Features = None,
     label: Label = None,
-    group_by: GroupBy = None,
-    folds: Folds = None,
-    ranking: Ranking = None,
-    criterion: Criterion = None,
-    tolerance: Tolerance = None,
-    all_subsets: AllSubsets = False,
     robust: Robust = False,
-    cluster: ClusterUnit = None,
-    intercept: Intercept = True,
-    search: Search = None,
-    max_features: MaxFeatures = None,
     half_life: HalfLife = None,
     prior: Prior = None,
     force: Annotated[
@@ -144,13 +148,12 @@ def publish(
         str | None,
         typer.Option(help="URI of an MLflow server to register the version in, too."),
     ] = None,
-    everything: All = False,
     json: Json = False,
 ) -> None:
-    """Select on a cohort and publish the winner as the next version of a model, its champion.
+    """Select from a model list and publish the winner as a model's next version, its champion.
 
     A model that exists is trained again with the options of its champion; options that are given
-    replace them.
+    replace them. Explore with select; its --save writes a list for --models.
 
     Try it first: fleet-slip publish waterford --dry-run
 
@@ -162,28 +165,11 @@ def publish(
 
     fleet = fleet_of(context)
     request = SelectionRequest(
-        models=models,
-        model=model,
-        order=order,
-        features=features,
-        label=label,
-        group_by=group_by,
-        folds=folds,
-        ranking=ranking,
-        criterion=criterion,
-        tolerance=tolerance,
-        all_subsets=all_subsets,
-        robust=robust,
-        cluster=cluster,
-        intercept=intercept,
-        search=search,
-        max_features=max_features,
-        half_life=half_life,
-        prior=prior,
+        models=models, label=label, robust=robust, half_life=half_life, prior=prior
     )
     recipe = recipe_for(fleet.models.registry, require_model_name(name), request, cohort)
-    if recipe.told:
-        say(f"{name}: {recipe.told}")
+    if recipe.explanation:
+        say(f"{name}: {recipe.explanation}")
     drives = fleet.cohort(recipe.cohort, include_faulty=include_faulty)
     with step("select"):
         selection = drives.run_request(recipe.request)
@@ -196,7 +182,7 @@ def publish(
             say(selection.examined)
         print_json(answer)
     else:
-        print_parts(selection.parts(everything))
+        print_parts(selection.parts())
         print_parts(answer.parts())
     if mlflow and isinstance(answer, Publication):
         number = fleet.models.log_to_mlflow(answer.version, mlflow)

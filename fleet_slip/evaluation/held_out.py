@@ -26,8 +26,8 @@ from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
-from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import Selection, SelectionPlan
+from fleet_slip.models.request import SelectionPlan, SelectionRequest
+from fleet_slip.models.select import Selection, select_models
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -206,7 +206,7 @@ class Learner:
         cohort = cohort.filter(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
         if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
             plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
-        return plan.choose(replace(cohort, prior=prior) if prior else cohort)
+        return select_models(replace(cohort, prior=prior) if prior else cohort, plan)
 
     def train(self, held_out: Segments, prior: Cohort | None = None) -> tuple[list[str], Predictor]:
         """Train without held-out segments; return the chosen columns and the model."""

@@ -52,12 +52,12 @@ from fleet_slip.export.c import StepWriter, helper_texts, keep_lines, start_line
 from fleet_slip.export.program import Input, Steps
 from fleet_slip.export.templating import field_names, fill_template
 from fleet_slip.grams.on_board import (
-    MAX_COLUMNS,
     MAX_SIGNALS,
+    MOST_COLUMNS,
     ROWS_IN_A_SUM,
     OnboardFeatureSet,
     Range,
-    max_gram_rows,
+    most_rows,
     onboard_feature_sets,
 )
 from fleet_slip.models.manifest import Manifest
@@ -121,7 +121,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     counted = counted_set.get(catalog.identity(name))
     if counted is None:
         raise RefusedError(
-            f"cars cannot count the feature set {name}: it has more than {MAX_COLUMNS} columns. "
+            f"cars cannot count the feature set {name}: it has more than {MOST_COLUMNS} columns. "
             "Export without them: fleet-slip export NAME --to c"
         )
     calibrated = catalog.calibrated
@@ -225,7 +225,7 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
         "numbers": sum(numbers),
         "max_vehicle": MAX_VEHICLE_BYTES,
         "max_message": max(
-            HEADER_BYTES + MAX_COLUMNS // 8 * (i > 0) + 8 * size + CHECKSUM_BYTES
+            HEADER_BYTES + MOST_COLUMNS // 8 * (i > 0) + 8 * size + CHECKSUM_BYTES
             for i, size in enumerate(sizes)
         ),
         "header_bytes": HEADER_BYTES,
@@ -253,7 +253,7 @@ def _counted(
             f"{count}U",
             f"{first_block}U",
             f"{first_number}U",
-            f"{max_gram_rows(on_board.ranges)}U",
+            f"{most_rows(on_board.ranges)}U",
             f"0x{on_board.counted.definition:016X}ULL",
             "true" if on_board.complete else "false",
         ]
@@ -303,5 +303,5 @@ def _words_of_changes(
         "min_delay": LATE_PARTS * MOST_EARLY,
         "max_delay": LATE_PARTS * MOST_LATE,
         "delay_ms": f"{1000 * float(SAMPLE_TIME_S) / LATE_PARTS:g}",
-        "columns_bytes": MAX_COLUMNS // 8,
+        "columns_bytes": MOST_COLUMNS // 8,
     }

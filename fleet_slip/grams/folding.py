@@ -77,8 +77,8 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
         raise DataError(
             "cross-validation needs at least two folds, and the cohort is one drive, or one trip: "
             f"drives of a car less than {LONGEST_PAUSE_S // 60} minutes apart. Add logs, or hold "
-            "out parts of the time: fleet-slip gram --features blocks, then fleet-slip publish "
-            "NAME --features blocks --group-by part"
+            "out parts of the time: fleet-slip gram --features blocks, then fleet-slip select "
+            "--features blocks --group-by part --save LIST.toml"
         )
     if count == EACH:
         if (number := len(set(values))) > MAX_FOLDS:

@@ -28,8 +28,14 @@ from fleet_slip.models.manifest import (
     checksum_of_drives,
 )
 from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
-from fleet_slip.models.request import LOGGED_MODELS, SelectionRequest, load_model_list
-from fleet_slip.models.select import GIVEN, Selection, checksum_of_list
+from fleet_slip.models.request import (
+    GIVEN,
+    LOGGED_MODELS,
+    SelectionRequest,
+    checksum_of_list,
+    load_model_list,
+)
+from fleet_slip.models.select import Selection
 from fleet_slip.models.training_checks import (
     require_in_time,
     require_sound_course,
@@ -62,52 +68,54 @@ _STORED_NAMES = {
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is asked for, of which drives, and in words whose it is and what is new in it."""
+    """How to retrain a model: selection options, cohort, and an explanation for the log."""
 
     request: SelectionRequest
     cohort: str
-    told: str = ""
+    explanation: str = ""
 
 
-def asked_of(selection: Selection) -> dict[str, Any] | None:
-    """Return what a manifest keeps of what was asked for; None if its list says it all."""
-    asked = _asked(selection.request)
-    fell_back = not asked and selection.model_list == LOGGED_MODELS
-    if asked.keys() <= {"models"} and not fell_back:  # which is no choice: usual again next time
+def stored_options(selection: Selection) -> dict[str, Any] | None:
+    """Return the options that a manifest stores; None if the name of its list is enough."""
+    options = _options(selection.request)
+    fell_back = not options and selection.model_list == LOGGED_MODELS
+    if options.keys() <= {"models"} and not fell_back:  # else the default list next time
         return None
-    stored = {_STORED_NAMES.get(name, name): value for name, value in asked.items()}
-    whole = selection.asked_condition == selection.cohort.predicate.text
-    return stored if whole else {**stored, COHORT: selection.asked_condition}
+    stored = {_STORED_NAMES.get(name, name): value for name, value in options.items()}
+    is_screened = selection.asked_condition != selection.cohort.predicate.text
+    return {**stored, COHORT: selection.asked_condition} if is_screened else stored
 
 
 def recipe_for(
     registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
 ) -> Recipe:
-    """Return how to train a model as before, but for what is asked. Raises `QuestionError`."""
-    before = _newest(registry, name)
-    asked = _asked(request)
-    if before is None:
+    """Return how to train a model as before, but for given options. Raises `QuestionError`."""
+    version = _newest(registry, name)
+    options = _options(request)
+    if version is None:
         return Recipe(request, cohort or TRAINING_DRIVES)
-    chosen_from = before.manifest.selected_by.model_list
-    was = with_all_drives(before.manifest.trained_on.cohort)
-    if asked.keys() & _MODEL_OPTIONS:
-        wanted = request
-        told = f"not as {before.reference}, chosen from {chosen_from}"
+    model_list = version.manifest.selected_by.model_list
+    if options.keys() & _MODEL_OPTIONS:
+        old_cohort = with_all_drives(version.manifest.trained_on.cohort)
+        explanation = f"not as {version.reference}, chosen from {model_list}"
     else:
-        kept, was = recipe_of(before)
-        wanted = replace(kept, **asked)
-        told = f"trained as {before.reference}, chosen from {chosen_from}"
-    if cohort is None or cohort == was:
-        return Recipe(wanted, was, f"{told}, on drives where {was}")
-    return Recipe(wanted, cohort, f"{told}, but not on drives where {was}: this is where {cohort}")
+        old_request, old_cohort = recipe_of(version)
+        request = replace(old_request, **options)
+        explanation = f"trained as {version.reference}, chosen from {model_list}"
+    if cohort is None or cohort == old_cohort:
+        return Recipe(request, old_cohort, f"{explanation}, on drives where {old_cohort}")
+    explanation += f", but on drives where {cohort} instead of {old_cohort}"
+    return Recipe(request, cohort, explanation)
 
 
-def _asked(request: SelectionRequest) -> dict[str, Any]:
-    usual = asdict(SelectionRequest())
-    return {name: value for name, value in asdict(request).items() if value != usual[name]}
+def _options(request: SelectionRequest) -> dict[str, Any]:
+    """Return the options of a request that differ from the default."""
+    default = asdict(SelectionRequest())
+    return {name: value for name, value in asdict(request).items() if value != default[name]}
 
 
 def _newest(registry: Registry, name: str) -> ModelVersion | None:
+    """Return the champion of a model, else its newest version, else None."""
     if name not in registry.names():
         return None
     numbers = registry.versions(name)
@@ -240,7 +248,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             model=winner.name,
             reason=selection.winner.reason,
             config_sha256=selection.config_sha256,
-            asked=asked_of(selection),
+            asked=stored_options(selection),
         ),
         package_version=package_version("fleet-slip"),
         prior=_prior_of(selection),

@@ -1,9 +1,10 @@
 """How to select: the one definition of what `FleetCohort.select` and `fleet-slip select` take."""
 
+import json
 import math
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
@@ -14,7 +15,6 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from typing_extensions import Doc
 
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.catalog import Catalog
@@ -22,11 +22,10 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config, refuse_renamed
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.folding import Folding, FoldKey
+from fleet_slip.grams.folding import PARTS, Folding, FoldKey, make_folding
 from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
 from fleet_slip.regression.drives import ClusterUnit
-from fleet_slip.regression.orders import METHODS, RANKINGS
-from fleet_slip.regression.subsets import CRITERIA
+from fleet_slip.regression.orders import METHODS
 
 if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
@@ -45,125 +44,31 @@ COURSE_MODELS = COURSE_FEATURES = "course"
 
 DEFAULT_MAX_FEATURES = 24
 
-TOLERANCE = Doc(
-    "Smallest gain that justifies another signal: an angle such as 0.025deg, the root of the "
-    "difference of the mean squared errors, in which the label's noise cancels; or a share of the "
-    "RMSE, such as 2%. Among the models that are worse than the best by less than this, or by at "
-    "most one standard error of the difference, the one with the fewest signals wins. Default: "
-    "0.025deg, or the rule of the list."
-)
-
-CLUSTER = Doc(
-    "Unit of independent evidence: vehicle, since drives of a car share its biases and tyres, or "
-    "drive. Default: vehicle where there are several, else drive."
-)
-
 _TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """Options of a selection; the default compares the default model list."""
+    """Options of a selection, as `FleetCohort.select` explains them."""
 
-    models: Annotated[
-        str | None,
-        Doc(
-            f"Model list of configs/models, or a TOML file. Default: {DEFAULT_MODELS}, or "
-            f"{LOGGED_MODELS} with `features` or without its Gram rows, unless `order` or an "
-            "option that searches is given."
-        ),
-    ] = None
-    model: Annotated[
-        str | None,
-        Doc("Inputs of a single model, separated by commas, instead of a list."),
-    ] = None
-    order: Annotated[
-        str | None,
-        Doc(
-            "Compare the nested models of an order of signals, separated by commas; 'catalogue' is "
-            "all inputs in the order of configs/signals.toml. A family of windows or gates stands "
-            "for its columns."
-        ),
-    ] = None
-    features: Annotated[
-        str | None,
-        Doc(
-            "Feature set of configs/features.toml, computed before with: fleet-slip gram "
-            "--features NAME. Default: the list's, else the logged signals."
-        ),
-    ] = None
-    label: Annotated[
-        Label | None,
-        Doc(
-            "course: learn from changes of the course over ground, without a reference sensor. "
-            "The default feature set and model list are then those called course."
-        ),
-    ] = None
-    group_by: Annotated[
-        FoldKey | None,
-        Doc("Column that defines the folds. Default: the list's."),
-    ] = None
-    folds: Annotated[
-        int | str | None,
-        Doc(
-            "Number of folds, or each: every drive (or value of `group_by`) is a fold. Default: "
-            "the list's."
-        ),
-    ] = None
-    ranking: Annotated[
-        str | None,
-        Doc(f"Rank the inputs of `order` first: {', '.join(RANKINGS)}. Default: declared."),
-    ] = None
-    criterion: Annotated[
-        str | None,
-        Doc(
-            "Criterion for the number of ranked inputs: cv (the smallest model that is negligibly "
-            f"worse than the best; see `tolerance`), {', '.join(CRITERIA)}. Default: cv."
-        ),
-    ] = None
-    tolerance: Annotated[str | None, TOLERANCE] = None
-    all_subsets: Annotated[
-        bool, Doc("Search all subsets of the inputs of `order` instead of nested models.")
-    ] = False
-    robust: Annotated[
-        bool,
-        Doc(
-            "Down-weight outlier drives (error above three times the median). Lists them; see "
-            "diagnose."
-        ),
-    ] = False
-    cluster: Annotated[ClusterUnit | None, CLUSTER] = None
-    intercept: Annotated[
-        bool,
-        Doc(
-            "Fit an intercept. Without it a car that drives straight has no side-slip, and no "
-            "sensor an offset."
-        ),
-    ] = True
-    search: Annotated[
-        str | None,
-        Doc(
-            f"Search among the inputs of `order`, or all: {', '.join(METHODS)}. Every fold repeats "
-            "the search. Adds its models of 1, 2, ... columns."
-        ),
-    ] = None
-    max_features: Annotated[
-        int | None,
-        Doc(f"Maximum number of columns of `search`. Default: {DEFAULT_MAX_FEATURES}."),
-    ] = None
-    half_life: Annotated[
-        int | None,
-        Doc(
-            "Age in days, before the cohort's newest day, at which the weight of a drive is halved."
-        ),
-    ] = None
-    prior: Annotated[
-        str | None,
-        Doc(
-            "Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
-            "training unless held-out drives are worse with them: fleet-slip identify --campaign."
-        ),
-    ] = None
+    models: str | None = None
+    model: str | None = None
+    order: str | None = None
+    features: str | None = None
+    label: Label | None = None
+    group_by: FoldKey | None = None
+    folds: int | str | None = None
+    ranking: str | None = None
+    criterion: str | None = None
+    tolerance: str | None = None
+    all_subsets: bool = False
+    robust: bool = False
+    cluster: ClusterUnit | None = None
+    intercept: bool = True
+    search: str | None = None
+    max_features: int | None = None
+    half_life: int | None = None
+    prior: str | None = None
 
     @property
     def is_ordered(self) -> bool:
@@ -337,33 +242,47 @@ class Search(Config):
 
 
 class ModelList(Config):
-    """Candidates in their declared order, the feature set and the folds to compare them on.
+    """Candidate models, their feature set, and the folds to compare them on.
 
-    `label` may stand for a reference sensor. What each `search` finds joins, and the rule of the
-    first decides. A file is validated with the `Catalog` as context.
+    A `label` replaces the reference sensor. The models of each `search` join, and the rule of the
+    first search chooses unless there is a `tolerance`. A file is validated with the `Catalog` as
+    context.
     """
 
     description: str = Field(min_length=1)
     label: Label | None = None
     features: Identifier = PLAIN
     line: Annotated[str, Field(min_length=1)] | None = None
-    """The list that the line is chosen from whose estimate is in the feature set."""
+    """Model list of the first-stage model whose estimate is in the feature set."""
     folds: Folding = Folding()
-    model: tuple[CandidateModel, ...] = Field(min_length=1)
+    tolerance: str | None = None
+    intercept: bool = True
+    model: tuple[CandidateModel, ...] = ()
     search: tuple[Search, ...] = ()
 
     @field_validator("search", mode="before")
     @classmethod
-    def _one_search(cls, search: Any) -> Any:
+    def _as_tuple(cls, search: Any) -> Any:
         return search if isinstance(search, list | tuple) else (search,)
 
     @field_serializer("search")
     def _as_written(self, search: tuple[Search, ...]) -> Any:
-        dumped = [each.as_dict(exclude_defaults=True) for each in search]
-        return dumped[0] if len(dumped) == 1 else dumped  # the checksum of a list with one
+        contents = [each.as_dict(exclude_defaults=True) for each in search]
+        return contents[0] if len(contents) == 1 else contents  # the checksum of one search
+
+    @field_validator("tolerance")
+    @classmethod
+    def _is_tolerance(cls, tolerance: str | None) -> str | None:
+        try:
+            parse_tolerance(tolerance)
+        except UsageError as error:
+            raise ValueError(str(error)) from None
+        return tolerance
 
     @model_validator(mode="after")
     def _names_differ(self) -> "ModelList":
+        if not (self.model or self.search):
+            raise ValueError("there is neither a model nor a search")
         names = [candidate.name for candidate in self.model]
         if len(set(names)) < len(names):
             raise ValueError("two models have the same name")
@@ -386,15 +305,36 @@ class ModelList(Config):
 
     def absent_from(self, inputs: Sequence[str]) -> list[str]:
         """Return the compared or searched columns that are not among the inputs."""
-        named = [name for one in self.model for name in one.signals]
-        named += [name for one in self.search for name in one.inputs or ()]
-        return [name for name in dict.fromkeys(named) if name not in inputs]
+        columns = [name for candidate in self.model for name in candidate.signals]
+        columns += [name for search in self.search for name in search.inputs or ()]
+        return [name for name in dict.fromkeys(columns) if name not in inputs]
 
     @property
     def sha256(self) -> str:
-        """Checksum of what the list says, whatever its layout."""
+        """Checksum of the content, independent of the layout of a file."""
         content = self.model_dump(mode="json", exclude_defaults=True)
         return sha256_of(canonical_json(content))
+
+    def as_toml(self) -> str:
+        """Return the text of a file with this list."""
+        excluded = {"folds", "model", "search"}
+        content = self.model_dump(mode="json", exclude_defaults=True, exclude=excluded)
+        tables = [("[folds]", self.folds.model_dump(mode="json"))]
+        tables += [("[[model]]", candidate.model_dump(mode="json")) for candidate in self.model]
+        tables += [
+            ("[[search]]", search.model_dump(mode="json", exclude_none=True))
+            for search in self.search
+        ]
+        parts = [("", content), *tables]
+        return "\n".join(
+            "".join(f"{line}\n" for line in [*filter(None, [head]), *_toml_lines(table)])
+            for head, table in parts
+        )
+
+
+def _toml_lines(table: Mapping[str, Any]) -> list[str]:
+    """Return keys and values as TOML, which has JSON's texts, numbers and lists."""
+    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
 
 
 def load_model_list(catalog: Catalog, name_or_path: str) -> ModelList:
@@ -457,3 +397,168 @@ def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
     names = list(catalog.families(inputs))
     more = f" and {len(names) - MAX_LISTED_INPUTS} more (fleet-slip features)"
     return ", ".join(names[:MAX_LISTED_INPUTS]) + (more if len(names) > MAX_LISTED_INPUTS else "")
+
+
+# The plan: a request that is validated once.
+
+GIVEN = "given"
+"""Name of a model whose inputs are named by the request."""
+
+
+@dataclass(frozen=True)
+class SelectionPlan:
+    """A validated selection: what is compared, on which feature set and folds.
+
+    Attributes:
+        asked: the request as it was given.
+        request: the request with the name of its model list, and the label of the list.
+        model_list: the list, None for an order or a search of the request.
+        searches: of the request, else of the list.
+        tolerance, intercept: of the request, else of the list.
+    """
+
+    asked: SelectionRequest
+    request: SelectionRequest
+    model_list: ModelList | None
+    searches: tuple[Search, ...]
+    folds: Folding
+    feature_set: str
+    tolerance: str | None
+    intercept: bool
+
+    @classmethod
+    def of(cls, catalog: Catalog, asked: SelectionRequest) -> "SelectionPlan":
+        """Validate a request. Raises `UsageError`, `QuestionError` and `ConfigError`."""
+        asked.check()
+        request = replace(asked, models=asked.models or _default_list(asked))
+        model_list = load_model_list(catalog, request.models) if request.models else None
+        if model_list and model_list.label and not request.label:
+            request = replace(request, label=model_list.label)
+            request.check()
+        if request.model is not None:
+            model_list = _list_of_one(catalog, request)
+        folds = model_list.folds if model_list else Folding()
+        feature_set = _feature_set(catalog, request, model_list)
+        return cls(
+            asked=asked,
+            request=request,
+            model_list=model_list,
+            searches=_searches(catalog, request, model_list, feature_set),
+            folds=make_folding(request.group_by or folds.by, request.folds, folds.count),
+            feature_set=feature_set,
+            tolerance=request.tolerance or (model_list.tolerance if model_list else None),
+            intercept=request.intercept and (model_list is None or model_list.intercept),
+        )
+
+    @property
+    def is_default(self) -> bool:
+        """True if the default model list is compared because the request names none."""
+        return self.asked.models is None and self.request.models == DEFAULT_MODELS
+
+    @property
+    def is_nested(self) -> bool:
+        """True if the nested models of an order are compared as given."""
+        return bool(self.request.order) and not (self.request.is_ordered or self.searches)
+
+    @property
+    def needs_drives(self) -> bool:
+        """True if the Gram rows of single drives are needed, not the sums of folds alone."""
+        request = self.request
+        weighted = request.robust or request.half_life
+        return bool(request.is_ordered or weighted or self.is_nested)
+
+    def with_logged_signals(self, catalog: Catalog) -> "SelectionPlan":
+        """Return the same plan with the list of logged signals."""
+        plan = SelectionPlan.of(catalog, replace(self.asked, models=LOGGED_MODELS))
+        return replace(plan, asked=self.asked)
+
+    def compared_list(self, cohort: "Cohort") -> ModelList:
+        """Return all that is compared as a model list, which makes the same selection again."""
+        model_list = self.model_list
+        candidates = model_list.model if model_list else ()
+        if self.is_nested:
+            candidates += nested_candidates(inputs_of(cohort, self.request.order or WHOLE_SET))
+        has_line = model_list is not None and model_list.line is not None
+        return ModelList(
+            description=model_list.description if model_list else "Models of a selection",
+            label=self.request.label,
+            features=model_list.features if model_list and has_line else cohort.feature_set,
+            line=model_list.line if model_list else None,
+            folds=self.folds,
+            tolerance=self.tolerance,
+            intercept=self.intercept,
+            model=candidates,
+            search=self.searches,
+        )
+
+
+def _default_list(request: SelectionRequest) -> str | None:
+    """Return the name of the list that is compared unless the request names one."""
+    if request.has_inputs:
+        return None
+    if request.label:
+        return COURSE_MODELS
+    return LOGGED_MODELS if request.features or request.group_by == PARTS else DEFAULT_MODELS
+
+
+def _list_of_one(catalog: Catalog, request: SelectionRequest) -> ModelList:
+    """Return a list of the one model whose inputs a request names."""
+    feature_set = request.features or (COURSE_FEATURES if request.label else PLAIN)
+    signals = require_inputs(catalog, (request.model or "").split(","), feature_set)
+    model = CandidateModel(name=GIVEN, signals=signals)
+    return ModelList(description="One model", features=feature_set, model=(model,))
+
+
+def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelList | None) -> str:
+    """Return the feature set of a request. Raises `QuestionError` if it lacks columns."""
+    default = COURSE_FEATURES if request.label else PLAIN
+    name = request.features or (model_list.features if model_list else default)
+    if request.label and not catalog.feature_set(name).change_ticks:
+        names = ", ".join(name for name, entry in catalog.sets.items() if entry.change_s)
+        raise QuestionError(
+            f"the feature set {name} has no changes of the course. Feature sets that have: {names}."
+        )
+    inputs = catalog.feature_set(name).inputs
+    if model_list and (absent := model_list.absent_from(inputs)):
+        raise QuestionError(
+            f"the feature set {name} lacks columns of {request.models}: "
+            f"{name_inputs(catalog, absent)}. Choose another feature set or model list."
+        )
+    return name
+
+
+def _searches(
+    catalog: Catalog, request: SelectionRequest, model_list: ModelList | None, feature_set: str
+) -> tuple[Search, ...]:
+    """Return the search of a request, else those of its list. Raises `QuestionError`."""
+    if not request.search:
+        return model_list.search if model_list else ()
+    if request.search not in METHODS:
+        raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
+    options: dict[str, Any] = {"method": request.search}
+    if request.max_features:
+        options["max_features"] = request.max_features
+    if request.order and request.order != WHOLE_SET:
+        options["inputs"] = require_inputs(catalog, request.order.split(","), feature_set)
+    if request.label:
+        # The noise of the course exceeds the gain of a column: compare correlations.
+        options["rule"] = "best"
+    return (Search.model_validate(options),)
+
+
+def checksum_of_list(model_list: ModelList, tolerance: str | None, intercept: bool = True) -> str:
+    """Return the checksum of a compared list, and of options other than the default."""
+    default = {"label": None, "line": None, "tolerance": None, "intercept": True}
+    compared = model_list.model_copy(update=default).sha256
+    tolerance = tolerance or model_list.tolerance
+    return checksum_with_options(compared, tolerance, intercept and model_list.intercept)
+
+
+def checksum_with_options(compared: str, tolerance: str | None, intercept: bool) -> str:
+    """Return a checksum of what is compared, changed by options other than the default."""
+    options: dict[str, Any] = {}
+    if tolerance is not None:
+        options["worth"] = tolerance
+    if not intercept:
+        options["intercept"] = False
+    return sha256_of(canonical_json({"compared": compared, **options})) if options else compared

@@ -27,10 +27,16 @@ from fleet_slip.regression.choice import (
     select_nested,
 )
 from fleet_slip.regression.figures import ErrorSums
-from fleet_slip.regression.folds import CrossValidation, Procedure, assemble, held_out_errors
+from fleet_slip.regression.folds import (
+    CohortFolds,
+    CrossValidation,
+    Procedure,
+    assemble,
+    held_out_errors,
+)
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
-from fleet_slip.regression.least_squares import Fit, LinearModel, fit
+from fleet_slip.regression.least_squares import Fit, LinearModel, Scales, fit
 from fleet_slip.regression.orders import stepwise_order
 from fleet_slip.regression.subsets import CRITERIA, SizeResult, best_subsets, pick_sizes
 
@@ -166,19 +172,19 @@ class SearchedModels:
 
 
 def search_models(
-    cohort: Cohort,
+    cohort: CohortFolds,
     inputs: Sequence[str],
-    folding: Folding,
+    label: str,
+    scales: Scales,
     search: Search,
     *,
     intercept: bool = True,
 ) -> SearchedModels:
-    """Search among the inputs on the drives that have them all. Raises `DataError`.
+    """Search among the inputs on the rows that have them all. Raises `DataError`.
 
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
-    label = cohort.catalog.signals.label
-    folds = cohort.folds(folding.by, folding.count).complete_cases(inputs, label, sparse=True)
+    folds = cohort.complete_cases(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
         seen = gram if intercept else gram.about_origin()
@@ -193,9 +199,8 @@ def search_models(
     for training, fold in folds.splits():
         for sums, fitted in zip(tests, fits(training), strict=False):
             sums.append(held_out_errors(fitted.model, training, fold))
-    name = search.name or search.method
     models = tuple(
-        assemble(f"{name} {fitted.size}", folds, sums, fitted.model, cohort.catalog.input_scales)
+        assemble(f"{search.title} {fitted.size}", folds, sums, fitted.model, scales)
         for sums, fitted in zip(tests, chosen, strict=True)
         if len(sums) == len(folds.grams)
     )

@@ -1,39 +1,41 @@
-"""Compares candidate models on a cohort by cross-validation and chooses one; no log row is read."""
+"""Model selection: complete cases, candidates, cross-validation, choice. Reads Gram rows only.
+
+The functions stand in the order in which they run.
+"""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import canonical_json, document_of, sha256_of
+from fleet_slip.base import canonical_json, document_of, pluralize, sha256_of
 from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
 from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights
-from fleet_slip.grams.folding import PARTS, Folding, make_folding
+from fleet_slip.grams.folding import PARTS, Folding
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
-    COURSE_FEATURES,
-    COURSE_MODELS,
     DEFAULT_MODELS,
+    GIVEN,
     LOGGED_MODELS,
+    MAX_LISTED_INPUTS,
     WHOLE_SET,
     CandidateModel,
     ModelList,
     Search,
+    SelectionPlan,
     SelectionRequest,
+    checksum_of_list,
+    checksum_with_options,
     inputs_of,
-    load_model_list,
-    name_inputs,
-    nested_candidates,
     parse_tolerance,
-    require_inputs,
     require_odd,
 )
 from fleet_slip.models.search import (
@@ -50,25 +52,13 @@ from fleet_slip.models.summary import summarize
 from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winner
 from fleet_slip.regression.drives import DriveMoments
 from fleet_slip.regression.folds import (
+    CohortFolds,
     CrossValidation,
     cross_validate,
-    cross_validate_inputs,
     least_squares,
 )
-from fleet_slip.regression.orders import METHODS
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.warehouse.warehouse import Warehouse
-
-
-def outlier_drives(served: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
-    """Return the drives that `robust` counts less, the most unusual first."""
-    table = served.table if intercept else served.table.about_origin()
-    weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
-    less = np.flatnonzero(weights.weights < FULL).tolist()
-    names = served.drives["drive_id"].to_pylist()
-    return {
-        names[i]: weights.drive(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))
-    }
 
 
 @dataclass(frozen=True)
@@ -76,13 +66,16 @@ class Selection(Answer):
     """All candidates with their figures, in the order of the list, and the winner.
 
     Attributes:
-        skipped: candidates that the cohort cannot serve, with the reason.
-        choice: how an order or a subset was chosen; None for a list of models.
+        models: figures on the rows that all candidates can use.
+        winner: the winner, fitted to all rows that it can use.
+        skipped: candidates that were not compared, with the reason.
+        choice: choice of an order or a subset; None for a list of models.
         searched: the models of each search, which are among `models`.
-        distances: of an order's nested models from the full and the true one, or why not told.
-        intercept: whether models have one; without it they go through the origin.
-        model_list, config_sha256: what was compared, such as `table1`, and its checksum.
-        weighed: the drives that `robust` counts less than others, the most unusual first.
+        distances: of an order's nested models from the full and the true one, or why unknown.
+        intercept: False if models go through the origin.
+        model_list, config_sha256: name of what was compared, such as `table1`, and its checksum.
+        compared: what was compared, as a model list.
+        weighted: the drives that `robust` down-weights, the most unusual first.
         full: how many times a row of full weight counts.
         without_label: how good the winner is, if changes of the course alone trained it.
         label_noise_deg: of the label, which every error has in it; None where it is not known.
@@ -102,6 +95,7 @@ class Selection(Answer):
     intercept: bool = True
     model_list: str = ""
     config_sha256: str = ""
+    compared: ModelList | None = None
     weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
     full: int = 1
     without_label: CourseLabelQuality | None = None
@@ -130,6 +124,19 @@ class Selection(Answer):
         signals = self.winner.model.signals
         of_search = (s for s in self.searched if signals in [one.signals for one in s.models])
         return next(of_search, None)
+
+    def as_model_list(self) -> ModelList:
+        """Return a model list whose selection on the same data has the same winner."""
+        if self.choice is None and self.compared is not None:
+            return self.compared
+        winner = self.winner.model
+        return ModelList(
+            description=f"Chosen by select: {self.model_list}",
+            features=self.cohort.feature_set,
+            folds=self.folds,
+            intercept=self.intercept,
+            model=(CandidateModel(name=winner.name, signals=winner.signals),),
+        )
 
     @property
     def rows_without(self) -> int:
@@ -194,67 +201,170 @@ class Selection(Answer):
         return document
 
 
+def run_selection(
+    warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
+) -> Selection:
+    """Validate a request and run it. Raises as `SelectionPlan.of` and `run_plan`."""
+    return run_plan(warehouse, SelectionPlan.of(warehouse.catalog, request), predicate)
+
+
+def run_plan(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
+    """Select on the drives of a predicate. Raises as `load_cohort` and `select`.
+
+    Compares the list of logged signals if the default list has no Gram rows.
+    """
+    remark = ""
+    try:
+        cohort = load_training_set(warehouse, plan, predicate)
+    except NotComputedError as error:
+        if not plan.is_default:
+            raise
+        remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
+        plan = plan.with_logged_signals(warehouse.catalog)
+        cohort = load_training_set(warehouse, plan, predicate)
+    selection = select_models(cohort, plan)
+    rmse_deg = selection.winner.model.pooled.rmse_deg
+    read = selection.cohort
+    quality = assess_course_label(warehouse, read.feature_set, read.predicate, rmse_deg)
+    return replace(
+        selection,
+        without_label=quality,
+        label_noise_deg=None if quality else label_noise_deg(warehouse, read),
+        remark=remark,
+        asked_condition=predicate,
+    )
+
+
+def load_training_set(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Cohort:
+    """Read the Gram rows of a plan, of its prior too; the sums of folds alone if they suffice."""
+    folding = None if plan.needs_drives else plan.folds
+    cohort = load_cohort(warehouse, predicate, plan.feature_set, folding)
+    if not plan.request.prior:
+        return cohort
+    from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
+
+    prior = simulate_prior(warehouse.catalog, plan.request.prior, plan.feature_set)
+    return replace(cohort, prior=prior)
+
+
+def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
+    """Weight the drives of a cohort, then compare what a plan names. Raises as `select`."""
+    weighted: dict[str, DownweightedDrive] = {}
+    full = 1
+    if plan.request.half_life:
+        days = cohort.drives["day"].to_pylist()
+        cohort, full = cohort.weighted(age_weights(days, plan.request.half_life)), FULL
+    if plan.request.robust:
+        cohort, weighted = _downweight_outliers(cohort, plan)
+        full *= FULL if weighted else 1
+    if prior := cohort.prior:
+        selection = _select_with_prior(cohort, prior, plan)
+    elif plan.request.is_ordered:
+        selection = _select_order(cohort, plan)
+    else:
+        selection = _select_listed(cohort, plan)
+    if plan.is_nested:
+        inputs = inputs_of(cohort, plan.request.order or WHOLE_SET)
+        distances = try_distances(cohort, inputs, plan.folds, plan.request)
+        selection = replace(selection, distances=distances)
+    return replace(selection, weighted=weighted, full=full, request=plan.asked)
+
+
+def _downweight_outliers(
+    cohort: Cohort, plan: SelectionPlan
+) -> tuple[Cohort, dict[str, DownweightedDrive]]:
+    """Down-weight the drives that are outliers of a model of all compared inputs."""
+    request, model_list = plan.request, plan.model_list
+    inputs = inputs_of(cohort, request.order or WHOLE_SET)
+    if model_list and model_list.model and not (request.order or request.search):
+        signals = {name for candidate in model_list.model for name in candidate.signals}
+        inputs = tuple(name for name in cohort.inputs if name in signals)
+    outliers = outlier_drives(cohort.complete_cases(inputs), intercept=plan.intercept)
+    if not outliers:
+        return cohort, {}
+    parts_of = {name: round(outlier.weight * FULL) for name, outlier in outliers.items()}
+    names = cohort.drives["drive_id"].to_pylist()
+    return cohort.weighted(np.array([parts_of.get(name, FULL) for name in names])), outliers
+
+
+def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
+    """Return the drives that `robust` down-weights, the most unusual first."""
+    table = cases.table if intercept else cases.table.about_origin()
+    weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
+    less = np.flatnonzero(weights.weights < FULL).tolist()
+    names = cases.drives["drive_id"].to_pylist()
+    return {
+        names[i]: weights.drive(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))
+    }
+
+
+def _select_listed(cohort: Cohort, plan: SelectionPlan) -> Selection:
+    """Compare the candidates and searches of a plan."""
+    compared = plan.compared_list(cohort)
+    tolerance = None if plan.tolerance is None else parse_tolerance(plan.tolerance)
+    selection = select(
+        cohort,
+        compared.model,
+        plan.folds,
+        tolerance,
+        compared.search,
+        cohort.inputs if compared.search else (),
+        intercept=plan.intercept,
+    )
+    order = f"order:{plan.request.order}" if plan.is_nested else None
+    name = plan.request.models or (GIVEN if plan.request.model else None)
+    title = "+".join(filter(None, [name, order]))
+    if not title:
+        (search,) = compared.search
+        title = f"search:{search.method} {search.max_features}"
+    checksum = checksum_of_list(compared, plan.tolerance, plan.intercept)
+    return replace(selection, model_list=title, config_sha256=checksum, compared=compared)
+
+
+MAX_LOST_SHARE = Fraction(1, 10)
+"""Maximum share of the drives that a candidate may remove from the comparison of all others."""
+
+
 def select(
     cohort: Cohort,
     candidates: Sequence[CandidateModel],
-    folds: Folding,
+    folding: Folding,
     tolerance: Tolerance | None = None,
     searches: Sequence[Search] = (),
     inputs: Sequence[str] = (),
     *,
     intercept: bool = True,
 ) -> Selection:
-    """Cross-validate each candidate, and what searches find among inputs; choose the winner.
+    """Cross-validate candidates and searches on the rows that all can use, and choose a winner.
 
-    `tolerance` overrides the rule of the first search. Skips candidates with absent or dependent
-    signals, and searches that need more drives. Raises `DataError` if none is left, or no drive has
-    the label.
+    `tolerance` overrides the rule of the first search. Skips, with the reason, candidates with
+    absent or dependent signals, candidates that too few drives have, and searches that need more
+    drives. Raises `DataError` if none is left, or no drive has the label.
     """
-    divided = cohort.folds(folds.by, folds.count)
-    catalog = cohort.catalog
-    label = catalog.signals.label
-    if not any(label in grams[0].signals for grams in divided.tables):
-        raise DataError(
-            f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
-            "log their course, learn from it: fleet-slip select --label course"
-        )
-    models: list[CrossValidation] = []
+    folds = _labelled_folds(cohort, folding)
     skipped: dict[str, str] = {}
-    scales = catalog.input_scales
-    for one in candidates:
-        try:
-            require_odd(catalog, one.signals, cohort.feature_set)
-            models.append(
-                cross_validate_inputs(
-                    one.name, divided, one.signals, label, scales, intercept=intercept
-                )
-            )
-        except (DataError, QuestionError) as error:
-            skipped[one.name] = str(error)
+    candidates = [one for one in candidates if _is_allowed(one, cohort, skipped)]
+    searches_run = [one for one in searches if _has_drives(one, cohort, skipped)]
+    columns = [name for name in inputs if any(one.among([name]) for one in searches_run)]
+    rows = find_complete_cases(folds, cohort.catalog.signals.label, candidates, columns, skipped)
+    models = _cross_validate_candidates(rows, cohort.catalog, skipped, intercept=intercept)
     searched: list[SearchedModels] = []
-    for search in searches:
-        if cohort.drive_count < search.min_drives:
-            few = f"it needs {search.min_drives} drives, and there are {cohort.drive_count}"
-            skipped[f"{search.name or search.method} (search)"] = few
-        elif among := search.among(inputs):
-            most = search.max_features
-            if search.max_features_per_drive and folds.by != PARTS:
-                most = min(most, search.max_features_per_drive * cohort.drive_count)
-            bounded = search.model_copy(update={"max_features": most})
-            try:
-                found = search_models(cohort, among, folds, bounded, intercept=intercept)
-            except DataError as error:  # no drive, or not one in each fold, has all inputs
-                skipped[f"{search.name or search.method} (search)"] = str(error)
-            else:
-                searched.append(found)
-                models += found.models
+    for search in searches_run:
+        bounded = _bounded(search, cohort, folding)
+        if models_of := _cross_validate_search(
+            rows, columns, bounded, cohort.catalog, skipped, intercept=intercept
+        ):
+            searched.append(models_of)
+            models += models_of.models
     if not models:
         reasons = "; ".join(f"model {name}: {reason}" for name, reason in skipped.items())
         raise DataError(f"no candidate model can be fitted: {reasons}")
     winner = choose_by(searches[0] if searches else None, models, tolerance)
+    if winner.model.name in {candidate.name for candidate in rows.candidates}:
+        winner = _refit(winner, folds, rows, cohort.catalog, intercept=intercept)
     return Selection(
         cohort,
-        folds,
+        folding,
         tuple(models),
         winner,
         skipped,
@@ -263,282 +373,238 @@ def select(
     )
 
 
-GIVEN = "given"
-"""The name of a model whose inputs were asked for one by one."""
+def _labelled_folds(cohort: Cohort, folding: Folding) -> CohortFolds:
+    """Divide a cohort into folds. Raises `DataError` if no drive has the label."""
+    folds, label = cohort.folds(folding.by, folding.count), cohort.catalog.signals.label
+    if not folds.tables_with([label]):
+        raise DataError(
+            f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
+            "log their course, learn from it: fleet-slip select --label course"
+        )
+    return folds
 
 
-def run_selection(
-    warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
-) -> Selection:
-    """Select on a predicate's drives, without the columns of the usual list by that of signals.
-
-    Raises `UsageError` for options that do not go together.
-    """
-    catalog, remark = warehouse.catalog, ""
-    plan = SelectionPlan.of(catalog, request)
-    usual = not request.models and plan.request.models == DEFAULT_MODELS
+def _is_allowed(candidate: CandidateModel, cohort: Cohort, skipped: dict[str, str]) -> bool:
+    """Return True if a candidate may be trained on the feature set; else note why not."""
     try:
-        answer = _answer(warehouse, plan, predicate)
-    except NotComputedError as error:
-        if not usual:
-            raise
-        remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
-        plan = SelectionPlan.of(catalog, replace(request, models=LOGGED_MODELS))
-        answer = _answer(warehouse, plan, predicate)
-    cohort, error_deg = answer.cohort, answer.winner.model.pooled.rmse_deg
-    told = assess_course_label(warehouse, cohort.feature_set, cohort.predicate, error_deg)
-    noise_deg = None if told else label_noise_deg(warehouse, answer.cohort)
-    known = replace(answer, without_label=told, label_noise_deg=noise_deg, remark=remark)
-    return replace(known, request=request, asked_condition=predicate)
+        require_odd(cohort.catalog, candidate.signals, cohort.feature_set)
+    except QuestionError as error:
+        skipped[candidate.name] = str(error)
+        return False
+    return True
+
+
+def _has_drives(search: Search, cohort: Cohort, skipped: dict[str, str]) -> bool:
+    """Return True if a cohort has the drives that a search needs; else note why not."""
+    drives = cohort.drive_count
+    if drives >= search.min_drives:
+        return True
+    reason = f"it needs {search.min_drives} drives, and there are {drives}"
+    skipped[f"{search.title} (search)"] = reason
+    return False
 
 
 @dataclass(frozen=True)
-class SelectionPlan:
-    """What a request compares: its list, which `request` names, its folds and its feature set."""
+class ComparedRows:
+    """The rows on which all candidates are compared.
 
-    request: SelectionRequest
-    model_list: ModelList | None
-    folds: Folding
-    feature_set: str
+    Attributes:
+        folds: rows that have the signals of all candidates and all columns.
+        candidates: the comparable candidates, in their order.
+        columns: the comparable columns of searches, in their order.
+    """
 
-    @classmethod
-    def of(cls, catalog: Catalog, request: SelectionRequest) -> "SelectionPlan":
-        """Return what a request asks for. Raises `UsageError` and `QuestionError`."""
-        request.check()
-        by_inputs = request.order or request.is_ordered or request.search
-        if not (request.models or request.model or by_inputs):
-            logged = request.features or request.group_by == PARTS
-            usual = LOGGED_MODELS if logged else DEFAULT_MODELS
-            request = replace(request, models=COURSE_MODELS if request.label else usual)
-        model_list = _given(catalog, request)
-        if request.models:
-            model_list = load_model_list(catalog, request.models)
-        if model_list and model_list.label and not request.label:
-            request = replace(request, label=model_list.label)
-            request.check()
-        listed = model_list.folds if model_list else Folding()
-        folds = make_folding(request.group_by or listed.by, request.folds, listed.count)
-        return cls(request, model_list, folds, _feature_set(catalog, request, model_list))
-
-    def choose(self, cohort: Cohort) -> Selection:
-        """Compare and choose on a cohort, whatever drives it is of. Raises as `select`."""
-        weighted: dict[str, DownweightedDrive] = {}
-        full = 1
-        if self.request.half_life:
-            days = cohort.drives["day"].to_pylist()
-            cohort, full = cohort.weighted(age_weights(days, self.request.half_life)), FULL
-        if self.request.robust:
-            cohort, weighted = _weigh_drives(cohort, self)
-            full *= FULL if weighted else 1
-        if prior := cohort.prior:
-            found = weigh_prior(cohort, prior, self)
-        elif self.request.is_ordered:
-            found = _search(cohort, self.request, self.folds)
-        else:
-            found = _compare_listed(cohort, self.request, self.model_list, self.folds)
-        return replace(found, weighted=weighted, full=full)
+    folds: CohortFolds
+    candidates: tuple[CandidateModel, ...]
+    columns: tuple[str, ...]
 
 
-def _answer(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
-    request, folds = plan.request, plan.folds
-    distances = bool(
-        request.order and not request.is_ordered and not _searches_of(request, plan.model_list)
+def find_complete_cases(
+    folds: CohortFolds,
+    label: str,
+    candidates: Sequence[CandidateModel],
+    columns: Sequence[str],
+    skipped: dict[str, str],
+) -> ComparedRows:
+    """Find the rows that all comparable candidates and columns can use; note the others.
+
+    Candidates, and then columns, join one by one, the most common first, unless fewer drives would
+    have all signals than 1 - `MAX_LOST_SHARE` of the drives of the most common.
+    """
+
+    @cache
+    def count_drives(tables: tuple[int, ...]) -> int:
+        return folds.count_drives(tables) if tables else 0
+
+    def drives_with(signals: Collection[str]) -> int:
+        return count_drives(folds.tables_with([*signals, label]))
+
+    entries = [(candidate.name, frozenset(candidate.signals)) for candidate in candidates]
+    entries += [(name, frozenset([name])) for name in columns]
+    drives = [drives_with(signals) for _, signals in entries]
+    total = max(drives, default=0)
+    order = sorted(range(len(entries)), key=lambda i: (i >= len(candidates), -drives[i]))
+    common: frozenset[str] = frozenset()
+    comparable: set[int] = set()
+    for i in order:
+        name, signals = entries[i]
+        remaining = drives_with(common | signals)
+        if drives[i] and remaining >= total * (1 - MAX_LOST_SHARE):
+            common |= signals
+            comparable.add(i)
+        elif i < len(candidates):
+            skipped[name] = _reason_to_skip(folds, label, signals, total - remaining, total)
+    chosen = sorted(comparable)
+    return ComparedRows(
+        folds.with_signals([*common, label]),
+        tuple(candidates[i] for i in chosen if i < len(candidates)),
+        tuple(entries[i][0] for i in chosen if i >= len(candidates)),
     )
-    of_drives = request.is_ordered or request.robust or request.half_life
-    whole = of_drives or distances  # else the sum of each fold suffices
-    cohort = load_cohort(warehouse, predicate, plan.feature_set, None if whole else folds)
-    if request.prior:
-        from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
-        prior = simulate_prior(warehouse.catalog, request.prior, plan.feature_set)
-        cohort = replace(cohort, prior=prior)
-    answer = plan.choose(cohort)
-    if distances:
-        inputs = inputs_of(answer.cohort, request.order or WHOLE_SET)
-        told = try_distances(answer.cohort, inputs, folds, request)
-        answer = replace(answer, distances=told)
-    return answer
+
+def _reason_to_skip(
+    folds: CohortFolds, label: str, signals: Collection[str], lost: int, total: int
+) -> str:
+    """Return why a candidate is not compared: signals that no drive, or that few drives have."""
+    try:
+        folds.complete_cases(sorted(signals), label, sparse=True)
+    except DataError as error:
+        return str(error)
+    return (
+        f"not comparable: it cannot be evaluated on {lost:,} of {pluralize(total, 'drive')}, which "
+        "lack a signal of it; at most a tenth may be left out"
+    )
+
+
+def _cross_validate_candidates(
+    rows: ComparedRows, catalog: Catalog, skipped: dict[str, str], *, intercept: bool
+) -> list[CrossValidation]:
+    """Cross-validate the candidates; note those with dependent signals."""
+    models = []
+    for candidate in rows.candidates:
+        try:
+            models.append(
+                _cross_validate(candidate.name, candidate.signals, rows.folds, catalog, intercept)
+            )
+        except DataError as error:
+            skipped[candidate.name] = str(error)
+    return models
+
+
+def _cross_validate(
+    name: str, signals: Sequence[str], folds: CohortFolds, catalog: Catalog, intercept: bool
+) -> CrossValidation:
+    """Cross-validate least squares on the rows that have the signals. Raises `DataError`."""
+    label = catalog.signals.label
+    complete = folds.complete_cases(signals, label, sparse=True)
+    procedure = least_squares(signals, label, intercept=intercept)
+    return cross_validate(name, complete, procedure, catalog.input_scales)
+
+
+def _bounded(search: Search, cohort: Cohort, folding: Folding) -> Search:
+    """Return a search with at most the columns that it may take for so many drives."""
+    if not search.max_features_per_drive or folding.by == PARTS:
+        return search
+    limit = search.max_features_per_drive * cohort.drive_count
+    return search.model_copy(update={"max_features": min(search.max_features, limit)})
+
+
+def _cross_validate_search(
+    rows: ComparedRows,
+    columns: Sequence[str],
+    search: Search,
+    catalog: Catalog,
+    skipped: dict[str, str],
+    *,
+    intercept: bool,
+) -> SearchedModels | None:
+    """Search among the comparable columns; note the others, and why a search has no model."""
+    among = search.among(rows.columns)
+    if rare := [name for name in search.among(columns) if name not in among]:
+        few, more = rare[:MAX_LISTED_INPUTS], len(rare) - MAX_LISTED_INPUTS
+        skipped[f"{search.title} (columns)"] = (
+            f"not comparable: more than a tenth of the drives lack {', '.join(few)}"
+            + (f" and {more} more" if more > 0 else "")
+        )
+    if not among:
+        return None
+    label, scales = catalog.signals.label, catalog.input_scales
+    try:
+        return search_models(rows.folds, among, label, scales, search, intercept=intercept)
+    except DataError as error:  # no drive, or not one in each fold, has all inputs
+        skipped[f"{search.title} (search)"] = str(error)
+        return None
+
+
+def _refit(
+    winner: Winner, folds: CohortFolds, rows: ComparedRows, catalog: Catalog, *, intercept: bool
+) -> Winner:
+    """Fit a winner to all rows that have its signals, where these are more than the compared."""
+    signals = winner.model.signals
+    if len(folds.tables_with([*signals, catalog.signals.label])) == len(rows.folds.tables):
+        return winner
+    model = _cross_validate(winner.model.name, signals, folds, catalog, intercept)
+    return replace(winner, model=model)
 
 
 PRIOR_SHARE = Fraction(1, 8)
 """Weight of all rows of a prior together, where those of the cohort have 1 (docs/measured.md)."""
 
 
-def weigh_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection:
-    """Fit the columns of a list's first search to the cohort and its prior, or choose without it.
+def _select_with_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection:
+    """Fit all inputs with the prior (no search: the prior regularises), or select without it.
 
-    With a prior nothing is searched for: simulated drives tell what real ones leave open, so all
-    columns can stay. Held-out drives are driven as the others are, and flatter what is chosen on
-    few of them: of n drives the choice without the prior must be better by more than 1/n.
+    Keeps the prior unless the cross-validated RMSE without it is lower by more than a factor
+    1 + 1/n, for n drives: held-out drives are like the training drives, and flatter a selection.
     """
-    alone = replace(cohort, prior=None)
-    first = _compare_listed(alone, plan.request, plan.model_list, plan.folds)
-    winner, label = first.winner.model, cohort.catalog.signals.label
-    searches = _searches_of(plan.request, plan.model_list)
-    named = next((one.inputs for one in searches if one.inputs), ())
-    signals = tuple(name for name in named if name in cohort.inputs) or winner.signals
+    selection = _select_listed(replace(cohort, prior=None), plan)
+    alone = selection.winner.model
+    searched = next((search.inputs for search in plan.searches if search.inputs), ())
+    signals = tuple(name for name in searched if name in cohort.inputs) or alone.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
     weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighted.folds(plan.folds.by, plan.folds.count).complete_cases(
-        signals, label, sparse=True
-    )
-    choose = least_squares(signals, label, intercept=plan.request.intercept)
-    joined = cross_validate("prior", folds, choose, cohort.catalog.input_scales)
-    told = (
+    folds = weighted.folds(plan.folds.by, plan.folds.count)
+    joined = _cross_validate("prior", signals, folds, cohort.catalog, plan.intercept)
+    figures = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
-        f"the weight {weighted.weight}, {winner.pooled.rmse_deg:.4f} deg without."
+        f"the weight {weighted.weight}, {alone.pooled.rmse_deg:.4f} deg without."
     )
-    models = (*first.models, joined)
-    if joined.pooled.rmse > winner.pooled.rmse * (1 + 1 / cohort.drive_count):
-        reason = f"{first.winner.reason} The prior is not used. {told}"
-        chosen = replace(first.winner, reason=reason)
-        unused = replace(cohort, weight=Fraction(0))
-        return replace(first, cohort=unused, models=models, winner=chosen)
-    reason = f"The prior stays. {told}"
-    chosen = replace(first.winner, model=joined, reason=reason)
-    return replace(first, cohort=weighted, models=models, winner=chosen)
-
-
-def _weigh_drives(
-    cohort: Cohort, plan: SelectionPlan
-) -> tuple[Cohort, dict[str, DownweightedDrive]]:
-    """Return a cohort whose lost drives count less, by a model of all compared inputs."""
-    request, model_list = plan.request, plan.model_list
-    inputs = inputs_of(cohort, request.order or WHOLE_SET)
-    if model_list and model_list.model and not (request.order or request.search):
-        listed = {name for one in model_list.model for name in one.signals}
-        inputs = tuple(name for name in cohort.inputs if name in listed)
-    lost = outlier_drives(cohort.complete_cases(inputs), intercept=request.intercept)
-    if not lost:
-        return cohort, {}
-    of_drive = {name: round(one.weight * FULL) for name, one in lost.items()}
-    parts = np.array([of_drive.get(name, FULL) for name in cohort.drives["drive_id"].to_pylist()])
-    return cohort.weighted(parts), lost
-
-
-def _given(catalog: Catalog, request: SelectionRequest) -> ModelList | None:
-    if request.model is None:
-        return None
-    feature_set = request.features or (COURSE_FEATURES if request.label else PLAIN)
-    signals = require_inputs(catalog, request.model.split(","), feature_set)
-    model = CandidateModel(name=GIVEN, signals=signals)
-    return ModelList(description="One model", features=feature_set, model=(model,))
-
-
-def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelList | None) -> str:
-    usual = COURSE_FEATURES if request.label else PLAIN
-    named = request.features or (model_list.features if model_list else usual)
-    if request.label and not catalog.feature_set(named).change_ticks:
-        names = ", ".join(name for name, entry in catalog.sets.items() if entry.change_s)
-        raise QuestionError(
-            f"the feature set {named} has no changes of the course. Feature sets that have: "
-            f"{names}."
-        )
-    inputs = catalog.feature_set(named).inputs
-    if model_list and (absent := model_list.absent_from(inputs)):
-        raise QuestionError(
-            f"the feature set {named} lacks columns of {request.models}: "
-            f"{name_inputs(catalog, absent)}. Take another one, or another list of models."
-        )
-    return named
-
-
-def _compare_listed(
-    cohort: Cohort,
-    request: SelectionRequest,
-    model_list: ModelList | None,
-    folds: Folding,
-) -> Selection:
-    listed = model_list.model if model_list else ()
-    searches = _searches_of(request, model_list)
-    tolerance = None if request.tolerance is None else parse_tolerance(request.tolerance)
-    inputs = inputs_of(cohort, request.order or WHOLE_SET) if searches else ()
-    nested = (
-        nested_candidates(inputs_of(cohort, request.order))
-        if request.order and not searches
-        else ()
-    )
-    candidates = (*listed, *nested)
-    if candidates:
-        described = ModelList(
-            description=model_list.description if model_list else "Nested models of an order",
-            features=cohort.feature_set,
-            folds=folds,
-            model=candidates,
-            search=searches,
-        )
-        name = request.models or (GIVEN if request.model else None)
-        label = "+".join(filter(None, [name, f"order:{request.order}" if nested else None]))
-        compared = described.sha256
+    if joined.pooled.rmse > alone.pooled.rmse * (1 + 1 / cohort.drive_count):
+        cohort = replace(cohort, weight=Fraction(0))
+        reason = f"{selection.winner.reason} The prior is not used. {figures}"
+        winner = replace(selection.winner, reason=reason)
     else:
-        (search,) = searches
-        content = {
-            "inputs": list(inputs),
-            **search.as_dict(include={"method", "max_features", "rule"}),
-        }
-        label = f"search:{search.method} {search.max_features}"
-        compared = sha256_of(canonical_json(content))
-    found = select(
-        cohort, candidates, folds, tolerance, searches, inputs, intercept=request.intercept
-    )
-    checksum = _checksum(compared, request.tolerance, request.intercept)
-    return replace(found, model_list=label, config_sha256=checksum)
+        cohort, reason = weighted, f"The prior stays. {figures}"
+        winner = replace(selection.winner, model=joined, reason=reason)
+    return replace(selection, cohort=cohort, models=(*selection.models, joined), winner=winner)
 
 
-def checksum_of_list(model_list: ModelList, tolerance: str | None) -> str | None:
-    """Return the `config_sha256` of a selection from a list, None for one that only searches."""
-    return _checksum(model_list.sha256, tolerance, True) if model_list.model else None
-
-
-def _checksum(compared: str, tolerance: str | None, intercept: bool) -> str:
-    """Return the checksum of what is compared, and of what else is asked for and not usual."""
-    unusual: dict[str, Any] = {}
-    if tolerance is not None:
-        unusual["worth"] = tolerance
-    if not intercept:
-        unusual["intercept"] = False
-    return sha256_of(canonical_json({"compared": compared, **unusual})) if unusual else compared
-
-
-def _searches_of(request: SelectionRequest, model_list: ModelList | None) -> tuple[Search, ...]:
-    if request.search:
-        if request.search not in METHODS:
-            raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
-        options: dict[str, Any] = {"method": request.search}
-        if request.max_features:
-            options["max_features"] = request.max_features
-        if request.label:
-            # The noise of the course exceeds the gain of a column: compare correlations.
-            options["rule"] = "best"
-        return (Search.model_validate(options),)
-    return model_list.search if model_list else ()
-
-
-def _search(cohort: Cohort, request: SelectionRequest, folds: Folding) -> Selection:
-    nested = request.order or WHOLE_SET
-    inputs = inputs_of(cohort, nested)
-    criterion = require_criterion(request.criterion or "cv")
+def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
+    """Rank the inputs of an order, or search all their subsets, and choose a size."""
+    request = plan.request
+    order = request.order or WHOLE_SET
+    inputs = inputs_of(cohort, order)
     ranking = ALL_SUBSETS if request.all_subsets else request.ranking or "declared"
-    rule = Rule(ranking, criterion, parse_tolerance(request.tolerance))
-    found = select_inputs(cohort, inputs, folds, rule, request)
+    criterion = require_criterion(request.criterion or "cv")
+    rule = Rule(ranking, criterion, parse_tolerance(plan.tolerance))
+    result = select_inputs(cohort, inputs, plan.folds, rule, request)
     described = ModelList(
         description="Inputs to choose from",
         features=cohort.feature_set,
-        folds=folds,
+        folds=plan.folds,
         model=(CandidateModel(name="inputs", signals=inputs),),
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
-    content |= {"evidence": found.choice.evidence.kind}
+    content |= {"evidence": result.choice.evidence.kind}
+    compared = sha256_of(canonical_json(content))
     return Selection(
         cohort,
-        folds,
-        found.models,
-        found.winner,
+        plan.folds,
+        result.models,
+        result.winner,
         {},
-        choice=found.choice,
-        intercept=request.intercept,
-        model_list=f"order:{nested} {rule.ranking} {rule.criterion}",
-        config_sha256=_checksum(
-            sha256_of(canonical_json(content)), request.tolerance, request.intercept
-        ),
+        choice=result.choice,
+        intercept=plan.intercept,
+        model_list=f"order:{order} {rule.ranking} {rule.criterion}",
+        config_sha256=checksum_with_options(compared, plan.tolerance, plan.intercept),
     )

@@ -5,7 +5,7 @@ the folds out cannot. Sizes vary by chance; a fold that no drive falls into is l
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
@@ -159,13 +159,27 @@ class CohortFolds:
 
         return cls(assignment.names, grams, count_drives)
 
+    def tables_with(self, signals: Collection[str]) -> tuple[int, ...]:
+        """Return the positions of the tables whose rows have all signals."""
+        needed = set(signals)
+        return tuple(i for i, grams in enumerate(self.tables) if needed.issubset(grams[0].signals))
+
+    def with_signals(self, signals: Collection[str]) -> "CohortFolds":
+        """Return the same folds of the tables whose rows have all signals."""
+        positions = self.tables_with(signals)
+        return replace(
+            self,
+            tables=tuple(self.tables[i] for i in positions),
+            count_drives=lambda tables: self.count_drives([positions[i] for i in tables]),
+        )
+
     def complete_cases(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
         """Return the folds of drives that have the label and all the inputs; `sparse` skips others.
 
         Raises `DataError` if a fold, or all but one, has no such row.
         """
         signals = (*inputs, label)
-        served = [i for i, grams in enumerate(self.tables) if set(signals) <= set(grams[0].signals)]
+        served = self.tables_with(signals)
         if not served:
             available = sorted({name for grams in self.tables for name in grams[0].signals})
             require_signals(available, signals)

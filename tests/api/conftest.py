@@ -8,6 +8,7 @@ import pytest
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from tests.support.commands import done_on
+from tests.support.model_lists import nested, write_list
 from tests.support.once import made_once
 
 FEATURES = "ay,yaw_rate,steering_wheel,speed_squared,curvature,course_rate,ay_signed_square"
@@ -20,7 +21,8 @@ def bent_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         done_on(root, "gram", "--features", "motion")
-        done_on(root, "publish", "bent", "--features", "motion", "--order", FEATURES)
+        own = write_list(root.with_name("bent.toml"), *nested(FEATURES), features="motion")
+        done_on(root, "publish", "bent", "--models", own)
 
     return made_once(tmp_path_factory, "bent", make)
 

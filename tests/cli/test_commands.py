@@ -21,6 +21,7 @@ from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 from tests.support.commands import COMMAND, RunCommand, run_here, run_on
+from tests.support.model_lists import write_list
 
 
 def test_a_second_run_does_nothing(
@@ -139,16 +140,16 @@ def test_python_sees_the_same_views_in_si_units(smoke_root: Path) -> None:
 
 
 def test_publish_show_score_promote_and_roll_back(
-    run_command: RunCommand, smoke_copy: Path
+    run_command: RunCommand, smoke_copy: Path, tmp_path: Path
 ) -> None:
     same = ("publish", "slip", "--models", "table1", "--cohort", "campaign = 'smoke'", "--json")
     made = [run_command(*same).json for _ in range(2)]
     assert [(one["version"], one["new"]) for one in made] == [(1, True), (1, False)]
-    alone = ("--order", "ax")
+    alone = ("--models", write_list(tmp_path / "ax.toml", "ax"))
     worse = run_command("publish", "slip", *alone)
     assert worse.exit_code == 7
     assert "worse than the champion" in worse.stderr
-    other = run_command("publish", "smoke", "--order", "ax")  # its columns are windows
+    other = run_command("publish", "smoke", *alone)  # its columns are windows
     assert other.exit_code == 7
     assert "cannot be compared: these drives lack" in other.stderr
     assert "its feature set is windows" in other.stderr
@@ -281,19 +282,23 @@ def test_the_version_is_told(run_command: RunCommand) -> None:
     assert run_command().exit_code == 2
 
 
-WORSE = ("publish", "smoke", "--features", "windows", "--order", "ax", "--json")
+@pytest.fixture
+def publish_worse(tmp_path: Path) -> tuple[str, ...]:
+    """The command that publishes a model of one signal."""
+    models = write_list(tmp_path / "worse.toml", "ax", features="windows")
+    return ("publish", "smoke", "--models", models, "--json")
 
 
 def test_candidates_wait_are_compared_and_promoted(
-    run_command: RunCommand, smoke_copy: Path
+    run_command: RunCommand, smoke_copy: Path, publish_worse: tuple[str, ...]
 ) -> None:
-    assert run_command(*WORSE).exit_code == 7
-    waiting = run_command(*WORSE, "--candidate").json
+    assert run_command(*publish_worse).exit_code == 7
+    waiting = run_command(*publish_worse, "--candidate").json
     assert (waiting["version"], waiting["candidate"]) == (2, True)
     assert "worse than the champion" in waiting["reason"]
     assert run_command("show", "smoke", "--json").json["version"] == 1
     compared = run_command("diff", "smoke@champion", "smoke@candidate")
-    assert "selected_by.asked.features" in compared.stdout and "sha256" not in compared.stdout
+    assert "selected_by.model_list" in compared.stdout and "sha256" not in compared.stdout
     once = [line.split()[0] for line in compared.stdout.splitlines() if "terms.ay_bias." in line]
     assert once == ["terms.ay_bias.coefficient"], "of a term of one alone"
     assert "8 made both, 0 only smoke@1, 0 only smoke@2" in compared.stderr
@@ -308,17 +313,18 @@ def test_candidates_wait_are_compared_and_promoted(
 
 
 def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
-    run_command: RunCommand, smoke_copy: Path
+    run_command: RunCommand, smoke_copy: Path, publish_worse: tuple[str, ...], tmp_path: Path
 ) -> None:
-    assert run_command(*WORSE, "--force").exit_code == 0
+    two = write_list(tmp_path / "two.toml", "ay,yaw_rate")
+    assert run_command(*publish_worse, "--force").exit_code == 0
     for hold in (["pin", "smoke"], ["rollback", "smoke"]):
         assert run_command(*hold).exit_code == 0
         before = run_command("show", "smoke", "--json").json["version"]
-        night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
+        night = run_command("publish", "smoke", "--models", two, "--force", "--json")
         assert night.json["candidate"]
         assert run_command("show", "smoke", "--json").json["version"] == before
     assert run_command("unpin", "smoke").exit_code == 0
-    night = run_command("publish", "smoke", "--order", "ay,yaw_rate", "--force", "--json")
+    night = run_command("publish", "smoke", "--models", two, "--force", "--json")
     assert not night.json["candidate"]
 
 

@@ -18,6 +18,7 @@ from tests.support.cars import TICKS, counts, drive
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, done_on
 from tests.support.logs import ask, land, log_rows
+from tests.support.model_lists import write_list
 from tests.support.once import made_once
 
 
@@ -100,8 +101,11 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
 ) -> None:
     nested = ("--order", "ay,steer_fl,curvature,speed_squared")
     arguments = ("--features", "motion", *nested, "--ranking", "declared", "--criterion", "cp")
-    done = run_command("publish", "curved", *arguments, "--json", root=own_set)
+    own = str(own_set.with_name("curved.toml"))
+    done = run_command("select", *arguments, "--save", own, "--json", root=own_set)
     assert done.exit_code == 0, done.stderr
+    published = ("publish", "curved", "--models", own, "--json")
+    assert run_command(*published, root=own_set).json["new"]
     shown = run_command("show", "curved", "--json", root=own_set).json
     terms = {term["signal"]: term for term in shown["terms"]}
     assert terms["curvature"]["sql"] == CATALOG.features["curvature"].sql
@@ -122,8 +126,7 @@ def test_a_published_model_with_features_explains_and_evaluates_them(
     weights = np.array([term["coefficient"] for term in terms.values()])
     error = matrix[:, :-1] @ (scales * weights) + shown["intercept"] - matrix[:, -1] * 1e-4
     assert score["rmse_deg"] == pytest.approx(math.degrees(math.sqrt(np.mean(error**2))), rel=1e-9)
-    again = run_command("publish", "curved", *arguments, "--json", root=own_set).json
-    assert not again["new"]
+    assert not run_command(*published, root=own_set).json["new"]
 
 
 def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, more_sets: Path) -> None:
@@ -145,8 +148,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
 @pytest.mark.parametrize(
     "words",
     [
-        *(f"{command} --folds 1001" for command in ("select", "publish m")),
-        *(f"select --folds {folds}" for folds in ("1", "-3", "few")),
+        *(f"select --folds {folds}" for folds in ("1001", "1", "-3", "few")),
     ],
 )
 def test_a_number_of_folds_that_cannot_be_is_named(
@@ -216,10 +218,12 @@ def test_a_model_through_the_origin_is_published_as_one(
     root = own_set
     chosen = ("--model", "ay,yaw_rate,steering_wheel")
     usual = run_command("select", *chosen, "--json", root=root).json
-    selected = run_command("select", *chosen, "--no-intercept", "--json", root=root).json
+    own = str(tmp_path / "origin.toml")
+    origin = ("--no-intercept", "--save", own, "--json")
+    selected = run_command("select", *chosen, *origin, root=root).json
     assert (usual["intercept"], selected["intercept"]) == (True, False)
     assert usual["models"][0]["intercept"] != 0 == selected["models"][0]["intercept"]
-    run_command("publish", "straight", *chosen, "--no-intercept", root=root)
+    run_command("publish", "straight", "--models", own, root=root)
     shown = run_command("show", "straight", "--json", root=root).json
     assert shown["through_origin"] is True
     assert shown["intercept"] == 0
@@ -264,7 +268,7 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
 def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
     run_command: RunCommand, root_to_fail_in: Path
 ) -> None:
-    asked = ("publish", "none", "--features", "gated", "--model", "beta")
+    asked = ("select", "--features", "gated", "--model", "beta")
     refused = run_command(*asked, root=root_to_fail_in)
     assert "beta is not an input" in refused.stderr
     assert " ay_mean," in refused.stderr
@@ -287,7 +291,9 @@ def test_single_drives_have_errors_by_rows_with_a_warning(
     assert "take drives for independent" in by_cars.stderr
 
 
-def test_rows_that_tell_nothing_are_told(run_command: RunCommand, warehouse: Warehouse) -> None:
+def test_rows_that_tell_nothing_are_told(
+    run_command: RunCommand, warehouse: Warehouse, tmp_path: Path
+) -> None:
     rng = np.random.default_rng(7)
     known = [counts(drive(rng, gentleness=2)) for _ in range(30)]
     for one in known[24:]:
@@ -299,7 +305,8 @@ def test_rows_that_tell_nothing_are_told(run_command: RunCommand, warehouse: War
     chosen = run_command("select", *asked)
     assert told in chosen.stderr, chosen.stderr
     assert run_command("select", *asked, "--json").json["rows_without"] == 6 * TICKS
-    assert run_command("publish", "beta", *asked, "--force").exit_code == 0
+    own = write_list(tmp_path / "own.toml", "ay,yaw_rate")
+    assert run_command("publish", "beta", "--models", own, "--force").exit_code == 0
     cohort = ("--cohort", "true")
     assert told in run_command("score", "beta", *cohort).stderr
     assert run_command("score", "beta", *cohort, "--json").json["rows_without"] == 6 * TICKS

@@ -68,14 +68,15 @@ def root(smoke_root: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(smoke_root, tmp_path / "data", ignore=without))
 
 
-def test_querying_and_selecting_need_the_core_alone(root: Path) -> None:
+def test_querying_and_selecting_need_the_core_alone(root: Path, tmp_path: Path) -> None:
+    own = str(tmp_path / "own.toml")
     at = ["--root", str(root)]
     asked = [
         [*at, "sql", "SELECT count(*) FROM log"],
         [*at, "gram"],
         [*at, "select", "--models", "table1"],
-        [*at, "select", "--all-subsets", "--order", "ay,yaw_rate,ax"],
-        [*at, "publish", "core", "--order", "ay,yaw_rate,ax,steer_fl"],
+        [*at, "select", "--all-subsets", "--order", "ay,yaw_rate,ax", "--save", own],
+        [*at, "publish", "core", "--models", own],
         [*at, "show", "core"],
         [*at, "score", "core"],
         [*at, "quality"],

@@ -20,6 +20,7 @@ PLAIN = "ay_mean_16, curvature_mean_8, steering_mean_16, rear_ay_mean_16, course
 LIST = """\
 description = "With gates and without"
 features = "gated"
+tolerance = "0.0001deg"
 [folds]
 by = "drive"
 count = 2
@@ -47,7 +48,7 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path, models: Pat
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
         update_grams(Warehouse(LocalFolder(root)), feature_set="gated")
-        answer(root, "publish", "roads", "--models", str(models), "--tolerance", "0.0001deg")
+        answer(root, "publish", "roads", "--models", str(models))
 
     return made_once(tmp_path_factory, "gated_model", make)
 

@@ -17,8 +17,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.drive_weights import age_weights
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
-from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.select import SelectionPlan
+from fleet_slip.models.request import SelectionPlan, SelectionRequest, load_model_list
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -30,6 +29,7 @@ from tests.support.commands import RunCommand, done_on, run_on
 from tests.support.counts import gram_of
 from tests.support.logs import land, log_rows
 from tests.support.measured import ingest_own
+from tests.support.model_lists import nested, write_list
 from tests.support.reported import answer
 
 INPUTS = "ax,ay,yaw_rate"
@@ -92,8 +92,11 @@ def test_a_prior_is_weighed_exactly_and_has_an_intercept_of_its_own(
     assert prior.rows > 1000 and found.cohort.drive_count == 6
 
 
-def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) -> None:
-    made = done_on(own, "publish", "with", "--model", INPUTS, "--prior", few, "--force")
+def test_a_version_names_its_prior_and_is_trained_so_again(
+    own: Path, few: str, tmp_path: Path
+) -> None:
+    models = write_list(tmp_path / "own.toml", INPUTS)
+    made = done_on(own, "publish", "with", "--models", models, "--prior", few, "--force")
     fleet = fleet_slip.open(own)
     manifest = fleet.models.get("with").manifest
     assert manifest.prior is not None
@@ -105,7 +108,8 @@ def test_a_version_names_its_prior_and_is_trained_so_again(own: Path, few: str) 
     again = answer(own, "publish", "with")
     assert not again["new"], "it is trained as it was, to the same bits"
     half = ("--half-life", "30", "--force")
-    done_on(own, "publish", "with", "--model", "ay,yaw_rate", *half)
+    two = write_list(tmp_path / "two.toml", "ay,yaw_rate")
+    done_on(own, "publish", "with", "--models", two, *half)
     facts = answer(own, "diff", "with@1", "with@2")["facts"]
     assert facts["prior.campaign"] == {"one": "few", "other": None}
     assert facts["selected_by.asked.half_life"]["other"] == 30
@@ -179,7 +183,8 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     few_drives = campaign.model_copy(update={"number_of_days": 1, "drives_per_day": 2})
     prior = simulate_prior(CATALOG, few_drives, "signals")
     monkeypatch.setattr("fleet_slip.models.prior.simulate_prior", lambda *_: prior)
-    done_on(own, "publish", "identified", "--model", INPUTS, "--prior", file, "--force")
+    models = write_list(tmp_path / "list.toml", INPUTS)
+    done_on(own, "publish", "identified", "--models", models, "--prior", file, "--force")
     monkeypatch.setattr(module, "identify", identify)
     monkeypatch.setattr(module, "simulate_prior", simulate)
     monkeypatch.setattr(module, "FILTERS", ())
@@ -271,7 +276,7 @@ def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: 
 
 
 def test_the_command_names_it_and_the_version_keeps_how(
-    fleet: Fleet, run_command: RunCommand
+    fleet: Fleet, run_command: RunCommand, tmp_path: Path
 ) -> None:
     told = run_command("select", "--order", TWO, "--robust")
     assert told.exit_code == 0
@@ -282,7 +287,8 @@ def test_the_command_names_it_and_the_version_keeps_how(
     assert list(before_json["drives_weighed"]) == ["d06"]
     document = run_command("select", "--order", TWO, "--robust", "--json").json
     assert document["drives_weighed"]["d06"]["weight"] == 0
-    made = run_command("publish", "safe", "--order", TWO, "--robust", "--force")
+    models = write_list(tmp_path / "own.toml", *nested(TWO))
+    made = run_command("publish", "safe", "--models", models, "--robust", "--force")
     assert made.exit_code == 0, made.stderr
     manifest = fleet.models.get("safe").manifest
     assert manifest.selected_by.asked is not None and manifest.selected_by.asked["robust"]

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import fleet_slip
 from fleet_slip.errors import ConfigError, QuestionError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import SelectedBy
-from fleet_slip.models.publish import asked_of, recipe_for
+from fleet_slip.models.publish import recipe_for, stored_options
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import run_selection
@@ -30,16 +31,9 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     folder = tmp_path_factory.mktemp("recipes") / "data"
     shutil.copytree(smoke_root, folder)
     answer(folder, "publish", "plain", "--cohort", FASTER)
-    options = (
-        "--order",
-        "ax,ay,yaw_rate",
-        "--ranking",
-        "forward",
-        "--folds",
-        "4",
-        "--no-intercept",
-    )
-    answer(folder, "publish", "ranked", "--cohort", FASTER, *options)
+    fleet = fleet_slip.open(folder)
+    options = {"order": "ax,ay,yaw_rate", "ranking": "forward", "folds": 4, "intercept": False}
+    fleet.models.publish("ranked", fleet.cohort(FASTER).select(**options))
     return folder
 
 
@@ -54,19 +48,42 @@ def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
     kept = recipe_for(registry, "ranked", SelectionRequest())
     assert (kept.request.ranking, kept.request.folds, kept.request.intercept) == (
         "forward",
-        "4",
+        4,
         False,
     )
     assert kept.cohort == FASTER
     wider = recipe_for(registry, "ranked", SelectionRequest(folds=3), "true")
     assert (wider.request.ranking, wider.request.folds, wider.cohort) == ("forward", 3, "true")
-    assert FASTER in wider.told
-    assert "ranked@1" in wider.told
+    assert FASTER in wider.explanation
+    assert "ranked@1" in wider.explanation
     other = recipe_for(registry, "ranked", SelectionRequest(models="table1"))
     assert other.request == SelectionRequest(models="table1")
     assert other.cohort == FASTER
     new = recipe_for(registry, "new", SelectionRequest())
-    assert (new.request, new.told) == (SelectionRequest(), "")
+    assert (new.request, new.explanation) == (SelectionRequest(), "")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"models": "table1", "tolerance": "0.0001deg"},
+        {"order": "ax,ay,yaw_rate", "intercept": False},
+        {"order": "ax,ay,yaw_rate", "ranking": "backward", "criterion": "bic"},
+        {"order": "ax,ay,yaw_rate", "all_subsets": True},
+        {"order": "ax,ay,yaw_rate,steer_fl", "search": "forward", "max_features": 3},
+        {"model": "ay,steering_wheel", "group_by": "day", "folds": "each"},
+    ],
+)
+def test_a_saved_list_has_the_winner_of_its_selection(
+    smoke_root: Path, tmp_path: Path, options: dict[str, Any]
+) -> None:
+    cohort = fleet_slip.open(smoke_root).cohort()
+    selection = cohort.select(**options)
+    file = tmp_path / "own.toml"
+    file.write_text(selection.as_model_list().as_toml())
+    again = cohort.select(models=str(file))
+    assert again.winner.model.model == selection.winner.model.model
+    assert again.winner.model.pooled == selection.winner.model.pooled
 
 
 def test_options_of_earlier_versions_are_read_under_their_old_names(tmp_path: Path) -> None:
@@ -132,8 +149,10 @@ def test_without_the_columns_of_the_usual_list_logged_signals_are_compared(tmp_p
     answer = run_selection(warehouse, SelectionRequest(), "true")
     assert answer.model_list == "table1"
     assert "fleet-slip gram --features windows" in answer.remark
-    assert asked_of(answer) == {}  # so that the usual list is asked for again
-    assert asked_of(run_selection(warehouse, SelectionRequest(models="table1"), "true")) is None
+    assert stored_options(answer) == {}  # so that the usual list is asked for again
+    assert (
+        stored_options(run_selection(warehouse, SelectionRequest(models="table1"), "true")) is None
+    )
 
 
 def test_publishing_computes_the_columns_of_the_usual_list(smoke_copy: Path) -> None:

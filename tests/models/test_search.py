@@ -159,7 +159,9 @@ def test_a_tolerance_precedes_the_rule_of_the_list(
     """The default tolerance counts if it is given; the weak signals are 0.0029 deg each."""
     cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
     search = Search(method="exchange", max_features=4, rule=rule)
-    models = search_models(cohort, INPUTS, FIVE, search).models
+    models = search_models(
+        cohort.folds("drive", 5), INPUTS, LABEL, CATALOG.input_scales, search
+    ).models
     asked = {
         text: len(choose_by(search, models, parse_tolerance(text)).model.signals)
         for text in (around, "0.025deg", "0.0001deg")
@@ -172,9 +174,17 @@ def test_the_rule_of_one_standard_error_keeps_what_is_real_however_small() -> No
     """The weak signals gain 0.0029 deg each, far more than their noise over folds."""
     cohort = cohort_of(driven(1, (0.00125, 0.4, 0.9, 0.00125), drives=30, noise=3))
     search = Search(method="exchange", max_features=4, rule="standard error")
-    models = search_models(cohort, INPUTS, FIVE, search).models
+    models = search_models(
+        cohort.folds("drive", 5), INPUTS, LABEL, CATALOG.input_scales, search
+    ).models
     assert len(choose_by(search, models).model.signals) == 4
-    idle = search_models(cohort_of(driven(1, STRONG_FIRST, drives=30)), INPUTS, FIVE, search)
+    idle = search_models(
+        cohort_of(driven(1, STRONG_FIRST, drives=30)).folds("drive", 5),
+        INPUTS,
+        LABEL,
+        CATALOG.input_scales,
+        search,
+    )
     winner = choose_by(search, idle.models)
     assert set(winner.model.signals) == {"ay", "yaw_rate"}
     assert winner.best is winner.model or "one standard error" in winner.reason
@@ -252,6 +262,6 @@ def test_five_drives_are_five_folds(count: FoldCount) -> None:
 
 
 def test_more_folds_than_can_be_fitted_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(folding, "MOST_FOLDS", 4)
+    monkeypatch.setattr(folding, "MAX_FOLDS", 4)
     with pytest.raises(DataError, match="the cohort has 5, and at most 4 can be folds"):
         assign_folds(list("abcde"), "drive", EACH)

@@ -26,6 +26,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.landing import Landing
+from tests.support.model_lists import nested, write_list
 from tests.support.once import made_once
 
 
@@ -150,10 +151,10 @@ def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
 
 
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
-    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch
+    fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    choice = ("--order", "ay,yaw_rate", "--tolerance", "0.0001deg")
-    command = ("publish", "m", *choice, "--dry-run")
+    own = write_list(tmp_path / "own.toml", *nested("ay,yaw_rate"), tolerance="0.0001deg")
+    command = ("publish", "m", "--models", own, "--dry-run")
     cohort = fleet.cohort("day = DATE '2026-10-05'")
     asked = cohort.select(order="ay,yaw_rate", tolerance="0.0001deg")
     for name, bound, told in (

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.commands import done_on
+from tests.support.model_lists import write_list
 from tests.support.once import made_once
 
 HERE = Path(__file__).resolve().parents[2]
@@ -73,7 +74,8 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
         )
         done_on(root, "simulate", few, "--days", "1")
         done_on(root, "gram")
-        done_on(root, "publish", "few", "--order", "ay", "--cohort", "campaign = 'few'", "--force")
+        own = write_list(root.with_name("list.toml"), "ay")
+        done_on(root, "publish", "few", "--models", own, "--cohort", "campaign = 'few'", "--force")
 
     return made_once(tmp_path_factory, "benchmarks", make)
 

@@ -28,6 +28,7 @@ from tests.support.catalog import SIGNALS
 from tests.support.commands import PATIENCE_S, RunCommand, finish, run, start_on
 from tests.support.logs import DAY, log_rows, state
 from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
+from tests.support.model_lists import nested, write_list
 
 pytestmark = pytest.mark.long
 
@@ -288,7 +289,8 @@ def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     assert [code for code, _ in at_once(parallel, *jobs, *jobs, ["gram"], ["gram"])] == [0] * 8
     run_command("gram", root=parallel)
     assert contents(run_command, parallel) == contents(run_command, serial)
-    publishing = ["publish", "m", "--order", "ay,steering_wheel", "--cohort", "campaign = 'smoke'"]
+    own = write_list(tmp_path / "own.toml", *nested("ay,steering_wheel"))
+    publishing = ["publish", "m", "--models", own, "--cohort", "campaign = 'smoke'"]
     for code, text in at_once(parallel, publishing, publishing, publishing):
         assert code == 0, text
     versions = run_command("models", "m", "--json", root=parallel).json

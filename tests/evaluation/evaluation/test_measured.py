@@ -140,7 +140,8 @@ def test_a_model_that_cannot_be_fitted_is_reported_with_the_reason(
         return train(learner, *words)
 
     monkeypatch.setattr(Learner, "train", fail)
-    done = done_on(own, "publish", "three", "--model", "ax,ay,yaw_rate", "--force")
+    fleet = fleet_slip.open(own)
+    fleet.models.publish("three", fleet.cohort().select(model="ax,ay,yaw_rate"), force=True)
     done = done_on(own, "evaluate", "three", "--cohort", "vehicle_id >= 'car-2'")
     assert "three@1: not evaluated: the training drives have no ax." in done.stderr
 
@@ -173,7 +174,7 @@ def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_p
     search: Any = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
     fleet.models.publish("again", fleet.cohort().select(**search), force=True)
     chosen = fleet_slip.open(root).models.get("again").manifest.signals
-    done_on(root, "publish", "once", "--model", ",".join(chosen), "--force")
+    fleet.models.publish("once", fleet.cohort().select(model=",".join(chosen)), force=True)
     found = fleet_slip.open(root).evaluation.evaluate_measured("again", "true", ["once"]).content
     spread_deg = float(np.degrees(np.std(columns["beta"])))
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}

@@ -51,6 +51,7 @@ from tests.support.fuzz.files import MAPPINGS, csv_file, parquet_file
 from tests.support.fuzz.logs import damaged_file
 from tests.support.fuzz.mutate import WORDS, mutate_bytes, mutate_tree, to_json, to_toml
 from tests.support.measured import ingest_file
+from tests.support.model_lists import nested, write_list
 
 Target = Callable[[random.Random, Path], None]
 """Takes the source of all choices, and an empty folder: all that may be written is below it."""
@@ -218,7 +219,8 @@ def _template(temporary: str) -> Path:
         warehouse.logs.snapshot().commit(Change(add=[action], transactions=[transaction]))
     program = "from fleet_slip.cli.main import main; main()"
     command = [sys.executable, "-c", program, "--root", str(root)]
-    for arguments in (["gram"], ["publish", MODEL, "--order", "ax,ay", "--folds", "2", "--force"]):
+    own = write_list(root.with_name("list.toml"), *nested("ax,ay"))
+    for arguments in (["gram"], ["publish", MODEL, "--models", own, "--force"]):
         subprocess.run([*command, *arguments], check=True, capture_output=True)
     return root
 
