@@ -46,7 +46,7 @@ def test_the_same_hash_has_the_same_set(scenarios: tuple[Scenario, ...]) -> None
     assert str(first) == str(again)
 
 
-def test_estimators_see_what_a_log_would_hold_and_the_truth_is_exact() -> None:
+def test_signals_are_quantised_as_in_a_log_and_the_truth_is_exact() -> None:
     scenario = load_scenario("imperfect", SHIPPED_CONFIGS)
     (drive,) = simulate_drives(SIGNALS, [scenario])
     (log,) = simulate_logs(SIGNALS, scenario.batch().drives)
@@ -61,7 +61,7 @@ def test_estimators_see_what_a_log_would_hold_and_the_truth_is_exact() -> None:
     assert len(np.unique(drive.vy_mps)) > 0.99 * len(drive.vy_mps), "no counts"
 
 
-def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
+def test_the_truth_has_no_error_and_zero_has_that_of_the_angle(
     scenarios: tuple[Scenario, ...],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -101,7 +101,7 @@ def test_who_is_right_has_no_error_and_who_says_zero_has_the_angle(
 
 
 @pytest.mark.long
-def test_the_command_judges_and_writes_nothing(evaluated: Path, tmp_path: Path) -> None:
+def test_the_command_evaluates_and_writes_nothing(evaluated: Path, tmp_path: Path) -> None:
     root = shutil.copytree(evaluated, tmp_path / "data")
     before = {path for path in root.rglob("*") if "runs" not in path.parts}
     told = answer(root, "evaluate", "smoke", "--blind")

@@ -59,7 +59,7 @@ def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: An
     assert after.version == before.version
 
 
-def test_an_evaluation_that_another_process_has_just_kept_is_not_kept_twice(
+def test_an_evaluation_of_another_process_is_not_stored_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = DocumentFolder(LocalFolder(tmp_path), "evaluations")
@@ -85,7 +85,7 @@ def test_no_model_is_trained_on_scenarios(root: Path) -> None:
     assert answer(root, "select", "--models", "table1")["drives"] == 8
 
 
-def test_a_cohort_that_does_not_ask_for_test_drives_has_none(root: Path, tmp_path: Path) -> None:
+def test_a_cohort_excludes_test_drives_by_default(root: Path, tmp_path: Path) -> None:
     copy = tmp_path / "data"
     shutil.copytree(root, copy)
     asked = ("--cohort", "speed_factor > 0.1")
@@ -110,7 +110,7 @@ def test_a_changed_scenario_is_refused(root: Path, tmp_path: Path) -> None:
         answer(copy, "evaluate", "smoke", "--scenario", str(file))
 
 
-def test_views_show_test_drives_to_those_who_ask(root: Path) -> None:
+def test_views_contain_test_drives_only_by_source(root: Path) -> None:
     fleet = fleet_slip.open(root)
     count = "SELECT count(*) FROM drives"
     for hidden in (
@@ -156,7 +156,7 @@ def test_stability_is_lost_on_the_slippery_road_alone(again: Any) -> None:
     assert inside["error_std_deg"] > 3 * outside["error_std_deg"]
 
 
-def test_a_missing_signal_costs_the_models_that_need_it(again: Any) -> None:
+def test_a_missing_signal_lowers_the_coverage_of_models_with_it(again: Any) -> None:
     one = next(one for one in again["scenarios"] if one["name"] == "wheel_missing")
     assert one["results"]["smoke@1/1"]["coverage"] == 1
     expected = 60 / one["truth"]["duration_s"]
@@ -192,7 +192,7 @@ def test_a_car_identified_from_the_same_drives_competes(again: Any) -> None:
     assert results["ekf_identified"]["rmse_deg"] < 1.5 * results["ekf_class_tuned"]["rmse_deg"]
 
 
-def test_filters_know_the_mass_where_the_model_does() -> None:
+def test_filters_use_the_mass_if_the_model_does() -> None:
     (drive,) = simulate_drives(SIGNALS, [load_scenario("adhesion_0_4", SHIPPED_CONFIGS)])
     scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
     heavy = replace(drive, scenario=scenario)
@@ -263,7 +263,7 @@ def test_satellite_navigation_does_not_compete() -> None:
     assert found["won"] == 1
 
 
-def test_who_leaves_rows_out_neither_wins_nor_is_close() -> None:
+def test_an_estimator_with_low_coverage_neither_wins_nor_is_close() -> None:
     one = standing(run(ours=(0.1, 11), ekf=0.2))
     assert (one["winner"], one["rmse_deg"], one["ratio"], one["won"]) == ("ekf", None, None, False)
     assert standing(run(ours=(0.1, 10), ekf=0.2))["won"]

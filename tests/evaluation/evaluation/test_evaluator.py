@@ -97,7 +97,7 @@ def by_fold(folds: list[Segments], drive: HeldOutDrive) -> list[float]:
     return [float(value) for value in estimate[:: ROWS // 4]]
 
 
-def test_each_segment_is_estimated_by_the_fit_that_did_not_see_it() -> None:
+def test_each_segment_is_estimated_by_the_fit_without_it() -> None:
     two = [measured("a"), measured("b")]
     assert by_fold(folds_of(two), two[1]) == [0, 1, 2, 3], "quarters"
     three = [*two, measured("c")]

@@ -18,7 +18,7 @@ from fleet_slip.vehicle.tyre import cornering_stiffness
 ALL = np.ones(5, dtype=np.bool_)
 
 
-def test_figures_of_a_known_error() -> None:
+def test_statistics_of_a_given_error() -> None:
     truth = np.radians([0.0, 1.0, 2.0, 3.0, 4.0])
     figures = error_statistics(truth + np.radians([1.0, 1.0, 1.0, 1.0, 2.0]), truth, ALL)
     assert figures.rows == 5
@@ -41,7 +41,7 @@ def test_rows_without_an_estimate_count_for_the_coverage_alone() -> None:
     assert figures.correlation is None
 
 
-def test_an_estimator_without_any_estimate_has_no_figures() -> None:
+def test_an_estimator_without_any_estimate_has_no_statistics() -> None:
     figures = error_statistics(np.full(5, np.nan), np.zeros(5), ALL)
     assert figures.coverage == 0
     assert figures.error_std_deg is None

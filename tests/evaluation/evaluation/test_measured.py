@@ -47,7 +47,7 @@ def drives_of(held_out: Segments) -> list[int]:
     return sorted({int(name.removeprefix("drive-")) for name, _ in held_out})
 
 
-def test_whole_drives_are_left_out_with_all_of_their_trip() -> None:
+def test_whole_drives_are_held_out_with_all_of_their_trip() -> None:
     drives = [a_drive(n, trip=f"trip-{n // 2}") for n in range(6)]
     assert [drives_of(one) for one in folds_of(drives)] == [[0, 1], [2, 3], [4, 5]]
     many = folds_of([a_drive(n) for n in range(20)])
@@ -55,7 +55,7 @@ def test_whole_drives_are_left_out_with_all_of_their_trip() -> None:
     assert len(many) == 8
 
 
-def test_of_few_drives_quarters_of_their_time_are_left_out() -> None:
+def test_quarters_of_few_drives_are_held_out() -> None:
     drives = [a_drive(0), a_drive(1)]
     first, *_ = parts = folds_of(drives)
     assert len(parts) == 4
@@ -63,7 +63,7 @@ def test_of_few_drives_quarters_of_their_time_are_left_out() -> None:
     assert np.isnan(drives[0].without(first).sideslip_rad).sum() == ROWS // 4
 
 
-def test_kinds_of_driving_are_left_out_whole() -> None:
+def test_kinds_of_driving_are_held_out_as_a_whole() -> None:
     drives = [a_drive(n, speed_mps=speed) for n, speed in enumerate((5.0, 20.0, 24.0))]
     found = {kind: drives_of(one) for kind, one in folds_by_kind(drives).items()}
     assert found == {
@@ -73,7 +73,7 @@ def test_kinds_of_driving_are_left_out_whole() -> None:
     assert folds_by_kind(drives[1:]) == {}
 
 
-def test_an_acceleration_that_is_not_logged_is_made_of_the_wheels() -> None:
+def test_a_missing_acceleration_is_derived_from_wheel_speeds() -> None:
     car, still = load_vehicle("d_class_sedan", SHIPPED_CONFIGS), np.zeros(ROWS)
     speed = still + np.linspace(10.0, 18.0, ROWS)  # 2 m/s²
     signals = rolling_drive(car, speed, still, still, still)
@@ -95,7 +95,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
+def test_without_a_vehicle_only_models_are_evaluated(own: Path) -> None:
     four = "vehicle_id <> 'car-0' AND vehicle_id <> 'car-5'"
     told = fleet_slip.open(own).evaluation.evaluate_measured("own", four)
     assert "No filter was evaluated" in str(told)
@@ -110,7 +110,7 @@ def test_drives_without_a_vehicle_are_judged_by_models_alone(own: Path) -> None:
     assert found["estimators"]["own@1"]["worst_drive"] in [one["name"] for one in found["drives"]]
 
 
-def test_a_model_that_saw_none_of_the_drives_is_judged_as_it_is(own: Path) -> None:
+def test_a_model_of_other_drives_is_evaluated_as_published(own: Path) -> None:
     done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
     assert done.json["estimators"]["own@1"]["told"] == "as published"
 
@@ -153,7 +153,7 @@ steer_fr = { column = "right", unit = "rad" }
 """
 
 
-def test_a_choice_that_saw_the_drives_flatters_and_one_made_again_does_not(tmp_path: Path) -> None:
+def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> None:
     generator = np.random.default_rng(2)
     cars, rows = 9, 200
     sizes = {"ax": 1, "ay": 2, "r": 0.1, "steer": 0.3, "left": 0.02, "right": 0.02, "beta": 0.02}
@@ -206,7 +206,7 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
         ("--cohort", "true", "--mass", "1500", "--vehicle", "suv"),
     ],
 )
-def test_what_does_not_go_together_is_refused(own: Path, words: tuple[str, ...]) -> None:
+def test_conflicting_options_are_refused(own: Path, words: tuple[str, ...]) -> None:
     done = run_on(own, "evaluate", "own", *words)
     assert done.exit_code == 2
     assert "leave out" in done.stderr or "not both" in done.stderr

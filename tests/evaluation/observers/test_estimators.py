@@ -89,7 +89,7 @@ def test_an_absent_sensor_is_named(field: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("fields", ["steer_fl_rad", "steer_fr_rad", "gps_vx_mps gps_vy_mps"])
-def test_one_front_wheels_angle_is_enough_and_gps_not_looked_at(fields: str) -> None:
+def test_one_front_wheel_angle_suffices_and_gps_is_not_read(fields: str) -> None:
     drive = slalom(CAR, 500)[0]
     one = replace(drive, **dict.fromkeys(fields.split(), np.full(500, np.nan)))
     found, expected = (ekf.estimate(each, CAR, ekf.EkfNoise()) for each in (one, drive))

@@ -46,7 +46,7 @@ def rmse_deg(estimate: np.ndarray, drive: LabelledDrive) -> float:
     return float(np.degrees(np.sqrt(np.mean((estimate - drive.sideslip_rad) ** 2))))
 
 
-def test_the_start_knows_nothing_but_what_was_measured() -> None:
+def test_the_start_depends_on_measures_alone() -> None:
     stiffer = CAR.with_tyres(stiffness_factor=0.8)
     assert VehicleMeasures.of_vehicle(stiffer) == MEASURED
     body = MEASURED.vehicle().body
@@ -63,7 +63,7 @@ def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
     assert found.held_out_rad is None
 
 
-def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
+def test_identifies_steering_ratio_offset_and_roll_from_a_steering_wheel(
     drive: LabelledDrive, identified: IdentifiedVehicle, executor: Executor
 ) -> None:
     exact, missing = drive.signals, np.full(len(drive.signals), np.nan)
@@ -87,7 +87,7 @@ def test_of_a_car_that_logs_a_steering_wheel_ratio_offset_and_roll_are_found(
     assert "steer_gain" not in {*found.at_bounds, *found.not_identifiable}
 
 
-def test_a_parameter_at_its_bound_and_one_that_drives_do_not_tell_are_said(
+def test_parameters_at_bounds_and_not_identifiable_ones_are_reported(
     drive: LabelledDrive, identified: IdentifiedVehicle, executor: Executor
 ) -> None:
     assert not identified.at_bounds
@@ -98,14 +98,16 @@ def test_a_parameter_at_its_bound_and_one_that_drives_do_not_tell_are_said(
     assert wrong.as_dict()["at_bounds"]
 
 
-def test_one_speed_in_the_place_of_all_wheels_tells_of_no_turn(drive: LabelledDrive) -> None:
+def test_one_speed_for_all_wheels_gives_no_yaw_rate(drive: LabelledDrive) -> None:
     speed = (drive.signals.wheel_rl_rad_s + drive.signals.wheel_rr_rad_s) / 2
     one = replace(drive.signals, wheel_rl_rad_s=speed, wheel_rr_rad_s=speed)
     two = rmse_deg(ekf.estimate(drive.signals, CAR, ekf.EkfNoise()), drive)
     assert rmse_deg(ekf.estimate(one, CAR, ekf.EkfNoise()), drive) < 2 * two
 
 
-def test_what_was_left_out_is_measured_without_it(drive: LabelledDrive, executor: Executor) -> None:
+def test_the_held_out_error_is_that_of_a_fit_without_the_drive(
+    drive: LabelledDrive, executor: Executor
+) -> None:
     drive = drive.beginning(2000)
     wrong = replace(drive, drive_id="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
     found = identify_held_out(MEASURED, [drive, wrong], executor)
@@ -125,7 +127,7 @@ class Recorder(IdentifiedVehicle):
         return np.zeros(len(signals))
 
 
-def test_no_car_is_measured_on_a_drive_that_it_was_identified_from(
+def test_held_out_drives_are_not_training_drives(
     drive: LabelledDrive, executor: Executor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row = drive.beginning(1)
@@ -153,7 +155,7 @@ def test_drives_without_a_label_are_refused(drive: LabelledDrive, executor: Exec
         identify(MEASURED, [unknown], executor)
 
 
-def test_what_a_sensor_says_at_rest_is_no_label(executor: Executor) -> None:
+def test_labels_at_rest_are_ignored(executor: Executor) -> None:
     """Of a car that stood at first, with ±180 deg as a navigation system has it."""
     drive = simulated_drive().beginning(1500)
     stood, wheels = np.arange(1500) < 300, {}
@@ -225,7 +227,9 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
         (ekf.TUNABLE, ekf.EkfNoise()),
     ],
 )
-def test_what_is_tunable_exists_and_is_positive(names: tuple[str, ...], parameters: Config) -> None:
+def test_tunable_parameters_exist_and_are_positive(
+    names: tuple[str, ...], parameters: Config
+) -> None:
     for name in names:
         value: object = parameters
         for part in name.split("."):
@@ -234,7 +238,7 @@ def test_what_is_tunable_exists_and_is_positive(names: tuple[str, ...], paramete
         assert value > 0
 
 
-def test_what_was_found_is_of_these_sources(tmp_path: Path) -> None:
+def test_the_checksum_depends_on_all_modules(tmp_path: Path) -> None:
     (tmp_path / "one.py").write_text("a = 1")
     (tmp_path / "two.py").write_text("b = 2")
     before = checksum_of_sources(tmp_path)

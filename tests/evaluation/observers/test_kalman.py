@@ -164,7 +164,7 @@ def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float)
         assert np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() > 0
 
 
-def test_joseph_keeps_the_variance_that_rounding_would_lose() -> None:
+def test_josephs_form_retains_variances_that_rounding_would_lose() -> None:
     """P (I − K H) of a very precise fix after great uncertainty rounds to zero and below."""
     vague = FilterNoise(gps_vx_std_mps=1e-5, gps_vy_std_mps=1e-5)
     state = independent_state((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))

@@ -61,7 +61,7 @@ def test_bias_is_found_and_noise_reduced() -> None:
     assert error.std() < 0.005, "half of the gyroscope's noise"
 
 
-def test_wheels_of_a_braking_car_are_not_believed() -> None:
+def test_wheel_speeds_are_ignored_in_braking() -> None:
     exact, _ = slalom(CAR, 4000)
     braking = replace(exact, ax_mps2=np.full(4000, -3.0))
     slipping = replace(braking, wheel_rl_rad_s=0.97 * braking.wheel_rl_rad_s)

@@ -78,7 +78,7 @@ def page(reported: Reported) -> Page:
     return Page(reported.page.read_text(encoding="utf-8"))
 
 
-def test_the_page_is_small_and_asks_for_nothing(reported: Reported, page: Page) -> None:
+def test_the_page_is_small_and_makes_no_request(reported: Reported, page: Page) -> None:
     assert reported.page.stat().st_size < 3_000_000
     assert all(source.startswith(("#", "data:")) for source in page.sources)
     text = reported.page.read_text(encoding="utf-8")
@@ -102,7 +102,7 @@ def test_each_figure_is_on_the_page_and_in_two_files(reported: Reported, page: P
     assert page.elements["svg"] == len(svgs)
 
 
-def test_a_scenario_that_was_left_out_is_said(reported: Reported, page: Page) -> None:
+def test_missing_scenarios_are_listed(reported: Reported, page: Page) -> None:
     assert "figure-7" not in page.ids
     assert "melbourne" in reported.page.read_text(encoding="utf-8")
 
@@ -176,7 +176,7 @@ def test_claims_name_scenarios_that_ship(data: ReportData, monkeypatch: pytest.M
     assert untested == [many_vehicles, generally_able], "no fleet, and no drive beyond the paper"
 
 
-def test_every_claim_is_judged(data: ReportData) -> None:
+def test_every_claim_has_a_verdict(data: ReportData) -> None:
     verdicts = evaluate_claims(data)
     assert len(verdicts) == len(CLAIMS) == 27
     assert len({one.claim.statement for one in verdicts}) == len(CLAIMS)
@@ -195,7 +195,7 @@ def test_a_verdict_follows_from_the_figures(data: ReportData) -> None:
     assert "0.100°" in verdict.figure
 
 
-def test_a_claim_without_its_drives_is_not_judged(data: ReportData) -> None:
+def test_a_claim_without_its_drives_is_not_testable(data: ReportData) -> None:
     content = deepcopy(dict(data.evaluated.document.content))
     content["scenarios"] = [one for one in content["scenarios"] if one["name"] == "nominal"]
     verdict = evaluate_claim(noise_is_slight, changed(data, content))
@@ -221,7 +221,7 @@ def test_an_evaluation_of_other_data_is_refused(reported: Reported, data: Report
             call(copy, "report", "smoke")
 
 
-def test_a_model_that_was_not_evaluated_is_told(
+def test_a_report_requires_an_evaluation(
     reported: Reported, run_command: RunCommand, tmp_path: Path
 ) -> None:
     shutil.copytree(reported.root / "models", tmp_path / "data" / "models")
@@ -245,7 +245,7 @@ def test_the_standings_mark_the_smallest_error_of_each_drive(data: ReportData) -
         assert marked == [name for name in names if errors.get(name) == least]
 
 
-def test_a_model_of_measured_drives_says_that_the_test_drives_are_of_other_cars(
+def test_the_page_states_that_the_model_is_of_measured_drives_of_other_cars(
     data: ReportData,
 ) -> None:
     selection = data.trained.selection
@@ -264,7 +264,7 @@ def test_a_model_of_measured_drives_says_that_the_test_drives_are_of_other_cars(
     arrays(np.float64, st.integers(1, 300), elements=st.floats(-10, 10)),
     st.integers(1, 40),
 )
-def test_a_band_holds_every_sample(values: np.ndarray, bins: int) -> None:
+def test_a_band_contains_every_sample(values: np.ndarray, bins: int) -> None:
     x = np.arange(len(values), dtype=np.float64)
     found = band(x, values, bins)
     assert len(found.x) <= bins
@@ -306,7 +306,7 @@ def test_every_cell_works_on_a_root_with_a_model(smoke_root: Path, tmp_path: Pat
 
 
 @pytest.mark.tools("marimo")
-def test_without_a_model_it_says_so(smoke_root: Path, tmp_path: Path) -> None:
+def test_without_a_model_the_notebook_states_it(smoke_root: Path, tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("models", "runs")
     root = shutil.copytree(smoke_root, tmp_path / "data", ignore=ignored)
     code, told, page = executed(root, tmp_path)
@@ -325,7 +325,7 @@ def judged(reported: Reported, tmp_path_factory: pytest.TempPathFactory) -> tupl
 
 
 @pytest.mark.long
-def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
+def test_filters_that_cannot_be_tuned_are_reported_and_compete(
     judged: tuple[Path, Finished],
 ) -> None:
     _, done = judged
@@ -335,7 +335,7 @@ def test_who_cannot_be_tuned_says_so_in_a_line_and_competes(
 
 
 @pytest.mark.long
-def test_the_report_has_what_is_left(judged: tuple[Path, Finished]) -> None:
+def test_the_report_of_a_model_with_few_signals(judged: tuple[Path, Finished]) -> None:
     root, _ = judged
     done_on(root, "evaluate", "own", "--cohort", "source = 'measured'")
     done_on(root, "report", "own")

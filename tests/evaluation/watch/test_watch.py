@@ -68,7 +68,7 @@ def test_a_drive_on_a_track_whose_file_is_gone_is_drawn_by_its_motion(
     assert np.hypot(np.diff(drawn.x_m), np.diff(drawn.y_m)).max() < 3
 
 
-def test_the_page_holds_the_drive_and_asks_for_nothing(frames: DriveFrames) -> None:
+def test_the_page_contains_the_drive_and_makes_no_request(frames: DriveFrames) -> None:
     page = render_watch(frames)
     data = data_of(page)
     assert len(data["t"]) == len(data["beta"]) == len(data["wheels"][0]) == len(frames.time_s)
@@ -91,7 +91,7 @@ def test_hostile_names_and_missing_signals_do_not_break_the_page(frames: DriveFr
     assert set(data_of(page)["estimate"]) == {None}
 
 
-def test_a_part_is_a_part(frames: DriveFrames) -> None:
+def test_part_cuts_all_series(frames: DriveFrames) -> None:
     part = frames.part(5.0, 6.0)
     assert (part.time_s[0], part.time_s[-1]) == (pytest.approx(5.0), pytest.approx(6.0))
     assert len(part.gates) == len(frames.gates)
@@ -101,7 +101,9 @@ def test_a_part_is_a_part(frames: DriveFrames) -> None:
         frames.part(1e6, None)
 
 
-def test_what_cannot_be_shown_is_told(root_to_fail_in: Path, tmp_path: Path) -> None:
+def test_other_suffixes_and_unknown_drives_are_refused(
+    root_to_fail_in: Path, tmp_path: Path
+) -> None:
     fleet = fleet_slip.open(root_to_fail_in)
     with pytest.raises(UsageError, match="shown as a page"):
         fleet.evaluation.watch(DRIVE, "smoke", tmp_path / "film.mp4")
