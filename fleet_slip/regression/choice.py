@@ -34,7 +34,7 @@ from fleet_slip.regression.subsets import best_size, criterion_values
 # A gain must reach a tolerance, which a user sets. The gap is sqrt(MSE - MSE of the best), in which
 # the label's noise cancels: for nested models it is the RMS difference of their estimates. A gain
 # must also exceed its standard error, paired over the same folds, whose difficulty cancels
-# (Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's own figure).
+# (Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's figure).
 #
 # Without folds, the same rows are divided into groups of independent units, cars or drives. With d
 # a group's difference of squared errors and n its rows, the difference of the mean squared errors

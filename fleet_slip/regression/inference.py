@@ -472,8 +472,8 @@ def _variance(full: Fit) -> Fraction:
 # Shrinkage: estimates for the members of a group, each moved towards the group's mean.
 #
 # A member's value is the mean of the group, plus a deviation of variance A, plus an error of known
-# variance V. The estimate of A maximises A times its likelihood, given the residuals: it is never 0,
-# also if values differ no more than their errors. Members are shrunk by B = V / (V + A). Their
+# variance V. The estimate of A maximises A times its likelihood, given the residuals: it is never
+# 0, also if values differ no more than their errors. Members are shrunk by B = V / (V + A). Their
 # standard errors include the uncertainties of A and of the mean:
 # C. N. Morris and R. Tang, "Estimating random effects via adjustment for density maximization",
 # Statistical Science 26 (2011), 271-287.

@@ -299,8 +299,8 @@ def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
 # Relations that hold on average, from sums of products: exact solutions, and influence of drives.
 #
 # A relation is y = theta_1 x_1 + theta_2 x_2 + ... + noise. Multiplied by instruments z and summed
-# up, it gives as many linear equations. Products z x of three columns are often those of two others, as
-# (ay/v)(r v) = ay r, so that Gram rows contain them without a column x.
+# up, it gives as many linear equations. Products z x of three columns are often those of two
+# others, as (ay/v)(r v) = ay r, so that Gram rows contain them without a column x.
 
 ONE = "1"
 """The constant among the terms."""
