@@ -249,7 +249,7 @@ def suggest(
         header = "channel|unit|guess|Hz|least|most|missing"
         row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
         title = f"{file}: {len(channels)} channels"
-        print_parts([TextTable(title, header, channels, row, left=3)])
+        print_parts([TextTable(title, header, channels, row, text_columns=3)])
     if output is not None:
         with storage_errors(output):
             output.write_text(text, encoding="utf-8")
@@ -269,7 +269,7 @@ def list_mappings(context: typer.Context, json: Json = False) -> None:
     if json:
         print_json(files)
     else:
-        print_parts([TextTable("", "mapping|file", files.items(), left=2)])
+        print_parts([TextTable("", "mapping|file", files.items(), text_columns=2)])
 
 
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":

@@ -43,7 +43,7 @@ def models(
     header = "model|aliases|signals|published|correlation|RMSE deg|drives"
     form = "{name}@{version}|{aliases}|{inputs}|{published_at:%Y-%m-%d %H:%M}|"
     form += "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
-    print_parts([TextTable("", header, records, form, left=4)])
+    print_parts([TextTable("", header, records, form, text_columns=4)])
     for row in rows:
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
@@ -51,7 +51,7 @@ def models(
         moves = fleet.models.registry.history(name).moves()
         header = "at|command|alias|version"
         form = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
-        print_parts([TextTable("\nhistory of aliases", header, moves, form, left=3)])
+        print_parts([TextTable("\nhistory of aliases", header, moves, form, text_columns=3)])
 
 
 def show(
@@ -101,7 +101,7 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
         f"sum of coefficient * signal{', through the origin' if origin else ''}"
     )
     properties = {**_properties(version), **({"sha256": version.sha256} if everything else {})}
-    yield TextTable("", "|", properties.items(), left=2)
+    yield TextTable("", "|", properties.items(), text_columns=2)
     form = repr if everything else "{:.6g}".format
     terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
     for term in manifest.terms:
@@ -109,9 +109,9 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
         terms.append([term.column, term.unit, form(term.coefficient), per_count])
     header = "signal|unit|coefficient"
     if not everything:
-        yield TextTable("", header, [row[:3] for row in terms], left=2)
+        yield TextTable("", header, [row[:3] for row in terms], text_columns=2)
         return
-    yield TextTable("", f"{header}|per count", terms, left=2)
+    yield TextTable("", f"{header}|per count", terms, text_columns=2)
     yield "per count: coefficient times scale, for an ECU that works on raw counts"
     if manifest.features:
         yield TextTable(
@@ -119,7 +119,7 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
             "feature|scale|SQL",
             (term for term in manifest.terms if term.sql),
             "{signal}|{scale} {unit}|{sql}",
-            left=3,
+            text_columns=3,
         )
 
 
