@@ -114,13 +114,13 @@ class Workspace:
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
         self._part(Region.TICK, 0, rows)[:] = drive.ticks
-        for number, one in enumerate(code.of_car):
-            known = (
-                one.count(drive.facts[one.name])
-                if isinstance(one, VehicleAttribute)
-                else drive.numbers.get(one.name)
+        for number, car_input in enumerate(code.of_car):
+            value = (
+                car_input.count(drive.facts[car_input.name])
+                if isinstance(car_input, VehicleAttribute)
+                else drive.numbers.get(car_input.name)
             )
-            self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known
+            self._part(Region.OF_CAR, number, 1)[:] = np.nan if value is None else value
         summed = max(len(code.summed), len(code.kinds), 1)
         self._flags = np.zeros((2, summed), dtype=np.bool_)
         self._flags[GAPS] = not drive.whole
@@ -137,9 +137,9 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
         raise DataError(
             "the ticks of a drive do not increase: it has no windows. Run: fleet-slip verify"
         )
-    for one in plan.windows.values():
-        summed = one.over not in {None, "lag"}
-        if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
+    for window in plan.windows.values():
+        summed = window.over not in {None, "lag"}
+        if summed and 2 * (rows + 1) * limit_of(window.of_bits) * window.ratio.numerator >= _EXACT:
             raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     if rows > plan.most_rows:
         raise DataError(f"the drive has {rows:,} rows: too many for windows.")
@@ -153,7 +153,7 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
 
 def compute_columns(plan: ColumnPlan, drive: DriveCounts) -> FloatArray:
     """Return all columns of a drive, (columns, rows), NaN where missing; raises as `blocks`."""
-    found = np.empty((len(plan.names), len(drive.ticks)))
+    columns = np.empty((len(plan.names), len(drive.ticks)))
     for rows, block, _ in Workspace(plan).blocks(drive):
-        found[:, rows] = block
-    return found
+        columns[:, rows] = block
+    return columns
