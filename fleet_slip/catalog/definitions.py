@@ -116,7 +116,7 @@ LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
 """The first digits of a line's checksum."""
 
 
-_LEFT_OUT = Field(exclude_if=lambda one: one is None)
+_LEFT_OUT = Field(exclude_if=lambda value: value is None)
 
 
 class AttributeFactor(Config):
@@ -381,7 +381,7 @@ class Definition(Config):
         return self.model_copy(update={"gate": None})
 
     @property
-    def parts(self) -> tuple["Definition", ...]:
+    def components(self) -> tuple["Definition", ...]:
         """What it is made of, each without a gate: itself, or the gated column and the gate's."""
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
@@ -425,7 +425,7 @@ OPPOSITE = frozenset(
 )
 """Signals of the other sign in the mirror. A front wheel's angle is nearly that of the other."""
 EXCHANGED = {"wheel_fl": "wheel_fr", "wheel_rl": "wheel_rr"}
-EXCHANGED |= {right: left for left, right in EXCHANGED.items()}
+EXCHANGED |= {right_wheel: left_wheel for left_wheel, right_wheel in EXCHANGED.items()}
 """Signals that are those of the other side in the mirror; what is in neither stays."""
 OFFSETS = frozenset({"yaw_rate_offset", "ay_offset", "steering_offset"})
 """Numbers of a car of the other sign in the mirror."""

@@ -128,7 +128,7 @@ class FeatureFile(Config):
         over_time = self._time_columns = _make_time_columns(self, signals)
         columns: dict[str, Feature | TimeColumn] = {**self.features, **over_time}
         taken |= {"day", "tick", "clipped", *BESIDE}
-        names = [*columns, *(one.column for one in columns.values())]
+        names = [*columns, *(column.column for column in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
@@ -137,8 +137,8 @@ class FeatureFile(Config):
                 raise ValueError(f"{name!r} is the set of {purpose}")
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
-            known = {*self.windows, *self.gates, *over_time}
-            unknown += [w for w in one.windows if w not in known or w in self.calibrated]
+            names_of_windows = {*self.windows, *self.gates, *over_time}
+            unknown += [w for w in one.windows if w not in names_of_windows or w in self.calibrated]
             unknown += [c for c in one.calibrated if c not in self.calibrated]
             unknown += [one.of] if one.of and one.of not in self.sets else []
             still = [c for c in one.calibrated if one.change_s and self.calibrated[c].alone]

@@ -368,12 +368,12 @@ class SlopeColumn(MadeColumn):
     equations: tuple[EquationColumns, ...] = Field(min_length=1)
     ridge: tuple[int, ...] = Field(min_length=1)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
         """Return a slope. Raises `ValueError` if a scale of its equations does not fit others."""
         equations, values = [], set()
         for number, equation in enumerate(self.equations, 1):
-            known.columns(*equation.names)
-            columns = known.over_time
+            sources.columns(*equation.names)
+            columns = sources.over_time
             of_y = {columns[name_y].exact_scale for name_y in equation.y}
             if len(of_y) > 1:
                 raise ValueError(f"{', '.join(equation.y)} differ in scale")
@@ -427,9 +427,9 @@ class GateFamily(ColumnFamily):
         knots = range(1, len(self.knots))
         return tuple(f"{column}_{name}_{knot}" for knot in knots for column in self.columns)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
         """Return the columns of each knot."""
-        by, *bases = known.columns(self.of, *self.columns)
+        by, *bases = sources.columns(self.of, *self.columns)
         counts = [round(Fraction(knot) / by.exact_scale) for knot in self.knots]
         members = []
         for knot, peak in enumerate(counts[1:], 1):

@@ -23,7 +23,7 @@ from fleet_slip.catalog.definitions import (
     plain_column,
     rows_behind,
 )
-from fleet_slip.columns.column_sql import CountedColumns, parts_of, rows_of
+from fleet_slip.columns.column_sql import CountedColumns, components_of, rows_of
 from fleet_slip.columns.lowering import (
     GIVEN,
     OPERATIONS,
@@ -125,7 +125,7 @@ class Code:
 
     Attributes:
         signals, of_car: what the program reads of a drive and its car, with their numbers.
-        summed, kept: what is summed up, and what is kept, over a drive.
+        summed, stored: the values that are summed, and stored, over a drive.
         kinds: windows of different lengths in ticks.
     """
 
@@ -133,7 +133,7 @@ class Code:
     signals: dict[str, int] = field(default_factory=dict)
     of_car: dict[VehicleAttribute | ParameterCount, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
-    kept: dict[Value, int] = field(default_factory=dict)
+    stored: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
     _known: dict[VectorOperation, int] = field(default_factory=dict)
 
@@ -150,13 +150,17 @@ class Code:
     def assemble(self, results: Sequence[Value]) -> "BlockProgram":
         """Return the program with results in the first registers."""
         columns: list[int] = []
-        for one in results:
-            if isinstance(one, int) and one not in columns:
-                columns.append(one)
+        for result in results:
+            if isinstance(result, int) and result not in columns:
+                columns.append(result)
             else:
-                columns.append(self._append(VectorOperation(COPY, (one,))))
+                columns.append(self._append(VectorOperation(COPY, (result,))))
         registers = {value: register for register, value in enumerate(columns)}
-        last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
+        last = {
+            read: number
+            for number, operation in enumerate(self.operations)
+            for read in operation.reads
+        }
         count, free = len(registers), list[int]()
         for number, operation in enumerate(self.operations):
             if number not in registers and operation.operation not in {ADD_UP, KEEP}:
@@ -168,9 +172,12 @@ class Code:
             free += [registers[read] for read in ended.difference(columns)]
         places = [
             [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
-            + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
-            + [NOWHERE] * (MOST_READ - len(one.reads))
-            for number, one in enumerate(self.operations)
+            + [
+                (Region.REGISTER, registers[r]) if isinstance(r, int) else r
+                for r in operation.reads
+            ]
+            + [NOWHERE] * (MOST_READ - len(operation.reads))
+            for number, operation in enumerate(self.operations)
         ]
         return BlockProgram(self, np.array(places, dtype=np.int64), count)
 
@@ -202,7 +209,7 @@ class BlockProgram:
             Region.TICK: (1, rows),
             Region.SUM: (len(code.summed), rows + 1),
             Region.COUNT: (len(code.summed), rows + 1),
-            Region.VALUE: (len(code.kept), rows),
+            Region.VALUE: (len(code.stored), rows),
             Region.BEGIN: (len(code.kinds), rows),
         }
         # Whoever reads what is of the car as a block must not read beyond the end.
@@ -296,8 +303,8 @@ class _Writer:
     def _signal_or_car(self, name: str, place: int) -> Value:
         if name == "signal":
             return (Region.SIGNAL, place)
-        known_input = self._of_car[place + (self._facts if name == "number" else 0)]
-        return self._do(BROADCAST, (Region.OF_CAR, _number(self.code.of_car, known_input)))
+        car_input = self._of_car[place + (self._facts if name == "number" else 0)]
+        return self._do(BROADCAST, (Region.OF_CAR, _number(self.code.of_car, car_input)))
 
     def _fused(self, number: int, guard: int | None) -> Value | None:
         """Return what one loop computes of several steps; None if there is no such loop."""
@@ -472,7 +479,7 @@ class _Writer:
     def _ago(self, row: int, ticks: int) -> Value:
         """Write the value so many ticks ago: its window begins there, one tick longer."""
         value = self.value(row)
-        slot, kind = _number(self.code.kept, value), _number(self.code.kinds, ticks + 1)
+        slot, kind = _number(self.code.stored, value), _number(self.code.kinds, ticks + 1)
         history, begins = (Region.VALUE, slot), (Region.BEGIN, kind)
         self._do(KEEP, value, history)
         return self._do(AGO, history, NOWHERE, begins, kind=kind, ticks=ticks)
@@ -482,9 +489,9 @@ class _Writer:
 
 
 _FUSED: Sequence[tuple[Pattern, Callable[[_Writer, int, Found, int | None], Value]]] = [
-    *((one, _Writer._quotient) for one in QUOTIENTS),
-    *((("clip", one, "#limit"), _Writer._scale) for one in SCALED),
-    *((one, _Writer._scale) for one in SCALED if one[1] != "x"),
+    *((pattern, _Writer._quotient) for pattern in QUOTIENTS),
+    *((("clip", pattern, "#limit"), _Writer._scale) for pattern in SCALED),
+    *((pattern, _Writer._scale) for pattern in SCALED if pattern[1] != "x"),
     (("nearest", ("*", "x", "y"), "#fixed"), _Writer._share),
     (ROUNDED, _Writer._round),
 ]
@@ -550,8 +557,12 @@ class ColumnPlan:
     @property
     def facts(self) -> tuple[str, ...]:
         """The drive columns that are needed."""
-        parts = [part for column in self.windows.values() for part in parts_of(column)]
-        return tuple(dict.fromkeys(part.fact.name for part in parts if part.fact))
+        components = [
+            component for column in self.windows.values() for component in components_of(column)
+        ]
+        return tuple(
+            dict.fromkeys(component.fact.name for component in components if component.fact)
+        )
 
     @property
     def numbers(self) -> tuple[str, ...]:

@@ -113,9 +113,9 @@ class SqlLayers:
         steps: Sequence[Step],
         ranges: Sequence[Range],
         table: Mapping[str, str],
-        given: Callable[[str, int], str],
+        input_sql: Callable[[str, int], str],
     ) -> None:
-        self._steps, self._ranges, self._table, self._given = steps, ranges, table, given
+        self._steps, self._ranges, self._table, self._input_sql = steps, ranges, table, input_sql
         self.layers: defaultdict[int, list[str]] = defaultdict(list)
         self._uses = Counter(operand for step in steps for operand in operands_of(step))
         self._texts: dict[int, tuple[str, int]] = {}
@@ -139,7 +139,7 @@ class SqlLayers:
         if name == "constant":
             return sql_constant(plain[0]), 0
         if name in GIVEN:
-            return self._given(name, plain[0]), 0
+            return self._input_sql(name, plain[0]), 0
         operation = OPERATIONS[name]
         operands = plain[: operation.steps]
         inline = name in INLINE
@@ -198,43 +198,43 @@ class CountedColumns:
         """Lower columns over time, and the `rows` that they look back on with others."""
         signals = dict.fromkeys(name for definition in rows.values() for name in definition.signals)
         lowered = _ClippedLast({name: place for place, name in enumerate(signals)})
-        parts = [
-            part
+        components = [
+            component
             for definition in over_time.values()
             if not definition.gate
-            for part in parts_of(definition)
+            for component in components_of(definition)
         ]
         gated = [
-            part
+            component
             for definition in over_time.values()
             if definition.gate
-            for part in parts_of(definition)
+            for component in components_of(definition)
         ]
-        parts += dict.fromkeys(gated)
+        components += dict.fromkeys(gated)
         places = {}
         for name, row in rows.items():  # a row, and all that looks back on it, stand together
             places[name] = lowered.row(row)
-            for part in parts:
-                if part.of == name:
-                    lowered.column(part)
+            for component in components:
+                if component.of == name:
+                    lowered.column(component)
         columns = {name: lowered.column(definition) for name, definition in over_time.items()}
         steps = tuple(lowered.steps)
         ends = {*places.values()}
         times = Counter(places[name] for name, row in rows.items() if row.sql or row.made)
-        for part in parts:
-            times.update(_clips(steps, lowered.column(part), ends))
+        for component in components:
+            times.update(_clips(steps, lowered.column(component), ends))
         ranges = lowered.ranges([LOGGED] * len(signals))
         return cls(lowered, steps, ranges, places | columns, times)
 
 
-def parts_of(column: Definition) -> Iterator[Definition]:
+def components_of(column: Definition) -> Iterator[Definition]:
     """Yield what a column is made of, each without a gate or a number."""
     if column.number is not None:
-        yield from parts_of(column.model_copy(update={"number": None}))
+        yield from components_of(column.model_copy(update={"number": None}))
         if column.number.running is not None:
             yield column.number.running
     else:
-        yield from column.parts
+        yield from column.components
 
 
 def rows_of(

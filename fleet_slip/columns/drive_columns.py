@@ -41,11 +41,11 @@ class DriveCounts:
     numbers: Mapping[str, int] = field(default_factory=dict)
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether no tick between the first and the last is missing."""
         return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
 
-    def part(
+    def segment(
         self, rows: Any, facts: Mapping[str, Any], numbers: Mapping[str, int]
     ) -> "DriveCounts":
         """Return some of the rows, as those of a drive of which that is known."""
@@ -123,7 +123,7 @@ class Workspace:
             self._part(Region.OF_CAR, number, 1)[:] = np.nan if value is None else value
         summed = max(len(code.summed), len(code.kinds), 1)
         self._flags = np.zeros((2, summed), dtype=np.bool_)
-        self._flags[GAPS] = not drive.whole
+        self._flags[GAPS] = not drive.is_complete
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
         begin, stride = self._regions[region]

@@ -106,7 +106,7 @@ OPERATIONS: Mapping[str, Operation] = {
     "negative": Operation(lambda a: (-a[1], -a[0]), 1),
     "abs": Operation(lambda a: (0 if a[0] <= 0 <= a[1] else min(map(abs, a)), max(map(abs, a))), 1),
     "sign": Operation(lambda a: ((a[0] > 0) - (a[0] < 0), (a[1] > 0) - (a[1] < 0)), 1),
-    "clip": Operation(lambda *of: (-of[1][1], of[1][1])),
+    "clip": Operation(lambda _, limit: (-limit[1], limit[1])),
     "power": Operation(_powers),  # of two, the least p with a <= b p
     # What may be missing.
     "at_least": Operation(_first, missing="less"),
@@ -115,7 +115,7 @@ OPERATIONS: Mapping[str, Operation] = {
     # What looks back, on so many ticks.
     "ago": Operation(_first, 1, "given", over_time=True),
     "sum": Operation(_sums, 1, "never", over_time=True),
-    "values": Operation(lambda *of: (0, of[2]), 1, "never", over_time=True),
+    "values": Operation(lambda *operands: (0, operands[2]), 1, "never", over_time=True),
 }
 
 GIVEN = ("signal", "fact", "number")
@@ -158,7 +158,9 @@ def roots_of(steps: Sequence[Step], ranges: Sequence[Range]) -> list[tuple[int, 
         missing, operands = OPERATIONS[operation_of(step)].missing, operands_of(step)
         roots = [root for i in operands for root in result[i]]
         if step[0] == "where":  # a value of now is one of its window's, so that it has values
-            roots = [one for one in roots if one not in _mean_of(steps, operands[0], operands[1])]
+            roots = [
+                root for root in roots if root not in _mean_of(steps, operands[0], operands[1])
+            ]
         if missing == "less" or (missing == "divisor" and ranges[operands[1]][0] <= 0):
             roots.append(number)
         elif missing == "given" or (missing == "both" and all(result[i] for i in operands)):

@@ -132,7 +132,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     with_attribute = [
         name
         for name in over_time
-        if any(part.fact for part in catalog.time_columns[name].definition.parts)
+        if any(part.fact for part in catalog.time_columns[name].definition.components)
     ]
     if with_attribute or len(columns) > MAX_SIGNALS:
         has = with_attribute[0] if with_attribute else pluralize(len(columns), "column")
