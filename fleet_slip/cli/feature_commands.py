@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleet_slip.base import pluralize
-from fleet_slip.cli.options import All, Json, fleet_of
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import print_json, print_parts
 from fleet_slip.rendering import TextTable
 
@@ -23,15 +24,14 @@ def features(
     sql: Annotated[
         str | None,
         typer.Option(
-            help="Print the query over log_counts that computes this feature, window or factor.",
-            show_default=False,
+            help="Print the query over log_counts that computes this feature, window or factor."
         ),
     ] = None,
     files: Annotated[
         bool, typer.Option("--files", help="List the config files in use, and their folders.")
     ] = False,
-    everything: All = False,
-    json: Json = False,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """List the features and feature sets of configs/features.toml.
 

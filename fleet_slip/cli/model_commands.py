@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fleet_slip.base import pluralize
-from fleet_slip.cli.options import Alias, All, Json, Model, ModelName, Version, fleet_of, recorded
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
 from fleet_slip.rendering import Part, TextTable
 
@@ -22,7 +23,7 @@ def models(
         str | None,
         typer.Argument(help="Name of a model: list its versions and the history of its aliases."),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """List the published model versions.
 
@@ -55,7 +56,10 @@ def models(
 
 
 def show(
-    context: typer.Context, model: Model = None, everything: All = False, json: Json = False
+    context: typer.Context,
+    model: opt.Model = None,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """Show one model version: figures, training data and coefficients.
 
@@ -178,8 +182,8 @@ def _label_noise(figures: "CrossValidated") -> str:
 @recorded
 def promote(
     context: typer.Context,
-    reference: Annotated[str, typer.Argument(help="NAME@VERSION.", show_default=False)],
-    alias: Alias = "champion",
+    reference: Annotated[str, typer.Argument(help="NAME@VERSION.")],
+    alias: opt.Alias = "champion",
 ) -> None:
     """Point an alias, by default champion, at a version.
 
@@ -190,7 +194,7 @@ def promote(
 
 
 @recorded
-def rollback(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def rollback(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Point an alias back at its previous version, and pin it there.
 
     Example: fleet-slip rollback waterford
@@ -203,7 +207,7 @@ def rollback(context: typer.Context, model: ModelName, alias: Alias = "champion"
 
 
 @recorded
-def pin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def pin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Keep an alias at its version: publications become candidates, until promote or unpin.
 
     Example: fleet-slip pin waterford
@@ -213,7 +217,7 @@ def pin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> 
 
 
 @recorded
-def unpin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def unpin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Let publications move an alias again.
 
     Example: fleet-slip unpin waterford
@@ -222,7 +226,9 @@ def unpin(context: typer.Context, model: ModelName, alias: Alias = "champion") -
     say(f"{model}@{alias} is version {version.version}; publications may move it")
 
 
-def diff(context: typer.Context, first: Version, second: Version, json: Json = False) -> None:
+def diff(
+    context: typer.Context, first: opt.Version, second: opt.Version, json: opt.Json = False
+) -> None:
     """Compare two versions of a model: data, prior, signals, coefficients, figures.
 
     Example: fleet-slip diff waterford@1 waterford@2
@@ -234,17 +240,16 @@ def export(
     context: typer.Context,
     to: Annotated[
         Literal["json", "c", "sql", "dbc", "onnx", "fmu"],
-        typer.Option(help="Target of the export.", show_default=False),
+        typer.Option(help="Target of the export."),
     ],
-    model: Model = None,
+    model: opt.Model = None,
     output: Annotated[
         Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
     ] = Path(),
     with_gram: Annotated[
-        bool,
-        typer.Option("--with-gram", help="With C: also the code for Gram rows on board."),
+        bool, typer.Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors.
 
