@@ -65,7 +65,7 @@ def document_of(value: Any) -> Any:
 
 
 def _fields_of(record: Any) -> dict[str, Any]:
-    return {one.name: document_of(getattr(record, one.name)) for one in fields(record)}
+    return {field.name: document_of(getattr(record, field.name)) for field in fields(record)}
 
 
 # The one text of JSON content, whatever its order and layout, and the checksum of a text.

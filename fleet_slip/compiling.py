@@ -89,9 +89,9 @@ def code_folder(digest: str) -> Path | None:
         base = Path(chosen or cache_folder("compiled")).resolve()
         folder = base / f"{PREFIX}{digest}"
         new = not folder.is_dir()
-        for one in reversed([folder, *folder.parents]):
-            if not one.is_dir():
-                one.mkdir(0o700, exist_ok=True)
+        for parent in reversed([folder, *folder.parents]):
+            if not parent.is_dir():
+                parent.mkdir(0o700, exist_ok=True)
         _require_own(folder)
     except OSError as error:
         LOGGER.warning(
@@ -114,15 +114,15 @@ def digest_sources(file: Path) -> str:
     That is its own source, those of the modules that it imports, of those that these import, and so
     on, and the compiler.
     """
-    found: set[Path] = set()
+    sources: set[Path] = set()
     waiting = [file]
     while waiting:
-        one = waiting.pop()
-        if one not in found:
-            found.add(one)
-            waiting += _imported(one)
+        module = waiting.pop()
+        if module not in sources:
+            sources.add(module)
+            waiting += _imported(module)
     digest = sha256(f"{numba.__version__} {llvmlite.__version__}".encode())
-    for source in sorted(found):
+    for source in sorted(sources):
         digest.update(sha256(source.read_bytes()).digest())
     return digest.hexdigest()[:32]
 
@@ -130,25 +130,25 @@ def digest_sources(file: Path) -> str:
 @functools.cache
 def _imported(file: Path) -> list[Path]:
     """Return the modules of this package that a file imports; all of one of which it is a part."""
-    found: list[Path] = []
+    sources: list[Path] = []
     for package, name in _IMPORT.findall(file.read_bytes()):
         place = PACKAGE.joinpath(*package.decode().split("."))
         modules = [place.with_suffix(".py"), place / f"{name.decode()}.py"]
-        found += next(([one] for one in modules if one.is_file()), place.rglob("*.py"))
-    return found
+        sources += next(([module] for module in modules if module.is_file()), place.rglob("*.py"))
+    return sources
 
 
 def _require_own(folder: Path) -> None:
     """Raise `OSError` if others can write a folder or put another in its place; if it is full."""
-    for one in (folder, *folder.parents):
-        found = one.stat(follow_symlinks=False)
-        if one == folder:
-            safe = found.st_uid == os.getuid() and not found.st_mode & 0o022
+    for parent in (folder, *folder.parents):
+        status = parent.stat(follow_symlinks=False)
+        if parent == folder:
+            safe = status.st_uid == os.getuid() and not status.st_mode & 0o022
         else:  # where only owners may rename, as in /tmp, this one's folder stays
-            by_others = found.st_mode & 0o022 and not found.st_mode & stat.S_ISVTX
-            safe = found.st_uid in (os.getuid(), 0) and not by_others
+            by_others = status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX
+            safe = status.st_uid in (os.getuid(), 0) and not by_others
         if not safe:
-            raise PermissionError(f"other users can write {one}")
+            raise PermissionError(f"other users can write {parent}")
     space = os.statvfs(folder)
     if space.f_bavail * space.f_frsize < LEAST_FREE_BYTES or not os.access(folder, os.W_OK):
         raise OSError(f"{folder} cannot be written, or its disk is full")
@@ -159,11 +159,11 @@ def _delete_damaged(folder: Path) -> dict[str, str]:
 
     numba renames files without flushing them, and executes what it reads.
     """
-    known = {}
+    checksums = {}
     with suppress(OSError, ValueError):
-        known = dict(json.loads((folder / CHECKSUMS).read_bytes()))
+        checksums = dict(json.loads((folder / CHECKSUMS).read_bytes()))
     sums = _checksums(folder)
-    for name in sums.keys() - dict(sums.items() & known.items()).keys():
+    for name in sums.keys() - dict(sums.items() & checksums.items()).keys():
         (folder / name).unlink(missing_ok=True)
         del sums[name]
     return sums
@@ -178,8 +178,8 @@ def _write_checksums(folder: Path, before: dict[str, str]) -> None:
 
 
 def _checksums(folder: Path) -> dict[str, str]:
-    found = {}
+    checksums = {}
     for file in folder.glob("*/*.nb[ic]"):
         with suppress(FileNotFoundError):  # of another process
-            found[str(file.relative_to(folder))] = sha256(file.read_bytes()).hexdigest()
-    return found
+            checksums[str(file.relative_to(folder))] = sha256(file.read_bytes()).hexdigest()
+    return checksums

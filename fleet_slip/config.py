@@ -112,8 +112,8 @@ def read_named_file(
             content = stream.read(most_bytes + 1)
     except FileNotFoundError:
         is_link = isinstance(file, Path) and file.is_symlink()
-        what = "a link to a file that does not exist" if is_link else "no such file"
-        raise error(f"{file}: {what}.") from None
+        problem = "a link to a file that does not exist" if is_link else "no such file"
+        raise error(f"{file}: {problem}.") from None
     except (OSError, ValueError) as fault:
         reason = getattr(fault, "strerror", None) or "no file can have this name"
         raise error(f"{file}: cannot be read: {reason}.") from None
@@ -183,8 +183,8 @@ def faults_of(error: ValidationError) -> str:
     wrong: dict[str, list[str]] = {}
     for fault in error.errors(include_input=False, include_url=False):
         reasons = wrong.setdefault(_key_of(fault), [])
-        if (said := _said(fault)) not in reasons:
-            reasons.append(said)
+        if (text_of_fault := _said(fault)) not in reasons:
+            reasons.append(text_of_fault)
     faults = [f"{key and f'{key}: '}{', or '.join(reasons)}" for key, reasons in wrong.items()]
     text = "; ".join(
         fault if len(fault) <= LONGEST_FAULT else fault[:LONGEST_FAULT] + "…"

@@ -25,18 +25,18 @@ _SECRET = re.compile(
 )
 
 
-def hide_passwords(text: str, *, whole: bool = False) -> str:
-    """Return text without users and queries of URLs; with `whole`, a URL goes on to the end."""
+def hide_passwords(text: str, *, to_end: bool = False) -> str:
+    """Return text without users and queries of URLs; with `to_end`, a URL goes on to the end."""
     if "://" not in text:
         return text
-    url = _WHOLE_URL if whole else _URL
+    url = _WHOLE_URL if to_end else _URL
     return _SECRET.sub(rf"\1{HIDDEN}", url.sub(_without_user, text))
 
 
-def _without_user(found: re.Match[str]) -> str:
-    user, at, rest = found[1].rpartition("@")  # a password may have @ and / in it
+def _without_user(match: re.Match[str]) -> str:
+    user, at, host = match[1].rpartition("@")  # a password may have @ and / in it
     secret = at and (":" in user or "/" not in user)
-    return f"://{HIDDEN}@{rest}" if secret else found[0]
+    return f"://{HIDDEN}@{host}" if secret else match[0]
 
 
 def printable(text: str) -> str:

@@ -25,17 +25,17 @@ class Remark(str):
 
 @dataclass(frozen=True)
 class TextTable:
-    """Records, mappings or tuples, of whose fields `row` has formats: `{name}|{rmse_deg:.4f}`.
+    """A table of records, mappings or tuples; `row` formats a record: `{name}|{rmse_deg:.4f}`.
 
-    Without a `row` they are sequences of cells. The first `left` columns are text, the others are
-    numbers. None is an empty cell, and a list is its texts in a row.
+    Without `row`, records are sequences of cells. The first `text_columns` columns are text, the
+    others numbers. None is an empty cell; a list is joined.
     """
 
     title: str
     header: str
     records: Iterable[Any]
     row: str = ""
-    left: int = 1
+    text_columns: int = 1
 
     def text(self, width: int = FILE_WIDTH, *, bold: bool = False) -> str:
         """Return the table, no wider than a terminal; words and numbers are never broken.
@@ -44,19 +44,19 @@ class TextTable:
         becomes a paragraph with a line for each column.
         """
         header = self.header.split("|")
-        rows = [[printable(text) for text in self._cells(one)] for one in self.records]
+        rows = [[printable(text) for text in self._cells(record)] for record in self.records]
         for gap in GAPS:
             if widths := _fit_columns(header, rows, width, gap):
                 break
         else:
             return _paragraphs(header, rows, width)
-        sides = [str.ljust if i < self.left else str.rjust for i in range(len(header))]
+        sides = [str.ljust if i < self.text_columns else str.rjust for i in range(len(header))]
 
         def lines(cells: Sequence[str], *, below: bool = False) -> Iterator[str]:
             wrapped = [_wrap(text, wide) for text, wide in zip(cells, widths, strict=True)]
             high = max(map(len, wrapped))
             if below:
-                wrapped = [[""] * (high - len(one)) + one for one in wrapped]
+                wrapped = [[""] * (high - len(record)) + record for record in wrapped]
             for texts in zip_longest(*wrapped, fillvalue=""):
                 padded = (
                     side(text, wide - _cells_of(text) + len(text))
@@ -67,7 +67,7 @@ class TextTable:
         head = [*lines(header, below=True)] if any(header) else []
         if bold:
             head = [f"\x1b[1m{line}\x1b[0m" for line in head]
-        return "\n".join([*head, *(line for one in rows for line in lines(one))])
+        return "\n".join([*head, *(line for record in rows for line in lines(record))])
 
     def _cells(self, record: Any) -> list[str]:
         if not self.row:
@@ -120,7 +120,7 @@ class Answer(Record):
             [part.title, part.text()] if isinstance(part, TextTable) else [part]
             for part in self.parts()
         )
-        return "\n".join(text for some in texts for text in some if text)
+        return "\n".join(text for block in texts for text in block if text)
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the same."""
@@ -157,13 +157,13 @@ def _fit_columns(
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(_cells_of, cells)) for cells in columns]
     widths = [max((_cells_of(w) for c in cells for w in c.split()), default=0) for cells in columns]
-    left = width - sum(widths) - gap * (len(widths) - 1)
-    if left < 0:
+    free = width - sum(widths) - gap * (len(widths) - 1)
+    if free < 0:
         return None
-    while left and widths != wished:
+    while free and widths != wished:
         wanting = [i for i in range(len(widths)) if widths[i] < wished[i]]
         widths[min(wanting, key=widths.__getitem__)] += 1  # many narrow columns before a wide one
-        left -= 1
+        free -= 1
     return widths
 
 
@@ -174,6 +174,6 @@ def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]], width: int
     for row in rows:
         for name, text in zip(header, row, strict=True):
             first, *more = _wrap(text, max(width - wide - 2, 1)) or [""]
-            lines += [f"{name:<{wide}}  {first}", *(" " * (wide + 2) + one for one in more)]
+            lines += [f"{name:<{wide}}  {first}", *(" " * (wide + 2) + text for text in more)]
         lines.append("")
     return "\n".join(line.rstrip() for line in lines)

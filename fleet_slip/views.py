@@ -61,18 +61,18 @@ def open_views(
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
     warehouse.require()
-    wanted = VIEWS if query is None else needed_views(query)
-    snapshots = table_snapshots(warehouse, wanted)
-    of = ALL_DRIVES if _SOURCE.search(query or "") else TRAINING_DRIVES
-    database = open_tables(warehouse, wanted, snapshots, threads=threads, of=of)
-    if "runs" in wanted:
+    views = VIEWS if query is None else needed_views(query)
+    snapshots = table_snapshots(warehouse, views)
+    drives = ALL_DRIVES if _SOURCE.search(query or "") else TRAINING_DRIVES
+    database = open_tables(warehouse, views, snapshots, threads=threads, drives=drives)
+    if "runs" in views:
         add_runs(database, warehouse.root)
-    if "models" in wanted:
+    if "models" in views:
         add_table(database, "models", Registry.of(warehouse).as_table())
-    if "dictionary" in wanted:
+    if "dictionary" in views:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalog.signals))
     if not unlocked:
-        lock(database, paths_of(snapshots, wanted))
+        lock(database, paths_of(snapshots, views))
     return database
 
 

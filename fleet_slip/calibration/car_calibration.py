@@ -471,7 +471,7 @@ class Calibration(Answer):
             "number|unit|cars|median|differs by|known to +-",
             rows,
             "{name}|{unit}|{cars:,}|{median:.3g}|{spread:.2g}|{known:.2g}",
-            left=2,
+            text_columns=2,
         )
         if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
             yield Remark("no car has two drives: uncertainties cannot be estimated")
@@ -494,7 +494,7 @@ class Calibration(Answer):
             ),
             "{name}|{of.unit}|{one.value:.6g}|{one.uncertainty:.2g}|{one.drives}|{one.count}|"
             "{of.grain}",
-            left=2,
+            text_columns=2,
         )
         missing = self.missing[car]
         for reason in dict.fromkeys(missing.values()):

@@ -91,13 +91,18 @@ FLAT = Relation.least_squares("yaw_rate", (ONE, "course_rate", "slowness"))
 
 COURSE = Relation(
     instruments=(ONE, "slowness", "course_rate", "curvature"),
-    left=(
+    products=(
         ((ONE, ONE), ("yaw_rate", "speed"), ("speed", ONE), ("curvature", ONE)),
         (("slowness", ONE), ("yaw_rate", ONE), (ONE, ONE), ("curvature", "slowness")),
         (("course_rate", ONE), ("yaw_rate", "ay"), ("ay", ONE), ("curvature", "course_rate")),
         (("curvature", ONE), ("yaw_rate", "yaw_rate"), ("yaw_rate", ONE), ("curvature",) * 2),
     ),
-    right=(("ay", ONE), ("course_rate", ONE), ("ay", "course_rate"), ("ay", "curvature")),
+    response_products=(
+        ("ay", ONE),
+        ("course_rate", ONE),
+        ("ay", "course_rate"),
+        ("ay", "curvature"),
+    ),
     noise={(3, 1): (ONE, ONE), (3, 3): ("slowness", "slowness")},
 )
 """ay by 1, r v, v and r/v: the unknowns d, rho, -rho b and the bank of bends."""
@@ -331,7 +336,9 @@ FEW_TURNS = "its course by satellite has too few turns"
 NO_CAR = "its satellite course is implausible: check the receiver and the antenna's position"
 """Why a number is missing."""
 
-SPEED = Relation(instruments=(ONE,), left=((("speed", ONE),),), right=((SATELLITE, ONE),))
+SPEED = Relation(
+    instruments=(ONE,), products=((("speed", ONE),),), response_products=((SATELLITE, ONE),)
+)
 """The satellite's speed by that of the wheels. Neither delay nor noise changes a mean."""
 
 CHANGE = Relation.least_squares(SLIP, (ONE, "curvature", "ay", TURNED))

@@ -103,17 +103,17 @@ def parse(sql: str) -> Arithmetic:
 
 def evaluate(sql: str, counts: Mapping[str, int]) -> int | None:
     """Return what the SQL of a feature comes to in one row; None where it has no value."""
-    one, found = parse(sql), list[int]()
-    for step in one.steps:
+    arithmetic, results = parse(sql), list[int]()
+    for step in arithmetic.steps:
         if step.function:
-            value = COMPUTED[step.function](*(found[operand] for operand in step.operands))
+            value = COMPUTED[step.function](*(results[operand] for operand in step.operands))
         else:
             value = counts[step.name] if step.name else step.value
         if value is None:
             return None
-        found.append(value)
-    missing = one.guard is not None and found[one.guard] < one.at_least
-    return None if missing else found[-1]
+        results.append(value)
+    missing = arithmetic.guard is not None and results[arithmetic.guard] < arithmetic.at_least
+    return None if missing else results[-1]
 
 
 def _tree(text: str) -> ast.expr:

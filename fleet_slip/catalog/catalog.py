@@ -74,8 +74,8 @@ class FeatureSet:
     @property
     def change_text(self) -> str:
         """The times over which columns change, as messages say them."""
-        *others, last = (f"{time_s:f}" for time_s in self.change_s)
-        return f"{', '.join(others)} and {last} s" if others else f"{last} s"
+        *earlier, last = (f"{time_s:f}" for time_s in self.change_s)
+        return f"{', '.join(earlier)} and {last} s" if earlier else f"{last} s"
 
     @property
     def in_time(self) -> bool:

@@ -40,14 +40,14 @@ def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
     for chunk in chunks:
         for start in range(0, chunk.size, BLOCK):
             values = chunk[start : start + BLOCK]
-            here = slice(end, end := end + values.size)
+            span = slice(end, end := end + values.size)
             block = np.divide(values, scale, out=scaled[: values.size])
             np.clip(np.rint(block, out=block), low, high, out=block)
             if np.isnan(block.sum()):  # the counts are finite, and a NaN stays one
                 mask = np.zeros(counts.size, dtype=np.bool_) if mask is None else mask
-                mask[here] = np.isnan(block)
-                block[mask[here]] = 0
-            counts[here] = block
+                mask[span] = np.isnan(block)
+                block[mask[span]] = 0
+            counts[span] = block
     return as_arrow(counts, mask)
 
 

@@ -83,8 +83,8 @@ def course_units(signals: SignalCatalog) -> CourseUnits:
 
 def split_late(late: int) -> tuple[int, int]:
     """Return how many whole ticks late a course is, and what its label gains per count of r."""
-    whole = (late + LATE_PARTS // 2) // LATE_PARTS
-    return whole, (late - whole * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
+    ticks = (late + LATE_PARTS // 2) // LATE_PARTS
+    return ticks, (late - ticks * LATE_PARTS) * 4 * HALF_TURN // LATE_PARTS
 
 
 def turned_scale(signals: SignalCatalog) -> float:

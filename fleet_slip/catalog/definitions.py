@@ -116,7 +116,7 @@ LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
 """The first digits of a line's checksum."""
 
 
-_LEFT_OUT = Field(exclude_if=lambda one: one is None)
+_LEFT_OUT = Field(exclude_if=lambda value: value is None)
 
 
 class AttributeFactor(Config):
@@ -196,8 +196,10 @@ class ParameterFactor(Config):
 
     @model_validator(mode="after")
     def _runs_plainly(self) -> "ParameterFactor":
-        one = self.running
-        if one and (one.over != "running_mean" or one.fact or one.number or self.less):
+        running = self.running
+        if running and (
+            running.over != "running_mean" or running.fact or running.number or self.less
+        ):
             raise ValueError("running is a mean since the drive began, without factors")
         return self
 
@@ -258,7 +260,7 @@ class Equation(Config):
     @property
     def columns(self) -> tuple["Definition", ...]:
         """The columns that it is made of."""
-        return (self.y, *(one for one in self.x if isinstance(one, Definition)))
+        return (self.y, *(column for column in self.x if isinstance(column, Definition)))
 
 
 class Slope(Config):
@@ -275,18 +277,18 @@ class Slope(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Slope":
-        if any(len(one.x) != len(self.ridge) for one in self.equations):
+        if any(len(equation.x) != len(self.ridge) for equation in self.equations):
             raise ValueError("each equation has as many columns as there are unknowns")
         if max(self.ratio.numerator, self.ratio.denominator) > LARGEST_SLOPE:
             raise ValueError(f"the ratio of a slope has no part above {LARGEST_SLOPE}")
-        if any(one.bits > COUNT_BITS for one in self.columns):
+        if any(equation.bits > COUNT_BITS for equation in self.columns):
             raise ValueError(f"the columns of a slope have {COUNT_BITS} bits")
         return self
 
     @property
     def columns(self) -> tuple["Definition", ...]:
         """The columns that it is made of."""
-        return tuple(column for one in self.equations for column in one.columns)
+        return tuple(column for equation in self.equations for column in equation.columns)
 
 
 Made = Combination | Product | Slope
@@ -345,11 +347,11 @@ class Definition(Config):
     @property
     def signals(self) -> tuple[str, ...]:
         """The logged signals in it."""
-        found: dict[str, None] = {}
+        names: dict[str, None] = {}
         for row in self.rows():
-            own = parse(row.sql).inputs if row.sql else () if row.made else (row.of,)
-            found |= dict.fromkeys(own)
-        return tuple(found)
+            inputs = parse(row.sql).inputs if row.sql else () if row.made else (row.of,)
+            names |= dict.fromkeys(inputs)
+        return tuple(names)
 
     def rows(self, seen: "set[int] | None" = None) -> "Iterator[Definition]":
         """Yield what it and the columns in it look back on, each as a column of one row.
@@ -360,8 +362,8 @@ class Definition(Config):
         if self.made is None or id(self.made) not in seen:
             seen.add(id(self.made))
             yield self.row
-            for one in self.made.columns if self.made else ():
-                yield from one.rows(seen)
+            for column in self.made.columns if self.made else ():
+                yield from column.rows(seen)
         for beside in (self.gate and self.gate.by, self.number and self.number.running):
             if beside:
                 yield from beside.rows(seen)
@@ -379,7 +381,7 @@ class Definition(Config):
         return self.model_copy(update={"gate": None})
 
     @property
-    def parts(self) -> tuple["Definition", ...]:
+    def components(self) -> tuple["Definition", ...]:
         """What it is made of, each without a gate: itself, or the gated column and the gate's."""
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
@@ -395,16 +397,22 @@ def rows_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
     Raises `QuestionError` if a column has the name of a feature behind one and is something else,
     or a feature is defined in two ways.
     """
-    found: dict[str, Definition] = {}
+    rows: dict[str, Definition] = {}
     seen = set[int]()
-    for row in (row for one in definitions.values() for row in one.rows(seen)):
-        if found.setdefault(row.of, row) != row:
+    for row in (row for definition in definitions.values() for row in definition.rows(seen)):
+        if rows.setdefault(row.of, row) != row:
             raise QuestionError(f"the feature {row.of} is defined in two ways.")
-    for name, one in definitions.items():
-        computed = name in found and (found[name].sql or found[name].made)
-        if computed and (one.over or one.fact or one.gate or one.number or one.of != name):
+    for name, definition in definitions.items():
+        computed = name in rows and (rows[name].sql or rows[name].made)
+        if computed and (
+            definition.over
+            or definition.fact
+            or definition.gate
+            or definition.number
+            or definition.of != name
+        ):
             raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
-    return found
+    return rows
 
 
 # Which columns change sign, and nothing else, when left and right are exchanged: odd ones.
@@ -417,7 +425,7 @@ OPPOSITE = frozenset(
 )
 """Signals of the other sign in the mirror. A front wheel's angle is nearly that of the other."""
 EXCHANGED = {"wheel_fl": "wheel_fr", "wheel_rl": "wheel_rr"}
-EXCHANGED |= {right: left for left, right in EXCHANGED.items()}
+EXCHANGED |= {right_wheel: left_wheel for left_wheel, right_wheel in EXCHANGED.items()}
 """Signals that are those of the other side in the mirror; what is in neither stays."""
 OFFSETS = frozenset({"yaw_rate_offset", "ay_offset", "steering_offset"})
 """Numbers of a car of the other sign in the mirror."""
@@ -426,26 +434,28 @@ TRIALS = 16
 
 
 @cache
-def parity(one: Definition) -> int:
+def parity(column: Definition) -> int:
     """Return -1 for an odd column, 1 for an even one, 0 for one that is neither.
 
     A gate must be opened by an even column: hats over an odd one differ from side to side.
     """
-    if one.made:  # no set of changes has what is made of columns
+    if column.made:  # no set of changes has what is made of columns
         return 0
-    if one.gate:
-        return parity(one.ungated) if parity(one.gate.by) == 1 else 0
-    if one.number:
-        of = 1 if one.number.alone else parity(one.model_copy(update={"number": None}))
-        return -of if one.number.name in OFFSETS else of
-    values = [(_value(one, row), _value(one, _mirrored(row))) for row in _trial_rows(one)]
+    if column.gate:
+        return parity(column.ungated) if parity(column.gate.by) == 1 else 0
+    if column.number:
+        base_parity = (
+            1 if column.number.alone else parity(column.model_copy(update={"number": None}))
+        )
+        return -base_parity if column.number.name in OFFSETS else base_parity
+    values = [(_value(column, row), _value(column, _mirrored(row))) for row in _trial_rows(column)]
     if all(a == b for a, b in values):
         return 1
     return -1 if all(a is not None and b == -a for a, b in values) else 0
 
 
-def _value(one: Definition, row: Mapping[str, int]) -> int | None:
-    return evaluate(one.sql, row) if one.sql else row[one.of]
+def _value(column: Definition, row: Mapping[str, int]) -> int | None:
+    return evaluate(column.sql, row) if column.sql else row[column.of]
 
 
 def _trial_rows(definition: Definition) -> tuple[Mapping[str, int], ...]:

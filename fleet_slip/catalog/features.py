@@ -74,7 +74,7 @@ class FeatureSetEntry(Config):
         names = (*self.signals, *self.features, *self.windows)
         out_of_range = any(not 0 < n <= LONGEST_TICKS for n in ticks)
         longest = f"{LONGEST_TICKS * float(SAMPLE_TIME_S):g}"
-        for wrong, what in (
+        for wrong, message in (
             (self.of is None and not self.signals, "a set has signals, or is of another set"),
             (self.of is not None and not self.change_s, "a set of another has change_s"),
             (unknown, f"not input signals: {unknown}"),
@@ -85,9 +85,9 @@ class FeatureSetEntry(Config):
             (out_of_range, f"change_s is at most {longest}"),
         ):
             if wrong:
-                raise ValueError(what)
+                raise ValueError(message)
         for name, times_s in (("block_s", (self.block_s,)), ("change_s", self.change_s)):
-            if any(one and Fraction(one) % SAMPLE_TIME_S for one in times_s):
+            if any(time_s and Fraction(time_s) % SAMPLE_TIME_S for time_s in times_s):
                 raise ValueError(f"{name} must be a multiple of {float(SAMPLE_TIME_S)}")
         return self
 
@@ -128,17 +128,17 @@ class FeatureFile(Config):
         over_time = self._time_columns = _make_time_columns(self, signals)
         columns: dict[str, Feature | TimeColumn] = {**self.features, **over_time}
         taken |= {"day", "tick", "clipped", *BESIDE}
-        names = [*columns, *(one.column for one in columns.values())]
+        names = [*columns, *(column.column for column in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
-        for name, what in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):
+        for name, purpose in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):
             if name in self.sets:
-                raise ValueError(f"{name!r} is the set of {what}")
+                raise ValueError(f"{name!r} is the set of {purpose}")
         for name, one in self.sets.items():
             unknown = [f for f in one.features if f not in self.features]
-            known = {*self.windows, *self.gates, *over_time}
-            unknown += [w for w in one.windows if w not in known or w in self.calibrated]
+            names_of_windows = {*self.windows, *self.gates, *over_time}
+            unknown += [w for w in one.windows if w not in names_of_windows or w in self.calibrated]
             unknown += [c for c in one.calibrated if c not in self.calibrated]
             unknown += [one.of] if one.of and one.of not in self.sets else []
             still = [c for c in one.calibrated if one.change_s and self.calibrated[c].alone]

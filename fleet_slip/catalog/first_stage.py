@@ -117,12 +117,12 @@ class EstimateSubstitution:
             changes["made"] = self._copies[key]
         return definition.model_copy(update=changes) if changes else definition
 
-    def _copy(self, made: Made) -> Made:
-        if isinstance(made, Product):
-            return made.model_copy(update={"of": tuple(map(self, made.of))})
-        if isinstance(made, Combination):
-            terms = tuple((factor, self(column)) for factor, column in made.terms)
-            return made.model_copy(update={"terms": terms})
+    def _copy(self, composite: Made) -> Made:
+        if isinstance(composite, Product):
+            return composite.model_copy(update={"of": tuple(map(self, composite.of))})
+        if isinstance(composite, Combination):
+            terms = tuple((factor, self(column)) for factor, column in composite.terms)
+            return composite.model_copy(update={"terms": terms})
         equations = [
             equation.model_copy(
                 update={
@@ -130,9 +130,9 @@ class EstimateSubstitution:
                     "x": tuple(x if isinstance(x, int) else self(x) for x in equation.x),
                 }
             )
-            for equation in made.equations
+            for equation in composite.equations
         ]
-        return made.model_copy(update={"equations": tuple(equations)})
+        return composite.model_copy(update={"equations": tuple(equations)})
 
 
 def integer_combination(

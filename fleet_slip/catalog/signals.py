@@ -177,7 +177,7 @@ class SignalCatalog(Config):
     @cached_property
     def optional(self) -> tuple[str, ...]:
         """Names of the columns that a file of the logs has only where a drive has a value."""
-        return (*(name for name, one in self.drive.items() if one.optional), *self.extras)
+        return (*(name for name, column in self.drive.items() if column.optional), *self.extras)
 
     @cached_property
     def feature_inputs(self) -> tuple[str, ...]:

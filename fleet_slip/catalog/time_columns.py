@@ -134,19 +134,19 @@ class KnownColumns:
         """Return an input by name. Raises `ValueError` for what is none, and `NotYetMadeError`."""
         if name in self.missing:
             raise NotYetMadeError
-        if found := self.over_time.get(name) or self.features.get(name):
-            return found
+        if column := self.over_time.get(name) or self.features.get(name):
+            return column
         if name not in self.signals.feature_inputs:
             raise ValueError(f"{name} is no input signal or feature")
         return self.signals[name]
 
     def definition(self, name: str) -> Definition:
         """Return a column over time, or a row as one. Raises `ValueError` for no input."""
-        one = self.of(name)
-        if isinstance(one, TimeColumn):
-            return one.definition
-        if isinstance(one, Feature):
-            return Definition(of=name, sql=one.sql, of_bits=one.bits)
+        column = self.of(name)
+        if isinstance(column, TimeColumn):
+            return column.definition
+        if isinstance(column, Feature):
+            return Definition(of=name, sql=column.sql, of_bits=column.bits)
         return Definition(of=name)
 
     def columns(self, *names: str) -> list[TimeColumn]:
@@ -167,15 +167,15 @@ class ColumnFamily(Config):
         """Return the names of the columns."""
         return (name,)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return the columns by name. Raises `ValueError`, and `NotYetMadeError`."""
         raise NotImplementedError
 
     def _column(self, definition: Definition, **other: Any) -> TimeColumn:
         """Return a column that is called as the family is, but for what is given."""
         names = ("scale", "unit", "column", "description")
-        own = {name: getattr(self, name) for name in names if name not in other}
-        return TimeColumn(definition=definition, **own, **other)
+        shared = {name: getattr(self, name) for name in names if name not in other}
+        return TimeColumn(definition=definition, **shared, **other)
 
 
 TICKS = "{ticks}"
@@ -212,12 +212,12 @@ class Window(ColumnFamily):
         """Return the name of each length, or that of the mean since the drive began."""
         return tuple(f"{name}_{n}" for n in self.ticks) or (name,)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return a column for each length."""
-        row = known.definition(self.of)
-        if self.of in known.over_time and not (row.made and row.of == self.of):
+        row = columns.definition(self.of)
+        if self.of in columns.over_time and not (row.made and row.of == self.of):
             raise ValueError(f"{self.of} is no input signal or feature")
-        ratio, found = known.of(self.of).exact_scale / Fraction(self.scale), {}
+        ratio, members = columns.of(self.of).exact_scale / Fraction(self.scale), {}
         for member, ticks in zip(self.names(name), self.ticks or (0,), strict=True):
             definition = Definition(
                 of=row.of,
@@ -229,12 +229,12 @@ class Window(ColumnFamily):
                 ratio=ratio,
                 bits=self.bits,
             )
-            found[member] = self._column(
+            members[member] = self._column(
                 definition,
                 column=self.column.replace(TICKS, str(ticks)),
                 description=self.description + (f", over {ticks} ticks" if ticks else ""),
             )
-        return found
+        return members
 
 
 class Factor(ColumnFamily):
@@ -248,15 +248,15 @@ class Factor(ColumnFamily):
     unit: SIUnit
     column: Identifier
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return the product."""
-        base = known.definition(self.of)
+        base = columns.definition(self.of)
         if base.fact is not None:
             raise ValueError(f"{self.of} has a factor already")
-        ratio = known.of(self.of).exact_scale / Fraction(self.scale)
+        ratio = columns.of(self.of).exact_scale / Fraction(self.scale)
         fact = AttributeFactor.model_validate(
             {"name": self.fact, "less": self.less, "equals": self.equals, "ratio": ratio},
-            context=known.signals,
+            context=columns.signals,
         )
         return {name: self._column(base.model_copy(update={"fact": fact}))}
 
@@ -271,22 +271,22 @@ class Calibrated(ColumnFamily):
     running: Identifier | None = None
     column: Identifier
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return the column times a number.
 
         Raises `ValueError` if `running` has another grain than the number, or `less` is between
         counts.
         """
-        base, of, number = (
-            known.definition(self.of),
-            known.of(self.of),
+        base, source, number = (
+            columns.definition(self.of),
+            columns.of(self.of),
             CALIBRATION_PARAMETERS[self.number],
         )
-        if isinstance(of, Feature):  # the count itself, as it stands in the rows
+        if isinstance(source, Feature):  # the count itself, as it stands in the rows
             base = base.model_copy(update={"bits": base.of_bits})
         if base.number is not None:
             raise ValueError(f"{self.of} has a number already")
-        running = known.columns(self.running)[0] if self.running else None
+        running = columns.columns(self.running)[0] if self.running else None
         if running is not None and running.scale != number.grain:
             raise ValueError(
                 f"{self.running} has the scale {running.scale}, {self.number} {number.grain}"
@@ -301,11 +301,11 @@ class Calibrated(ColumnFamily):
             alone=self.alone,
             running=running.definition if running else None,
         )
-        own = [] if number.unit == "1" else [number.unit]
+        units = [] if number.unit == "1" else [number.unit]
         column = self._column(
             base.model_copy(update={"number": factor}),
-            scale=number.grain if self.alone else number.grain * of.scale,
-            unit="*".join(own if self.alone else [*own, of.unit]) or "1",
+            scale=number.grain if self.alone else number.grain * source.scale,
+            unit="*".join(units if self.alone else [*units, source.unit]) or "1",
         )
         return {name: column}
 
@@ -317,8 +317,8 @@ class MadeColumn(ColumnFamily):
     unit: SIUnit
     column: Identifier
 
-    def _of(self, name: str, made: Made, bits: int = LARGEST_BITS) -> dict[str, TimeColumn]:
-        return {name: self._column(Definition(of=name, made=made, of_bits=bits, bits=bits))}
+    def _of(self, name: str, composite: Made, bits: int = LARGEST_BITS) -> dict[str, TimeColumn]:
+        return {name: self._column(Definition(of=name, made=composite, of_bits=bits, bits=bits))}
 
 
 class EstimateColumn(MadeColumn):
@@ -326,7 +326,7 @@ class EstimateColumn(MadeColumn):
 
     unit: Literal["rad"] = "rad"
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
         """Return the estimate of a line that has not been fitted."""
         return self._of(name, Combination(line=""))
 
@@ -337,10 +337,10 @@ class ProductColumn(MadeColumn):
     of: tuple[Identifier, ...] = Field(max_length=2)
     bits: Bits = 20
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return the product."""
-        factors = tuple(map(known.definition, self.of))
-        scale = math.prod((known.of(one).exact_scale for one in self.of), start=Fraction(1))
+        factors = tuple(map(columns.definition, self.of))
+        scale = math.prod((columns.of(factor).exact_scale for factor in self.of), start=Fraction(1))
         return self._of(name, Product(of=factors, ratio=scale / Fraction(self.scale)), self.bits)
 
 
@@ -359,7 +359,7 @@ class EquationColumns(Config):
     @property
     def names(self) -> tuple[str, ...]:
         """The columns in it."""
-        return (*self.y, self.of, *(one for one in self.beside if isinstance(one, str)))
+        return (*self.y, self.of, *(column for column in self.beside if isinstance(column, str)))
 
 
 class SlopeColumn(MadeColumn):
@@ -368,16 +368,16 @@ class SlopeColumn(MadeColumn):
     equations: tuple[EquationColumns, ...] = Field(min_length=1)
     ridge: tuple[int, ...] = Field(min_length=1)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
         """Return a slope. Raises `ValueError` if a scale of its equations does not fit others."""
         equations, values = [], set()
         for number, equation in enumerate(self.equations, 1):
-            known.columns(*equation.names)
-            columns = known.over_time
-            of_y = {columns[one].exact_scale for one in equation.y}
+            sources.columns(*equation.names)
+            columns = sources.over_time
+            of_y = {columns[name_y].exact_scale for name_y in equation.y}
             if len(of_y) > 1:
                 raise ValueError(f"{', '.join(equation.y)} differ in scale")
-            terms = tuple((sign, columns[one].definition) for one, sign in equation.y.items())
+            terms = tuple((sign, columns[name_y].definition) for name_y, sign in equation.y.items())
             y = Definition(
                 of=f"{name}_{number}",
                 made=Combination(terms=terms),
@@ -385,12 +385,15 @@ class SlopeColumn(MadeColumn):
                 bits=COUNT_BITS,
             )
             x = (equation.of, *equation.beside)
-            factors = tuple(columns[of].definition if isinstance(of, str) else of for of in x)
+            factors = tuple(
+                columns[regressor].definition if isinstance(regressor, str) else regressor
+                for regressor in x
+            )
             equations.append(Equation(y=y, x=factors, weight=Fraction(equation.weight)))
             values.add(of_y.pop() / columns[equation.of].exact_scale)
         if len(values) > 1:
             raise ValueError(
-                "the scales of y and `of` have another ratio from one equation to the next"
+                "the scales of y and `regressor` have another ratio from one equation to the next"
             )
         ratio = values.pop() / Fraction(self.scale)
         return self._of(name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio))
@@ -424,20 +427,20 @@ class GateFamily(ColumnFamily):
         knots = range(1, len(self.knots))
         return tuple(f"{column}_{name}_{knot}" for knot in knots for column in self.columns)
 
-    def make(self, name: str, known: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
         """Return the columns of each knot."""
-        by, *bases = known.columns(self.of, *self.columns)
+        by, *bases = sources.columns(self.of, *self.columns)
         counts = [round(Fraction(knot) / by.exact_scale) for knot in self.knots]
-        found = []
+        members = []
         for knot, peak in enumerate(counts[1:], 1):
             high = counts[knot + 1] if knot + 1 < len(counts) else None
             gate = Gate(by=by.definition, low=counts[knot - 1], peak=peak, high=high)
-            near = f", where {self.of} is near {self.knots[knot]:f}"
+            suffix = f", where {self.of} is near {self.knots[knot]:f}"
             for base in bases:
                 changed = {
                     "definition": base.definition.model_copy(update={"gate": gate}),
                     "column": f"{base.column}_{name}_{knot}",
-                    "description": base.description + near,
+                    "description": base.description + suffix,
                 }
-                found.append(base.model_copy(update=changed))
-        return dict(zip(self.names(name), found, strict=True))
+                members.append(base.model_copy(update=changed))
+        return dict(zip(self.names(name), members, strict=True))

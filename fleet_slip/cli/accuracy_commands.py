@@ -10,39 +10,24 @@ import typer
 from fleet_slip.api.calls import CarMeasures
 from fleet_slip.base import require_extra
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.cli.options import (
-    Cohort,
-    FrontAxle,
-    FrontDrive,
-    Height,
-    IncludeFaulty,
-    Json,
-    Mass,
-    Model,
-    Radius,
-    RearAxle,
-    Threads,
-    TrackWidth,
-    fleet_of,
-    recorded,
-)
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, progress, say
 from fleet_slip.errors import UsageError
 
 
 def score(
     context: typer.Context,
-    model: Model = None,
+    model: opt.Model = None,
     cohort: Annotated[
         str | None,
         typer.Option(
             help="SQL predicate on the view drives. Default: the drives that the model was not "
-            "trained on, or all if there are no others.",
-            show_default=False,
+            "trained on, or all if there are no others."
         ),
     ] = None,
-    include_faulty: IncludeFaulty = False,
-    json: Json = False,
+    include_faulty: opt.IncludeFaulty = False,
+    json: opt.Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: RMSE, largest error and percentiles.
 
@@ -55,16 +40,14 @@ def score(
 @recorded
 def evaluate(
     context: typer.Context,
-    model: Model = None,
+    model: opt.Model = None,
     compare: Annotated[
-        list[str] | None,
-        typer.Option(help="Another model to evaluate beside it. May be repeated."),
+        list[str] | None, typer.Option(help="Another model to evaluate beside it. May be repeated.")
     ] = None,
     scenario: Annotated[
         list[str] | None,
         typer.Option(
-            help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all.",
-            show_default=False,
+            help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all."
         ),
     ] = None,
     blind: Annotated[
@@ -80,29 +63,25 @@ def evaluate(
         typer.Option(
             help="SQL predicate on the view drives: evaluate on measured drives with a label "
             "instead. Models and filters are trained without the drives, or parts, that they are "
-            "evaluated on.",
-            show_default=False,
+            "evaluated on."
         ),
     ] = None,
     vehicle: Annotated[
         str | None,
-        typer.Option(
-            help="With --cohort: vehicle file for filters, instead of --mass and axles.",
-            show_default=False,
-        ),
+        typer.Option(help="With --cohort: vehicle file for filters, instead of --mass and axles."),
     ] = None,
-    mass: Mass = None,
-    front_axle: FrontAxle = None,
-    rear_axle: RearAxle = None,
-    track_width: TrackWidth = None,
-    height: Height = None,
-    radius: Radius = None,
-    front_drive: FrontDrive = None,
-    threads: Threads = None,
+    mass: opt.Mass = None,
+    front_axle: opt.FrontAxle = None,
+    rear_axle: opt.RearAxle = None,
+    track_width: opt.TrackWidth = None,
+    height: opt.Height = None,
+    radius: opt.Radius = None,
+    front_drive: opt.FrontDrive = None,
+    threads: opt.Threads = None,
     everything: Annotated[
         bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Evaluate models on the paper's test drives and on others; simulate those that are missing.
 
@@ -147,26 +126,21 @@ def evaluate(
 
 def identify(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the car.", show_default=False)],
-    cohort: Cohort = TRAINING_DRIVES,
-    mass: Mass = None,
-    front_axle: FrontAxle = None,
-    rear_axle: RearAxle = None,
-    track_width: TrackWidth = None,
-    height: Height = None,
-    radius: Radius = None,
-    front_drive: FrontDrive = None,
-    threads: Threads = None,
-    output: Annotated[
-        Path | None, typer.Option(help="Vehicle file to write.", show_default=False)
-    ] = None,
+    name: Annotated[str, typer.Argument(help="Name of the car.")],
+    cohort: opt.Cohort = TRAINING_DRIVES,
+    mass: opt.Mass = None,
+    front_axle: opt.FrontAxle = None,
+    rear_axle: opt.RearAxle = None,
+    track_width: opt.TrackWidth = None,
+    height: opt.Height = None,
+    radius: opt.Radius = None,
+    front_drive: opt.FrontDrive = None,
+    threads: opt.Threads = None,
+    output: Annotated[Path | None, typer.Option(help="Vehicle file to write.")] = None,
     campaign: Annotated[
-        Path | None,
-        typer.Option(
-            help="Campaign file with the car to write, for publish --prior.", show_default=False
-        ),
+        Path | None, typer.Option(help="Campaign file with the car to write, for publish --prior.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
 
@@ -205,14 +179,11 @@ def identify(
 
 def report(
     context: typer.Context,
-    model: Model = None,
+    model: opt.Model = None,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder to write into. Default: report/ in the data root.", show_default=False
-        ),
+        Path | None, typer.Option(help="Folder to write into. Default: report/ in the data root.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Write a page that compares the latest evaluation with the paper's figures.
 
@@ -240,17 +211,15 @@ def watch(
         typer.Argument(
             metavar="SCENARIO|DRIVE",
             help="Scenario of configs/scenarios, a TOML file, or the drive_id of a logged drive.",
-            show_default=False,
         ),
     ],
-    model: Model = None,
+    model: opt.Model = None,
     output: Annotated[
         Path, typer.Option(help="Page to write, .html. It plays in a browser.")
     ] = Path("watch.html"),
     from_s: Annotated[float, typer.Option("--from", help="First second of the drive.")] = 0.0,
     until_s: Annotated[
-        float | None,
-        typer.Option("--until", help="Last second. Default: the end.", show_default=False),
+        float | None, typer.Option("--until", help="Last second. Default: the end.")
     ] = None,
 ) -> None:
     """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
@@ -267,8 +236,7 @@ def explore(
     context: typer.Context,
     edit: Annotated[bool, typer.Option("--edit", help="Show the code, for editing.")] = False,
     port: Annotated[
-        int | None,
-        typer.Option(min=1, max=65535, help="Port on this machine.", show_default=False),
+        int | None, typer.Option(min=1, max=65535, help="Port on this machine.")
     ] = None,
     headless: Annotated[
         bool, typer.Option("--headless", help="Print the address, and open no browser.")

@@ -216,7 +216,6 @@ def options(
         typer.Option(
             help="Data root: a folder, or the URL of an object store, such as s3://BUCKET/PATH. "
             "Default: $FLEET_SLIP_ROOT, else ./data.",
-            show_default=False,
         ),
     ] = None,
     config: Annotated[
@@ -224,7 +223,6 @@ def options(
         typer.Option(
             help="Folder of configs that override the shipped ones (docs/configuration.md). "
             "Default: $FLEET_SLIP_CONFIG.",
-            show_default=False,
         ),
     ] = None,
     _version: Annotated[

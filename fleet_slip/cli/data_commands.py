@@ -10,15 +10,8 @@ import typer
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.base import last_day, pluralize
-from fleet_slip.cli.options import (
-    CampaignDays,
-    Cluster,
-    Json,
-    Threads,
-    Through,
-    fleet_of,
-    recorded,
-)
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
@@ -37,11 +30,11 @@ ALL_SETS = "all"
 def simulate(
     context: typer.Context,
     campaign: Annotated[str, typer.Argument(help="Campaign of configs/campaigns, or a TOML file.")],
-    days: CampaignDays = None,
-    through: Through = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    json: Json = False,
+    days: opt.CampaignDays = None,
+    through: opt.Through = None,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
+    json: opt.Json = False,
 ) -> None:
     """Simulate the missing drives of a campaign and write them to the logs.
 
@@ -65,16 +58,14 @@ def ingest(
         list[str],
         typer.Argument(
             help="Log files (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO) or folders. "
-            "Of folders, files that were ingested before are skipped.",
-            show_default=False,
+            "Of folders, files that were ingested before are skipped."
         ),
     ],
     mapping: Annotated[
         str | None,
         typer.Option(
             help="Mapping of configs/mappings, or a TOML file. Without it, the files are tables of "
-            "Gram rows.",
-            show_default=False,
+            "Gram rows."
         ),
     ] = None,
     dry_run: Annotated[
@@ -91,8 +82,8 @@ def ingest(
             "mapping.",
         ),
     ] = False,
-    cluster: Cluster = None,
-    json: Json = False,
+    cluster: opt.Cluster = None,
+    json: opt.Json = False,
 ) -> None:
     """Bring measured logs into the data root through a mapping of columns, units and axes.
 
@@ -206,16 +197,14 @@ def mapping() -> None:
 @mapping_app.command()
 def suggest(
     context: typer.Context,
-    file: Annotated[str, typer.Argument(help="A measured log.", show_default=False)],
+    file: Annotated[str, typer.Argument(help="A measured log.")],
     output: Annotated[
-        Path | None,
-        typer.Option(help="File to write the draft to, instead of stdout.", show_default=False),
+        Path | None, typer.Option(help="File to write the draft to, instead of stdout.")
     ] = None,
     can: Annotated[
-        Path | None,
-        typer.Option(help="Database of a CAN trace: DBC, KCD or SYM.", show_default=False),
+        Path | None, typer.Option(help="Database of a CAN trace: DBC, KCD or SYM.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
 
@@ -249,7 +238,7 @@ def suggest(
         header = "channel|unit|guess|Hz|least|most|missing"
         row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
         title = f"{file}: {len(channels)} channels"
-        print_parts([TextTable(title, header, channels, row, left=3)])
+        print_parts([TextTable(title, header, channels, row, text_columns=3)])
     if output is not None:
         with storage_errors(output):
             output.write_text(text, encoding="utf-8")
@@ -259,7 +248,7 @@ def suggest(
 
 
 @mapping_app.command(name="list")
-def list_mappings(context: typer.Context, json: Json = False) -> None:
+def list_mappings(context: typer.Context, json: opt.Json = False) -> None:
     """List the mappings of configs/mappings.
 
     Example: fleet-slip mapping list
@@ -269,7 +258,7 @@ def list_mappings(context: typer.Context, json: Json = False) -> None:
     if json:
         print_json(files)
     else:
-        print_parts([TextTable("", "mapping|file", files.items(), left=2)])
+        print_parts([TextTable("", "mapping|file", files.items(), text_columns=2)])
 
 
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
@@ -303,16 +292,15 @@ def gram(
         str | None,
         typer.Option(
             help="SQL predicate on the view drives: read only log files with such a drive. "
-            "Default: all files.",
-            show_default=False,
+            "Default: all files."
         ),
     ] = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
     sql: Annotated[
         bool, typer.Option("--sql", help="Print the SQL statement, and compute nothing.")
     ] = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
 

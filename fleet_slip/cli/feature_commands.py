@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from fleet_slip.base import pluralize
-from fleet_slip.cli.options import All, Json, fleet_of
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import print_json, print_parts
 from fleet_slip.rendering import TextTable
 
@@ -23,15 +24,14 @@ def features(
     sql: Annotated[
         str | None,
         typer.Option(
-            help="Print the query over log_counts that computes this feature, window or factor.",
-            show_default=False,
+            help="Print the query over log_counts that computes this feature, window or factor."
         ),
     ] = None,
     files: Annotated[
         bool, typer.Option("--files", help="List the config files in use, and their folders.")
     ] = False,
-    everything: All = False,
-    json: Json = False,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """List the features and feature sets of configs/features.toml.
 
@@ -71,13 +71,15 @@ def features(
         )
     elif sets:
         row = "{0}|{1.inputs}|{1.description}"
-        print_parts([TextTable("", "set|columns|description", feature_sets.items(), row, left=3)])
+        print_parts(
+            [TextTable("", "set|columns|description", feature_sets.items(), row, text_columns=3)]
+        )
     else:
         columns: dict[str, Any] = dict(catalog.features)
         if everything:
             columns |= catalog.time_columns
         header, row = "column|unit|scale|description", "{0}|{1.unit}|{1.scale}|{1.description}"
-        print_parts([TextTable("", header, columns.items(), row, left=4)])
+        print_parts([TextTable("", header, columns.items(), row, text_columns=4)])
         if not everything:
             print_parts([_families(catalog)])
 
@@ -103,7 +105,7 @@ def _families(catalog: "Catalog") -> TextTable:
     families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in file.gates.items()]
     count = pluralize(len(file.time_columns), "column")
     title = f"\n{count} over time; one by one: --all"
-    return TextTable(title, "column|over ticks|description", families, left=3)
+    return TextTable(title, "column|over ticks|description", families, text_columns=3)
 
 
 def _print_files(configs: "Configs", json: bool) -> None:
@@ -123,4 +125,6 @@ def _print_files(configs: "Configs", json: bool) -> None:
         print_json(files)
     else:
         heading = f"own configs: {overlay or 'none'}\nshipped ones: {folder('configs')}"
-        print_parts([TextTable(heading, "file|from", files.items(), "{0}|{1[from]}", left=2)])
+        print_parts(
+            [TextTable(heading, "file|from", files.items(), "{0}|{1[from]}", text_columns=2)]
+        )

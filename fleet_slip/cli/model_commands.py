@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from fleet_slip.base import pluralize
-from fleet_slip.cli.options import Alias, All, Json, Model, ModelName, Version, fleet_of, recorded
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
 from fleet_slip.rendering import Part, TextTable
 
@@ -22,7 +23,7 @@ def models(
         str | None,
         typer.Argument(help="Name of a model: list its versions and the history of its aliases."),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """List the published model versions.
 
@@ -43,7 +44,7 @@ def models(
     header = "model|aliases|signals|published|correlation|RMSE deg|drives"
     form = "{name}@{version}|{aliases}|{inputs}|{published_at:%Y-%m-%d %H:%M}|"
     form += "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
-    print_parts([TextTable("", header, records, form, left=4)])
+    print_parts([TextTable("", header, records, form, text_columns=4)])
     for row in rows:
         if row["trained_on_forgotten"]:
             say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
@@ -51,11 +52,14 @@ def models(
         moves = fleet.models.registry.history(name).moves()
         header = "at|command|alias|version"
         form = "{at:%Y-%m-%d %H:%M:%S}|{command}|{alias}|{version}"
-        print_parts([TextTable("\nhistory of aliases", header, moves, form, left=3)])
+        print_parts([TextTable("\nhistory of aliases", header, moves, form, text_columns=3)])
 
 
 def show(
-    context: typer.Context, model: Model = None, everything: All = False, json: Json = False
+    context: typer.Context,
+    model: opt.Model = None,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """Show one model version: figures, training data and coefficients.
 
@@ -101,7 +105,7 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
         f"sum of coefficient * signal{', through the origin' if origin else ''}"
     )
     properties = {**_properties(version), **({"sha256": version.sha256} if everything else {})}
-    yield TextTable("", "|", properties.items(), left=2)
+    yield TextTable("", "|", properties.items(), text_columns=2)
     form = repr if everything else "{:.6g}".format
     terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
     for term in manifest.terms:
@@ -109,9 +113,9 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
         terms.append([term.column, term.unit, form(term.coefficient), per_count])
     header = "signal|unit|coefficient"
     if not everything:
-        yield TextTable("", header, [row[:3] for row in terms], left=2)
+        yield TextTable("", header, [row[:3] for row in terms], text_columns=2)
         return
-    yield TextTable("", f"{header}|per count", terms, left=2)
+    yield TextTable("", f"{header}|per count", terms, text_columns=2)
     yield "per count: coefficient times scale, for an ECU that works on raw counts"
     if manifest.features:
         yield TextTable(
@@ -119,7 +123,7 @@ def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
             "feature|scale|SQL",
             (term for term in manifest.terms if term.sql),
             "{signal}|{scale} {unit}|{sql}",
-            left=3,
+            text_columns=3,
         )
 
 
@@ -178,8 +182,8 @@ def _label_noise(figures: "CrossValidated") -> str:
 @recorded
 def promote(
     context: typer.Context,
-    reference: Annotated[str, typer.Argument(help="NAME@VERSION.", show_default=False)],
-    alias: Alias = "champion",
+    reference: Annotated[str, typer.Argument(help="NAME@VERSION.")],
+    alias: opt.Alias = "champion",
 ) -> None:
     """Point an alias, by default champion, at a version.
 
@@ -190,7 +194,7 @@ def promote(
 
 
 @recorded
-def rollback(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def rollback(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Point an alias back at its previous version, and pin it there.
 
     Example: fleet-slip rollback waterford
@@ -203,7 +207,7 @@ def rollback(context: typer.Context, model: ModelName, alias: Alias = "champion"
 
 
 @recorded
-def pin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def pin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Keep an alias at its version: publications become candidates, until promote or unpin.
 
     Example: fleet-slip pin waterford
@@ -213,7 +217,7 @@ def pin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> 
 
 
 @recorded
-def unpin(context: typer.Context, model: ModelName, alias: Alias = "champion") -> None:
+def unpin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Let publications move an alias again.
 
     Example: fleet-slip unpin waterford
@@ -222,7 +226,9 @@ def unpin(context: typer.Context, model: ModelName, alias: Alias = "champion") -
     say(f"{model}@{alias} is version {version.version}; publications may move it")
 
 
-def diff(context: typer.Context, first: Version, second: Version, json: Json = False) -> None:
+def diff(
+    context: typer.Context, first: opt.Version, second: opt.Version, json: opt.Json = False
+) -> None:
     """Compare two versions of a model: data, prior, signals, coefficients, figures.
 
     Example: fleet-slip diff waterford@1 waterford@2
@@ -234,17 +240,16 @@ def export(
     context: typer.Context,
     to: Annotated[
         Literal["json", "c", "sql", "dbc", "onnx", "fmu"],
-        typer.Option(help="Target of the export.", show_default=False),
+        typer.Option(help="Target of the export."),
     ],
-    model: Model = None,
+    model: opt.Model = None,
     output: Annotated[
         Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
     ] = Path(),
     with_gram: Annotated[
-        bool,
-        typer.Option("--with-gram", help="With C: also the code for Gram rows on board."),
+        bool, typer.Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors.
 

@@ -7,7 +7,8 @@ import typer
 
 from fleet_slip.base import date_of
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
-from fleet_slip.cli.options import Cluster, Cohort, Json, Model, Threads, fleet_of, recorded
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
 from fleet_slip.errors import UsageError
 
@@ -15,12 +16,9 @@ from fleet_slip.errors import UsageError
 def status(
     context: typer.Context,
     max_age_hours: Annotated[
-        float | None,
-        typer.Option(
-            min=0, help="Maximum age of data or of a backlog, in hours.", show_default=False
-        ),
+        float | None, typer.Option(min=0, help="Maximum age of data or of a backlog, in hours.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Report the health of the data root: freshness, backlog, last runs, disk, champions.
 
@@ -39,7 +37,9 @@ def status(
         raise report.problem
 
 
-def quality(context: typer.Context, cohort: Cohort = TRAINING_DRIVES, json: Json = False) -> None:
+def quality(
+    context: typer.Context, cohort: opt.Cohort = TRAINING_DRIVES, json: opt.Json = False
+) -> None:
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
     Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
@@ -51,15 +51,14 @@ def quality(context: typer.Context, cohort: Cohort = TRAINING_DRIVES, json: Json
 
 def calibrate(
     context: typer.Context,
-    cohort: Cohort = ALL_DRIVES,
+    cohort: opt.Cohort = ALL_DRIVES,
     car: Annotated[
         str | None,
         typer.Option(
-            help="vehicle_id: print the parameters of this car, also as on-board constants.",
-            show_default=False,
+            help="vehicle_id: print the parameters of this car, also as on-board constants."
         ),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Estimate the sensor errors of each car from its own drives, without label or log rows.
 
@@ -73,22 +72,18 @@ def calibrate(
 
 def monitor(
     context: typer.Context,
-    model: Model = None,
+    model: opt.Model = None,
     cohort: Annotated[
         str | None,
         typer.Option(
-            help="SQL predicate on the view drives. Default: the predicate of the training.",
-            show_default=False,
+            help="SQL predicate on the view drives. Default: the predicate of the training."
         ),
     ] = None,
     since: Annotated[
         str | None,
-        typer.Option(
-            help="First new day, YYYY-MM-DD. Default: the day after the training data.",
-            show_default=False,
-        ),
+        typer.Option(help="First new day, YYYY-MM-DD. Default: the day after the training data."),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Chart a model's error on each day since its training, with control limits.
 
@@ -118,13 +113,12 @@ def verify(
         list[str] | None,
         typer.Option(
             help="Lost document without a backup to give up: FOLDER/NUMBER.json, or FOLDER for all "
-            "its documents. May be repeated.",
-            show_default=False,
+            "its documents. May be repeated."
         ),
     ] = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    json: Json = False,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
+    json: opt.Json = False,
 ) -> None:
     """Verify every byte against its checksum, and all tables against each other.
 
@@ -149,9 +143,7 @@ def compact(
     context: typer.Context,
     target_rows: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="Maximum number of rows of a file. Default: 2,000,000.", show_default=False
-        ),
+        typer.Option(min=1, help="Maximum number of rows of a file. Default: 2,000,000."),
     ] = None,
     retention_hours: Annotated[
         float | None,
@@ -159,13 +151,12 @@ def compact(
             min=1,
             max=168,
             help="Hours for which files of replaced versions are kept. Default: 168, a week.",
-            show_default=False,
         ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the files to be removed; change nothing.")
     ] = False,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Merge the small log files of each day, and remove files that are out of use.
 
@@ -184,12 +175,8 @@ def compact(
 @recorded
 def forget(
     context: typer.Context,
-    vehicle: Annotated[
-        str | None, typer.Option(help="vehicle_id to erase.", show_default=False)
-    ] = None,
-    drive: Annotated[
-        str | None, typer.Option(help="drive_id to erase.", show_default=False)
-    ] = None,
+    vehicle: Annotated[str | None, typer.Option(help="vehicle_id to erase.")] = None,
+    drive: Annotated[str | None, typer.Option(help="drive_id to erase.")] = None,
     now: Annotated[
         bool, typer.Option("--now", help="Delete old files at once, instead of by compact.")
     ] = False,
@@ -201,12 +188,9 @@ def forget(
     ] = False,
     retention: Annotated[
         str | None,
-        typer.Option(
-            help="Retention file of --expired. Default: retention.toml of the configs.",
-            show_default=False,
-        ),
+        typer.Option(help="Retention file of --expired. Default: retention.toml of the configs."),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Erase a vehicle or a drive from logs, Gram rows and quarantine; mark models it trained.
 
@@ -238,7 +222,7 @@ def forget(
 
 
 @recorded
-def migrate(context: typer.Context, json: Json = False) -> None:
+def migrate(context: typer.Context, json: opt.Json = False) -> None:
     """Bring the data root to this program and to the signal catalog: add columns.
 
     It can be repeated after any interruption.

@@ -39,8 +39,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON 
 All = Annotated[bool, typer.Option("--all", help="Print all rows and columns.")]
 
 Threads = Annotated[
-    int | None,
-    typer.Option(min=1, help="Threads on this machine. Default: one per core."),
+    int | None, typer.Option(min=1, help="Threads on this machine. Default: one per core.")
 ]
 Cluster = Annotated[
     str | None,
@@ -49,7 +48,6 @@ Cluster = Annotated[
         metavar="ADDRESS",
         help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers share the "
         "data root. Default: threads on this machine.",
-        show_default=False,
     ),
 ]
 
@@ -59,34 +57,24 @@ Model = Annotated[
         metavar="MODEL",
         help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
         "Default: the only published model.",
-        show_default=False,
     ),
 ]
-ModelName = Annotated[str, typer.Argument(help="Name of the model.", show_default=False)]
+ModelName = Annotated[str, typer.Argument(help="Name of the model.")]
 Alias = Annotated[str, typer.Option(help="Alias.")]
 Version = Annotated[
-    str,
-    typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion."),
+    str, typer.Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.")
 ]
 
 Cohort = Annotated[str, typer.Option(help="SQL predicate on the view drives.")]
 IncludeFaulty = Annotated[
-    bool,
-    typer.Option("--include-faulty", help="Include drives with faulty sensors."),
+    bool, typer.Option("--include-faulty", help="Include drives with faulty sensors.")
 ]
-Mapping = Annotated[
-    str,
-    typer.Option(help="Mapping of configs/mappings, or a TOML file.", show_default=False),
-]
+Mapping = Annotated[str, typer.Option(help="Mapping of configs/mappings, or a TOML file.")]
 CampaignDays = Annotated[
-    int | None,
-    typer.Option(min=1, help="Simulate only the first N days. Default: all.", show_default=False),
+    int | None, typer.Option(min=1, help="Simulate only the first N days. Default: all.")
 ]
 Through = Annotated[
-    str | None,
-    typer.Option(
-        help="Last day to simulate, YYYY-MM-DD or today. Default: all days.", show_default=False
-    ),
+    str | None, typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
 ]
 
 # How models are selected.
@@ -95,63 +83,54 @@ ModelList = Annotated[
     str | None,
     typer.Option(
         help="Model list of configs/models, or a TOML file. Default: estimator, or table1 with "
-        "--features or without the Gram rows of estimator.",
-        show_default=False,
+        "--features or without the Gram rows of estimator."
     ),
 ]
 OneModel = Annotated[
     str | None,
     typer.Option(
         help='Inputs of one model, separated by commas, such as "ax, ay, yaw_rate", instead of a '
-        "list.",
-        show_default=False,
+        "list."
     ),
 ]
 Order = Annotated[
     str | None,
     typer.Option(
         help="Inputs, separated by commas, whose first 1, 2, ... form nested models; 'catalogue' "
-        "is all inputs, a family of windows or gates its columns.",
-        show_default=False,
+        "is all inputs, a family of windows or gates its columns."
     ),
 ]
 Features = Annotated[
     str | None,
     typer.Option(
         help="Feature set of configs/features.toml, computed by: fleet-slip gram --features NAME. "
-        "Default: the list's, else the logged signals.",
-        show_default=False,
+        "Default: the list's, else the logged signals."
     ),
 ]
 Label = Annotated[
     Literal["course"] | None,
     typer.Option(
         help="Train without a reference sensor, on changes of the course over ground. Default "
-        "feature set and model list are then those called course.",
-        show_default=False,
+        "feature set and model list are then those called course."
     ),
 ]
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
 GroupBy = Annotated[
     FoldKey | None,
-    typer.Option(
-        "--group-by", help="Groups that form the folds. Default: the list's.", show_default=False
-    ),
+    typer.Option("--group-by", help="Groups that form the folds. Default: the list's."),
 ]
 Folds = Annotated[
     str | None,
     typer.Option(
         metavar="NUMBER|each",
         help="Number of folds, or each for one fold per group. Default: the list's.",
-        show_default=False,
     ),
 ]
 Ranking = Annotated[
     str | None,
     typer.Option(
         help="Ranking of the inputs of --order: declared, correlation, t, forward or backward. "
-        "Default: declared.",
-        show_default=False,
+        "Default: declared."
     ),
 ]
 Criterion = Annotated[
@@ -159,8 +138,7 @@ Criterion = Annotated[
     typer.Option(
         help="Criterion for the number of ranked inputs: cv (the smallest model within --tolerance "
         "of the best), cp, aic, aic-likelihood, bic, bic-likelihood, ric or adjusted-r2. Default: "
-        "cv.",
-        show_default=False,
+        "cv."
     ),
 ]
 Tolerance = Annotated[
@@ -169,8 +147,7 @@ Tolerance = Annotated[
         help="Smallest gain that justifies another signal: an angle such as 0.025deg (root of the "
         "difference of the mean squared errors), or a share of the RMSE such as 2%. Models within "
         "it, or within one standard error of the difference, count as equal. Default: 0.025deg, or "
-        "the list's.",
-        show_default=False,
+        "the list's."
     ),
 ]
 AllSubsets = Annotated[
@@ -187,8 +164,7 @@ Robust = Annotated[
 ClusterUnit = Annotated[
     Literal["drive", "vehicle"] | None,
     typer.Option(
-        help="Unit of independent evidence. Default: vehicle if there are several, else drive.",
-        show_default=False,
+        help="Unit of independent evidence. Default: vehicle if there are several, else drive."
     ),
 ]
 Intercept = Annotated[
@@ -201,25 +177,20 @@ Search = Annotated[
     str | None,
     typer.Option(
         help="Search method among the inputs of --order, or all: forward, backward or exchange. "
-        "The search is repeated in every fold.",
-        show_default=False,
+        "The search is repeated in every fold."
     ),
 ]
 MaxFeatures = Annotated[
     int | None,
     typer.Option(
-        min=1,
-        max=200,
-        help="Maximum number of columns that --search may add. Default: 24.",
-        show_default=False,
+        min=1, max=200, help="Maximum number of columns that --search may add. Default: 24."
     ),
 ]
 HalfLife = Annotated[
     int | None,
     typer.Option(
         help="Days, counted back from the cohort's newest day, after which a drive counts half as "
-        "much.",
-        show_default=False,
+        "much."
     ),
 ]
 Prior = Annotated[
@@ -227,39 +198,26 @@ Prior = Annotated[
     typer.Option(
         help="Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
         "training with the weight that serves the held-out drives best. See: fleet-slip identify "
-        "--campaign.",
-        show_default=False,
+        "--campaign."
     ),
 ]
 
 # Measured data of a car.
 
-Mass = Annotated[
-    float | None,
-    typer.Option(help="Mass of the car with its driver, kg.", show_default=False),
-]
+Mass = Annotated[float | None, typer.Option(help="Mass of the car with its driver, kg.")]
 FrontAxle = Annotated[
-    float | None,
-    typer.Option(help="Distance from centre of gravity to front axle, m.", show_default=False),
+    float | None, typer.Option(help="Distance from centre of gravity to front axle, m.")
 ]
 RearAxle = Annotated[
-    float | None,
-    typer.Option(help="Distance from centre of gravity to rear axle, m.", show_default=False),
+    float | None, typer.Option(help="Distance from centre of gravity to rear axle, m.")
 ]
-TrackWidth = Annotated[
-    float | None, typer.Option(help="Track width, m. Default: 1.55.", show_default=False)
-]
+TrackWidth = Annotated[float | None, typer.Option(help="Track width, m. Default: 1.55.")]
 Height = Annotated[
-    float | None,
-    typer.Option(help="Height of the centre of gravity, m. Default: 0.55.", show_default=False),
+    float | None, typer.Option(help="Height of the centre of gravity, m. Default: 0.55.")
 ]
 Radius = Annotated[
-    float | None,
-    typer.Option(help="Rolling radius of the wheels, m. Default: 0.315.", show_default=False),
+    float | None, typer.Option(help="Rolling radius of the wheels, m. Default: 0.315.")
 ]
 FrontDrive = Annotated[
-    float | None,
-    typer.Option(
-        help="Share of the drive torque on the front axle. Default: 1.", show_default=False
-    ),
+    float | None, typer.Option(help="Share of the drive torque on the front axle. Default: 1.")
 ]

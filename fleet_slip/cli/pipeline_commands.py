@@ -11,21 +11,8 @@ import typer
 
 from fleet_slip.base import date_of, last_day, pluralize
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.cli.options import (
-    All,
-    CampaignDays,
-    Cluster,
-    Cohort,
-    Json,
-    Mapping,
-    ModelList,
-    ModelName,
-    Threads,
-    Through,
-    Tolerance,
-    fleet_of,
-    recorded,
-)
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.storage.data_root import data_root
@@ -40,18 +27,17 @@ def run(
     campaign: Annotated[
         str, typer.Option(help="Campaign of configs/campaigns, or a TOML file.")
     ] = "waterford",
-    days: CampaignDays = None,
-    through: Through = None,
+    days: opt.CampaignDays = None,
+    through: opt.Through = None,
     name: Annotated[
-        str | None,
-        typer.Option(help="Name of the model. Default: the campaign's.", show_default=False),
+        str | None, typer.Option(help="Name of the model. Default: the campaign's.")
     ] = None,
-    models: ModelList = None,
-    tolerance: Tolerance = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    everything: All = False,
-    json: Json = False,
+    models: opt.ModelList = None,
+    tolerance: opt.Tolerance = None,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """Simulate a campaign, update Gram rows, select a model, publish it if it is not worse.
 
@@ -87,19 +73,16 @@ def run(
 @recorded
 def learn(
     context: typer.Context,
-    name: ModelName,
+    name: opt.ModelName,
     logs: Annotated[
         list[str],
-        typer.Argument(
-            help="Log files or folders. Files that were ingested before are skipped.",
-            show_default=False,
-        ),
+        typer.Argument(help="Log files or folders. Files that were ingested before are skipped."),
     ],
-    mapping: Mapping,
-    threads: Threads = None,
-    cluster: Cluster = None,
-    everything: All = False,
-    json: Json = False,
+    mapping: opt.Mapping,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """Train a model on measured logs: ingest, gram, select, publish. Repeat it for new logs.
 
@@ -129,39 +112,31 @@ def learn(
 @recorded
 def nightly(
     context: typer.Context,
-    inbox: Annotated[
-        str,
-        typer.Option(help="Folder of logs; new logs in it are ingested.", show_default=False),
-    ],
-    mapping: Mapping,
-    model: Annotated[str, typer.Option(help="Name of the model.", show_default=False)],
-    cohort: Cohort = TRAINING_DRIVES,
-    models: ModelList = None,
-    tolerance: Tolerance = None,
+    inbox: Annotated[str, typer.Option(help="Folder of logs; new logs in it are ingested.")],
+    mapping: opt.Mapping,
+    model: Annotated[str, typer.Option(help="Name of the model.")],
+    cohort: opt.Cohort = TRAINING_DRIVES,
+    models: opt.ModelList = None,
+    tolerance: opt.Tolerance = None,
     candidate: Annotated[
         bool, typer.Option("--candidate", help="Publish as a candidate, even if it is not worse.")
     ] = False,
     retention: Annotated[
-        str | None,
-        typer.Option(
-            help="Retention file. Default: retention.toml of the configs.", show_default=False
-        ),
+        str | None, typer.Option(help="Retention file. Default: retention.toml of the configs.")
     ] = None,
     night: Annotated[
-        str | None,
-        typer.Option(help="Date of the night, YYYY-MM-DD. Default: today.", show_default=False),
+        str | None, typer.Option(help="Date of the night, YYYY-MM-DD. Default: today.")
     ] = None,
-    threads: Threads = None,
-    cluster: Cluster = None,
+    threads: opt.Threads = None,
+    cluster: opt.Cluster = None,
     output: Annotated[
         Path | None,
         typer.Option(
             help="Folder for the summary: NIGHT.txt and NIGHT.json. The files name drives; forget "
-            "does not change them.",
-            show_default=False,
+            "does not change them."
         ),
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Run the nightly job: ingest new logs, check their sensors, train again, verify.
 

@@ -6,34 +6,8 @@ from typing import Annotated
 import typer
 
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
-from fleet_slip.cli.options import (
-    All,
-    AllSubsets,
-    ClusterUnit,
-    Cohort,
-    Criterion,
-    Features,
-    Folds,
-    GroupBy,
-    HalfLife,
-    IncludeFaulty,
-    Intercept,
-    Json,
-    Label,
-    MaxFeatures,
-    Model,
-    ModelList,
-    ModelName,
-    OneModel,
-    Order,
-    Prior,
-    Ranking,
-    Robust,
-    Search,
-    Tolerance,
-    fleet_of,
-    recorded,
-)
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
 from fleet_slip.storage.runs import step
 from fleet_slip.storage.storage_errors import storage_errors
@@ -41,36 +15,35 @@ from fleet_slip.storage.storage_errors import storage_errors
 
 def select(
     context: typer.Context,
-    cohort: Cohort = TRAINING_DRIVES,
-    include_faulty: IncludeFaulty = False,
-    models: ModelList = None,
-    model: OneModel = None,
-    order: Order = None,
-    features: Features = None,
-    label: Label = None,
-    group_by: GroupBy = None,
-    folds: Folds = None,
-    ranking: Ranking = None,
-    criterion: Criterion = None,
-    tolerance: Tolerance = None,
-    all_subsets: AllSubsets = False,
-    robust: Robust = False,
-    cluster: ClusterUnit = None,
-    intercept: Intercept = True,
-    search: Search = None,
-    max_features: MaxFeatures = None,
-    half_life: HalfLife = None,
-    prior: Prior = None,
+    cohort: opt.Cohort = TRAINING_DRIVES,
+    include_faulty: opt.IncludeFaulty = False,
+    models: opt.ModelList = None,
+    model: opt.OneModel = None,
+    order: opt.Order = None,
+    features: opt.Features = None,
+    label: opt.Label = None,
+    group_by: opt.GroupBy = None,
+    folds: opt.Folds = None,
+    ranking: opt.Ranking = None,
+    criterion: opt.Criterion = None,
+    tolerance: opt.Tolerance = None,
+    all_subsets: opt.AllSubsets = False,
+    robust: opt.Robust = False,
+    cluster: opt.ClusterUnit = None,
+    intercept: opt.Intercept = True,
+    search: opt.Search = None,
+    max_features: opt.MaxFeatures = None,
+    half_life: opt.HalfLife = None,
+    prior: opt.Prior = None,
     save: Annotated[
         Path | None,
         typer.Option(
             metavar="LIST.toml",
             help="Write what was compared as a model list, for publish --models.",
-            show_default=False,
         ),
     ] = None,
-    everything: All = False,
-    json: Json = False,
+    everything: opt.All = False,
+    json: opt.Json = False,
 ) -> None:
     """Compare models on a cohort by cross-validation and choose one. Reads Gram rows only.
 
@@ -119,36 +92,33 @@ def select(
 @recorded
 def publish(
     context: typer.Context,
-    name: ModelName,
+    name: opt.ModelName,
     cohort: Annotated[
         str | None,
         typer.Option(
             help="SQL predicate on the view drives. Default: the cohort of the model's champion; "
-            "all drives, for a new model.",
-            show_default=False,
+            "all drives, for a new model."
         ),
     ] = None,
-    include_faulty: IncludeFaulty = False,
-    models: ModelList = None,
-    label: Label = None,
-    robust: Robust = False,
-    half_life: HalfLife = None,
-    prior: Prior = None,
+    include_faulty: opt.IncludeFaulty = False,
+    models: opt.ModelList = None,
+    label: opt.Label = None,
+    robust: opt.Robust = False,
+    half_life: opt.HalfLife = None,
+    prior: opt.Prior = None,
     force: Annotated[
         bool, typer.Option("--force", help="Publish even a model that is worse than the champion.")
     ] = False,
     candidate: Annotated[
-        bool,
-        typer.Option("--candidate", help="Publish as a candidate; promote makes it champion."),
+        bool, typer.Option("--candidate", help="Publish as a candidate; promote makes it champion.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print what would be published; publish nothing.")
     ] = False,
     mlflow: Annotated[
-        str | None,
-        typer.Option(help="URI of an MLflow server to register the version in, too."),
+        str | None, typer.Option(help="URI of an MLflow server to register the version in, too.")
     ] = None,
-    json: Json = False,
+    json: opt.Json = False,
 ) -> None:
     """Select from a model list and publish the winner as a model's next version, its champion.
 
@@ -194,24 +164,20 @@ def publish(
 
 def diagnose(
     context: typer.Context,
-    model: Model = None,
-    cohort: Cohort = TRAINING_DRIVES,
+    model: opt.Model = None,
+    cohort: opt.Cohort = TRAINING_DRIVES,
     signals: Annotated[
         str | None,
         typer.Option(
             help="Signals to fit instead of a published model, separated by commas; 'catalogue' is "
-            "all inputs.",
-            show_default=False,
+            "all inputs."
         ),
     ] = None,
     features: Annotated[
-        str | None,
-        typer.Option(
-            help="Feature set of --signals. Default: the logged signals.", show_default=False
-        ),
+        str | None, typer.Option(help="Feature set of --signals. Default: the logged signals.")
     ] = None,
-    cluster: ClusterUnit = None,
-    json: Json = False,
+    cluster: opt.ClusterUnit = None,
+    json: opt.Json = False,
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
 

@@ -15,7 +15,8 @@ import pyarrow as pa
 import typer
 
 from fleet_slip.base import pluralize
-from fleet_slip.cli.options import Json, fleet_of
+from fleet_slip.cli import options as opt
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import json_text, print_json, print_text, say
 from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory, split_statements
@@ -36,11 +37,10 @@ def sql(
     query: Annotated[
         str,
         typer.Argument(
-            help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.',
-            show_default=False,
+            help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.'
         ),
     ] = "-",
-    json: Json = False,
+    json: opt.Json = False,
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV on stdout.")] = False,
     exact: Annotated[
         bool,
@@ -51,8 +51,7 @@ def sql(
         ),
     ] = False,
     output: Annotated[
-        Path | None,
-        typer.Option(help="File to write: .parquet, .csv or .json.", show_default=False),
+        Path | None, typer.Option(help="File to write: .parquet, .csv or .json.")
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Print all rows and columns.")] = False,
     unsafe: Annotated[

@@ -23,7 +23,7 @@ from fleet_slip.catalog.definitions import (
     plain_column,
     rows_behind,
 )
-from fleet_slip.columns.column_sql import CountedColumns, parts_of, rows_of
+from fleet_slip.columns.column_sql import CountedColumns, components_of, rows_of
 from fleet_slip.columns.lowering import (
     GIVEN,
     OPERATIONS,
@@ -125,7 +125,7 @@ class Code:
 
     Attributes:
         signals, of_car: what the program reads of a drive and its car, with their numbers.
-        summed, kept: what is summed up, and what is kept, over a drive.
+        summed, stored: the values that are summed, and stored, over a drive.
         kinds: windows of different lengths in ticks.
     """
 
@@ -133,30 +133,34 @@ class Code:
     signals: dict[str, int] = field(default_factory=dict)
     of_car: dict[VehicleAttribute | ParameterCount, int] = field(default_factory=dict)
     summed: dict[Value, int] = field(default_factory=dict)
-    kept: dict[Value, int] = field(default_factory=dict)
+    stored: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
     _known: dict[VectorOperation, int] = field(default_factory=dict)
 
-    def add(self, one: VectorOperation) -> int:
+    def add(self, operation: VectorOperation) -> int:
         """Add an operation if there is no equal one; return its number."""
-        if one not in self._known:
-            self._known[one] = self._append(one)
-        return self._known[one]
+        if operation not in self._known:
+            self._known[operation] = self._append(operation)
+        return self._known[operation]
 
-    def _append(self, one: VectorOperation) -> int:
-        self.operations.append(one)
+    def _append(self, operation: VectorOperation) -> int:
+        self.operations.append(operation)
         return len(self.operations) - 1
 
     def assemble(self, results: Sequence[Value]) -> "BlockProgram":
         """Return the program with results in the first registers."""
         columns: list[int] = []
-        for one in results:
-            if isinstance(one, int) and one not in columns:
-                columns.append(one)
+        for result in results:
+            if isinstance(result, int) and result not in columns:
+                columns.append(result)
             else:
-                columns.append(self._append(VectorOperation(COPY, (one,))))
+                columns.append(self._append(VectorOperation(COPY, (result,))))
         registers = {value: register for register, value in enumerate(columns)}
-        last = {read: number for number, one in enumerate(self.operations) for read in one.reads}
+        last = {
+            read: number
+            for number, operation in enumerate(self.operations)
+            for read in operation.reads
+        }
         count, free = len(registers), list[int]()
         for number, operation in enumerate(self.operations):
             if number not in registers and operation.operation not in {ADD_UP, KEEP}:
@@ -168,9 +172,12 @@ class Code:
             free += [registers[read] for read in ended.difference(columns)]
         places = [
             [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
-            + [(Region.REGISTER, registers[r]) if isinstance(r, int) else r for r in one.reads]
-            + [NOWHERE] * (MOST_READ - len(one.reads))
-            for number, one in enumerate(self.operations)
+            + [
+                (Region.REGISTER, registers[r]) if isinstance(r, int) else r
+                for r in operation.reads
+            ]
+            + [NOWHERE] * (MOST_READ - len(operation.reads))
+            for number, operation in enumerate(self.operations)
         ]
         return BlockProgram(self, np.array(places, dtype=np.int64), count)
 
@@ -189,7 +196,7 @@ class BlockProgram:
     @cached_property
     def ratios(self) -> FloatArray:
         """The ratio of each step, shape (steps, 4)."""
-        return np.array([one.ratio for one in self.code.operations])
+        return np.array([operation.ratio for operation in self.code.operations])
 
     def regions(self, rows: int) -> NDArray[np.int64]:
         """Return each region's begin and stride for so many rows, and the memory's size last."""
@@ -202,7 +209,7 @@ class BlockProgram:
             Region.TICK: (1, rows),
             Region.SUM: (len(code.summed), rows + 1),
             Region.COUNT: (len(code.summed), rows + 1),
-            Region.VALUE: (len(code.kept), rows),
+            Region.VALUE: (len(code.stored), rows),
             Region.BEGIN: (len(code.kinds), rows),
         }
         # Whoever reads what is of the car as a block must not read beyond the end.
@@ -216,9 +223,12 @@ class BlockProgram:
         regions = self.regions(rows)
         begins, strides = regions[self.places[..., 0]].transpose(2, 0, 1)
         moves = self.places[..., 0] == Region.SIGNAL
-        others = [[one.slot, one.kind, one.ticks, one.number] for one in self.code.operations]
-        operations = [[one.operation] for one in self.code.operations]
-        return np.hstack([operations, begins + strides * self.places[..., 1], moves, others])
+        settings = [
+            [operation.slot, operation.kind, operation.ticks, operation.number]
+            for operation in self.code.operations
+        ]
+        operations = [[operation.operation] for operation in self.code.operations]
+        return np.hstack([operations, begins + strides * self.places[..., 1], moves, settings])
 
 
 # Patterns of steps that one loop over a block does together, for speed.
@@ -283,32 +293,32 @@ class _Writer:
         if name in GIVEN:
             return self._signal_or_car(name, plain[0])
         if self._whole(number):
-            found = self._do(TO_BINARY64, self.integers(number, guard))
-            return self._do(WHERE, found, self._present(number, guard))
+            value = self._do(TO_BINARY64, self.integers(number, guard))
+            return self._do(WHERE, value, self._present(number, guard))
         fused = None
-        if not any(self._whole(one) for one in operands_of(step)):
+        if not any(self._whole(operand) for operand in operands_of(step)):
             fused = self._fused(number, guard)
         return self._plain(number, guard) if fused is None else fused
 
     def _signal_or_car(self, name: str, place: int) -> Value:
         if name == "signal":
             return (Region.SIGNAL, place)
-        one = self._of_car[place + (self._facts if name == "number" else 0)]
-        return self._do(BROADCAST, (Region.OF_CAR, _number(self.code.of_car, one)))
+        car_input = self._of_car[place + (self._facts if name == "number" else 0)]
+        return self._do(BROADCAST, (Region.OF_CAR, _number(self.code.of_car, car_input)))
 
     def _fused(self, number: int, guard: int | None) -> Value | None:
         """Return what one loop computes of several steps; None if there is no such loop."""
         for pattern, write in _FUSED:
-            found: dict[str, int] = {}
-            if self._matches(pattern, number, found):
-                return write(self, number, found, guard)
+            bindings: dict[str, int] = {}
+            if self._matches(pattern, number, bindings):
+                return write(self, number, bindings, guard)
         return None
 
     def _plain(self, number: int, guard: int | None) -> Value:
         name, plain = operation_of(self._steps[number]), plain_of(self._steps[number])
         if name == "at_least" and self._whole(plain[0]):
             # Rounded to binary64, the difference keeps its sign.
-            pair = [self.integers(one, guard) for one in plain]
+            pair = [self.integers(operand, guard) for operand in plain]
             excess = self._do(TO_BINARY64, self._do(INTEGERS + SUBTRACT, *pair))
             excess = self._do(WHERE, excess, self._present(plain[0], guard))
             return self._do(AT_LEAST, excess, self._do(FILL, ratio=(0.0, 1.0, 0.0, inf)))
@@ -320,16 +330,16 @@ class _Writer:
             return self._clip(number, plain[0], self._ranges[plain[1]][1], guard)
         if name == "where":
             guard = self._guarded_by(plain[1])
-        found = self._do(_LOOPS[name], *(self.value(one, guard) for one in plain))
+        result = self._do(_LOOPS[name], *(self.value(operand, guard) for operand in plain))
         if name in ("//", "nearest"):
-            return self._divided(found, plain[1], guard)
-        return found
+            return self._divided(result, plain[1], guard)
+        return result
 
-    def _guarded_by(self, there: int) -> int | None:
+    def _guarded_by(self, step: int) -> int | None:
         """Return the step that is above zero wherever another one is there."""
-        found: dict[str, int] = {}
-        guards = self._matches(("at_least", "guard", "#least"), there, found)
-        return found["guard"] if guards and found["#least"] > 0 else None
+        bindings: dict[str, int] = {}
+        guards = self._matches(("at_least", "guard", "#least"), step, bindings)
+        return bindings["guard"] if guards and bindings["#least"] > 0 else None
 
     def _divided(self, quotient: Value, divisor: int, guard: int | None) -> Value:
         if self._is_positive(divisor, guard):
@@ -337,8 +347,8 @@ class _Writer:
         return self._do(WHERE, quotient, self._above_zero(divisor, guard))
 
     def _above_zero(self, number: int, guard: int | None) -> Value:
-        one = self._do(FILL, ratio=(1.0, 1.0, 0.0, inf))
-        return self._do(AT_LEAST, self.value(number, guard), one)
+        least = self._do(FILL, ratio=(1.0, 1.0, 0.0, inf))
+        return self._do(AT_LEAST, self.value(number, guard), least)
 
     def _is_positive(self, number: int, guard: int | None) -> bool:
         if (constant := self._constant(number)) is not None:
@@ -348,7 +358,7 @@ class _Writer:
             return True
         step = self._steps[number]
         return step[0] in ("+", "*") and all(
-            self._is_positive_term(one, guard) for one in operands_of(step)
+            self._is_positive_term(operand, guard) for operand in operands_of(step)
         )
 
     def _is_positive_term(self, number: int, guard: int | None) -> bool:
@@ -373,7 +383,7 @@ class _Writer:
         if any(OPERATIONS[operation_of(self._steps[n])].over_time for n in operands_of(step)):
             return False  # a drive with so many rows is refused
         size = largest_in(step, number, self._ranges)
-        return size >= _EXACT or any(self._whole(one) for one in operands_of(step))
+        return size >= _EXACT or any(self._whole(operand) for operand in operands_of(step))
 
     def _integers(self, number: int, guard: int | None) -> Value:
         """Return a step in int64; anything where it is missing."""
@@ -381,76 +391,78 @@ class _Writer:
             return self._do(INTEGERS + FILL, number=constant)
         if not self._whole(number):
             return self._do(INTEGERS + COPY, self.value(number, guard))
-        found: dict[str, int] = {}
-        name, of = operation_of(self._steps[number]), operands_of(self._steps[number])
-        if self._matches(ROUNDED, number, found):
-            name, of = "nearest", (found["c"], found["d"])
+        bindings: dict[str, int] = {}
+        name, operands = operation_of(self._steps[number]), operands_of(self._steps[number])
+        if self._matches(ROUNDED, number, bindings):
+            name, operands = "nearest", (bindings["c"], bindings["d"])
         if name in ("//", "nearest"):
-            self._is_positive(of[1], guard)
-        parts = [self.integers(one, guard) for one in of]
+            self._is_positive(operands[1], guard)
+        parts = [self.integers(operand, guard) for operand in operands]
         return self._do(INTEGERS + _LOOPS[name], *parts)
 
     def _present(self, number: int, guard: int | None) -> Value:
         """Return what is NaN where a step in int64 is missing."""
         step = self._steps[number]
         parts: list[Value] = []
-        for one in operands_of(step):
-            if self._whole(one):
-                parts.append(self._present(one, guard))
-            elif self._constant(one) is None:
-                parts.append(self.value(one, guard))
+        for operand in operands_of(step):
+            if self._whole(operand):
+                parts.append(self._present(operand, guard))
+            elif self._constant(operand) is None:
+                parts.append(self.value(operand, guard))
         divisor = operands_of(step)[-1]
         if step[0] in ("//", "nearest") and not self._is_positive(divisor, guard):
             parts.append(self._above_zero(divisor, guard))
         return reduce(lambda a, b: self._do(WHERE, a, b), parts)
 
-    def _matches(self, pattern: Pattern, number: int, found: dict[str, int]) -> bool:
+    def _matches(self, pattern: Pattern, number: int, bindings: dict[str, int]) -> bool:
         """Return whether a step is what a pattern says, and what its names stand for."""
         if isinstance(pattern, int):
             return self._constant(number) == pattern
         if isinstance(pattern, str):
             value = self._constant(number) if pattern.startswith("#") else number
-            return value is not None and found.setdefault(pattern, value) == value
+            return value is not None and bindings.setdefault(pattern, value) == value
         step = self._steps[number]
         name, plain = operation_of(step), plain_of(step)
         if name != pattern[0]:
             return False
         steps = OPERATIONS[name].steps
         return all(
-            self._matches(one, of, found) if i < steps else found.setdefault(one, of) == of
-            for i, (one, of) in enumerate(zip(pattern[1:], plain, strict=True))
+            self._matches(element, operand, bindings)
+            if i < steps
+            else bindings.setdefault(element, operand) == operand
+            for i, (element, operand) in enumerate(zip(pattern[1:], plain, strict=True))
         )
 
-    def _scale(self, number: int, found: Found, guard: int | None) -> Value:
-        value, limit = self.value(found["x"], guard), float(found.get("#limit", inf))
-        numerator, fixed = found.get("#numerator", 1), found["#fixed"]
+    def _scale(self, number: int, bindings: Found, guard: int | None) -> Value:
+        value, limit = self.value(bindings["x"], guard), float(bindings.get("#limit", inf))
+        numerator, fixed = bindings.get("#numerator", 1), bindings["#fixed"]
         _require_positive(fixed)
-        if numerator == fixed and size_of(self._ranges[found["x"]]) <= limit:
+        if numerator == fixed and size_of(self._ranges[bindings["x"]]) <= limit:
             return value
         times = self._counted.times.get(number, 0)
         ratio = (float(numerator), float(fixed), 0.0, limit)
         return self._do(SCALE, value, ratio=ratio, number=times)
 
-    def _clip(self, number: int, of: int, limit: int, guard: int | None) -> Value:
-        value = self.value(of, guard)
-        if size_of(self._ranges[of]) <= limit:
+    def _clip(self, number: int, source: int, limit: int, guard: int | None) -> Value:
+        value = self.value(source, guard)
+        if size_of(self._ranges[source]) <= limit:
             return value
         times = self._counted.times.get(number, 0)
         return self._do(CLIP, value, ratio=(0.0, 1.0, 0.0, float(limit)), number=times)
 
-    def _share(self, _: int, found: Found, guard: int | None) -> Value:
-        factors = (self.value(found[one], guard) for one in "xy")
-        return self._do(SHARE, *factors, ratio=(1.0, float(found["#fixed"]), 0.0, inf))
+    def _share(self, _: int, bindings: Found, guard: int | None) -> Value:
+        factors = (self.value(bindings[factor], guard) for factor in "xy")
+        return self._do(SHARE, *factors, ratio=(1.0, float(bindings["#fixed"]), 0.0, inf))
 
-    def _round(self, _: int, found: Found, guard: int | None) -> Value:
-        quotient = self._do(NEAREST, *(self.value(found[one], guard) for one in "cd"))
-        return self._divided(quotient, found["d"], guard)
+    def _round(self, _: int, bindings: Found, guard: int | None) -> Value:
+        quotient = self._do(NEAREST, *(self.value(bindings[operand], guard) for operand in "cd"))
+        return self._divided(quotient, bindings["d"], guard)
 
-    def _quotient(self, number: int, found: Found, _: int | None) -> Value:
+    def _quotient(self, number: int, bindings: Found, _: int | None) -> Value:
         """Write a sum over a window times numerator / (fixed + each * its values), rounded."""
-        value = self.value(found["row"])
-        ticks, limit = found["ticks"], float(found.get("#limit", inf))
-        fixed, each = (float(found.get(one, 0)) for one in ("#fixed", "#each"))
+        value = self.value(bindings["row"])
+        ticks, limit = bindings["ticks"], float(bindings.get("#limit", inf))
+        fixed, per_value = (float(bindings.get(key, 0)) for key in ("#fixed", "#each"))
         slot, kind = _number(self.code.summed, value), _number(self.code.kinds, ticks)
         sums, counts, begins = (Region.SUM, slot), (Region.COUNT, slot), (Region.BEGIN, kind)
         self._do(ADD_UP, value, sums, counts, slot=slot)
@@ -461,25 +473,25 @@ class _Writer:
             kind=kind,
             ticks=ticks,
             number=self._counted.times.get(number, 0),
-            ratio=(float(found.get("#numerator", 1)), fixed, each, limit),
+            ratio=(float(bindings.get("#numerator", 1)), fixed, per_value, limit),
         )
 
     def _ago(self, row: int, ticks: int) -> Value:
         """Write the value so many ticks ago: its window begins there, one tick longer."""
         value = self.value(row)
-        slot, kind = _number(self.code.kept, value), _number(self.code.kinds, ticks + 1)
-        kept, begins = (Region.VALUE, slot), (Region.BEGIN, kind)
-        self._do(KEEP, value, kept)
-        return self._do(AGO, kept, NOWHERE, begins, kind=kind, ticks=ticks)
+        slot, kind = _number(self.code.stored, value), _number(self.code.kinds, ticks + 1)
+        history, begins = (Region.VALUE, slot), (Region.BEGIN, kind)
+        self._do(KEEP, value, history)
+        return self._do(AGO, history, NOWHERE, begins, kind=kind, ticks=ticks)
 
     def _do(self, operation: int, *operands: Value, **more: Any) -> int:
         return self.code.add(VectorOperation(operation, operands, **more))
 
 
 _FUSED: Sequence[tuple[Pattern, Callable[[_Writer, int, Found, int | None], Value]]] = [
-    *((one, _Writer._quotient) for one in QUOTIENTS),
-    *((("clip", one, "#limit"), _Writer._scale) for one in SCALED),
-    *((one, _Writer._scale) for one in SCALED if one[1] != "x"),
+    *((pattern, _Writer._quotient) for pattern in QUOTIENTS),
+    *((("clip", pattern, "#limit"), _Writer._scale) for pattern in SCALED),
+    *((pattern, _Writer._scale) for pattern in SCALED if pattern[1] != "x"),
     (("nearest", ("*", "x", "y"), "#fixed"), _Writer._share),
     (ROUNDED, _Writer._round),
 ]
@@ -491,8 +503,8 @@ def _require_positive(divisor: int) -> None:
         raise QuestionError("a feature divides by a number that is not positive.")
 
 
-def _number(known: dict[Any, int], key: object) -> int:
-    return known.setdefault(key, len(known))
+def _number(numbers: dict[Any, int], key: object) -> int:
+    return numbers.setdefault(key, len(numbers))
 
 
 # What to compute of a drive: columns of single rows, and columns that look back.
@@ -545,14 +557,18 @@ class ColumnPlan:
     @property
     def facts(self) -> tuple[str, ...]:
         """The drive columns that are needed."""
-        parts = [part for one in self.windows.values() for part in parts_of(one)]
-        return tuple(dict.fromkeys(part.fact.name for part in parts if part.fact))
+        components = [
+            component for column in self.windows.values() for component in components_of(column)
+        ]
+        return tuple(
+            dict.fromkeys(component.fact.name for component in components if component.fact)
+        )
 
     @property
     def numbers(self) -> tuple[str, ...]:
         """What the drives of a car must have determined, or running means stand for."""
-        found = (one.number.name for one in self.windows.values() if one.number)
-        return tuple(dict.fromkeys(found))
+        names = (column.number.name for column in self.windows.values() if column.number)
+        return tuple(dict.fromkeys(names))
 
     @property
     def limits(self) -> tuple[int, ...]:
@@ -567,8 +583,10 @@ class ColumnPlan:
     @cached_property
     def most_rows(self) -> float:
         """Of how many rows its slopes are exact, and the same on board, which adds up no more."""
-        made = (row.made for row in rows_behind(self.windows).values())
-        slopes = [len(one.equations) for one in made if isinstance(one, Slope)]
+        composites = (row.made for row in rows_behind(self.windows).values())
+        slopes = [
+            len(composite.equations) for composite in composites if isinstance(composite, Slope)
+        ]
         return min(map(most_products, slopes), default=inf)
 
     @cached_property

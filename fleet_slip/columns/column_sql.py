@@ -72,13 +72,13 @@ def sql_constant(value: int) -> str:
     return str(value) if value >= 0 else f"({value})"
 
 
-def attribute_sql(one: VehicleAttribute) -> str:
+def attribute_sql(attribute: VehicleAttribute) -> str:
     """Return the whole number of a fact, given the column of the drive; null if not known."""
-    if one.equals is None:
-        known = f"ABS({one.name}) <= {MAX_ATTRIBUTE}"
-        return f"CASE WHEN {known} THEN CAST(ROUND({one.name}) AS BIGINT) END"
-    is_it = f"{one.name} = '{one.equals}'"
-    return f"CASE WHEN {is_it} THEN 1 WHEN {one.name} IS NOT NULL THEN 0 END"
+    if attribute.equals is None:
+        is_valid = f"ABS({attribute.name}) <= {MAX_ATTRIBUTE}"
+        return f"CASE WHEN {is_valid} THEN CAST(ROUND({attribute.name}) AS BIGINT) END"
+    is_it = f"{attribute.name} = '{attribute.equals}'"
+    return f"CASE WHEN {is_it} THEN 1 WHEN {attribute.name} IS NOT NULL THEN 0 END"
 
 
 def sql_of(
@@ -113,11 +113,11 @@ class SqlLayers:
         steps: Sequence[Step],
         ranges: Sequence[Range],
         table: Mapping[str, str],
-        given: Callable[[str, int], str],
+        input_sql: Callable[[str, int], str],
     ) -> None:
-        self._steps, self._ranges, self._table, self._given = steps, ranges, table, given
+        self._steps, self._ranges, self._table, self._input_sql = steps, ranges, table, input_sql
         self.layers: defaultdict[int, list[str]] = defaultdict(list)
-        self._uses = Counter(of for step in steps for of in operands_of(step))
+        self._uses = Counter(operand for step in steps for operand in operands_of(step))
         self._texts: dict[int, tuple[str, int]] = {}
 
     def text(self, number: int) -> tuple[str, int]:
@@ -139,16 +139,16 @@ class SqlLayers:
         if name == "constant":
             return sql_constant(plain[0]), 0
         if name in GIVEN:
-            return self._given(name, plain[0]), 0
-        one = OPERATIONS[name]
-        own = plain[: one.steps]
+            return self._input_sql(name, plain[0]), 0
+        operation = OPERATIONS[name]
+        operands = plain[: operation.steps]
         inline = name in INLINE
-        parts = [self.text(i) if inline else self.column(i) for i in own]
+        parts = [self.text(i) if inline else self.column(i) for i in operands]
         text = sql_of(
             name,
             [part for part, _ in parts],
-            *plain[one.steps :],
-            divides_by=self._ranges[own[-1]][0],
+            *plain[operation.steps :],
+            divides_by=self._ranges[operands[-1]][0],
             table=self._table,
         )
         layer = max(layer for _, layer in parts)
@@ -170,8 +170,8 @@ LOGGED: Range = (-(2**15), 2**15 - 1)
 
 
 class _ClippedLast(Lowering):
-    def clip_where(self, step: int, limit: int, there: Callable[[], int]) -> int:
-        return self.clip(self.do("where", step, there()), limit)
+    def clip_where(self, step: int, limit: int, presence: Callable[[], int]) -> int:
+        return self.clip(self.do("where", step, presence()), limit)
 
 
 @dataclass(frozen=True)
@@ -196,57 +196,67 @@ class CountedColumns:
         cls, rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
     ) -> "CountedColumns":
         """Lower columns over time, and the `rows` that they look back on with others."""
-        signals = dict.fromkeys(name for one in rows.values() for name in one.signals)
+        signals = dict.fromkeys(name for definition in rows.values() for name in definition.signals)
         lowered = _ClippedLast({name: place for place, name in enumerate(signals)})
-        parts = [part for one in over_time.values() if not one.gate for part in parts_of(one)]
-        gated = [part for one in over_time.values() if one.gate for part in parts_of(one)]
-        parts += dict.fromkeys(gated)
+        components = [
+            component
+            for definition in over_time.values()
+            if not definition.gate
+            for component in components_of(definition)
+        ]
+        gated = [
+            component
+            for definition in over_time.values()
+            if definition.gate
+            for component in components_of(definition)
+        ]
+        components += dict.fromkeys(gated)
         places = {}
         for name, row in rows.items():  # a row, and all that looks back on it, stand together
             places[name] = lowered.row(row)
-            for part in parts:
-                if part.of == name:
-                    lowered.column(part)
-        found = {name: lowered.column(one) for name, one in over_time.items()}
+            for component in components:
+                if component.of == name:
+                    lowered.column(component)
+        columns = {name: lowered.column(definition) for name, definition in over_time.items()}
         steps = tuple(lowered.steps)
         ends = {*places.values()}
         times = Counter(places[name] for name, row in rows.items() if row.sql or row.made)
-        for part in parts:
-            times.update(_clips(steps, lowered.column(part), ends))
+        for component in components:
+            times.update(_clips(steps, lowered.column(component), ends))
         ranges = lowered.ranges([LOGGED] * len(signals))
-        return cls(lowered, steps, ranges, places | found, times)
+        return cls(lowered, steps, ranges, places | columns, times)
 
 
-def parts_of(one: Definition) -> Iterator[Definition]:
+def components_of(column: Definition) -> Iterator[Definition]:
     """Yield what a column is made of, each without a gate or a number."""
-    if one.number is not None:
-        yield from parts_of(one.model_copy(update={"number": None}))
-        if one.number.running is not None:
-            yield one.number.running
+    if column.number is not None:
+        yield from components_of(column.model_copy(update={"number": None}))
+        if column.number.running is not None:
+            yield column.number.running
     else:
-        yield from one.parts
+        yield from column.components
 
 
 def rows_of(
     rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
 ) -> dict[str, Definition]:
     """Return columns of one row, looked back on ones too. Raises `QuestionError`, `DataError`."""
-    found = dict(rows)
+    merged = dict(rows)
     for name, row in rows_behind(over_time).items():
-        if found.setdefault(name, row) != row:
+        if merged.setdefault(name, row) != row:
             raise DataError(f"the feature {name} is defined in two ways.")
-    return found
+    return merged
 
 
-def _clips(steps: tuple[Step, ...], of: int, ends: Iterable[int]) -> set[int]:
+def _clips(steps: tuple[Step, ...], end: int, ends: Iterable[int]) -> set[int]:
     """Return the steps that clip on the way to a step from `ends`, which are not looked into."""
-    found, waiting = set[int](), [of]
+    clips, waiting = set[int](), [end]
     while waiting:
         step = waiting.pop()
         if step not in ends:
-            found |= {step} if steps[step][0] == "clip" else set()
+            clips |= {step} if steps[step][0] == "clip" else set()
             waiting += operands_of(steps[step])
-    return found
+    return clips
 
 
 # The SQL of columns of counts, of a row and over time, as subqueries of `log_counts`.
@@ -272,8 +282,8 @@ def with_columns(
     """
     if not features and not over_time:
         return rows
-    known = rows_of(features, over_time)
-    counted = CountedColumns.of(known, over_time)
+    all_rows = rows_of(features, over_time)
+    counted = CountedColumns.of(all_rows, over_time)
     signals, facts = list(counted.lowered.signals), list(counted.lowered.facts)
     layers = SqlLayers(
         counted.steps,
@@ -291,15 +301,15 @@ def with_columns(
             columns.append(f"{layers.column(place)[0]}::{kind} AS {name}")
     for place, times in counted.times.items():
         value, limit = plain_of(counted.steps[place])
-        most = plain_of(counted.steps[limit])[0]
-        if size_of(counted.ranges[value]) > most:
-            outside = f"coalesce(abs({layers.column(value)[0]}) > {most}, false)::INTEGER"
+        largest = plain_of(counted.steps[limit])[0]
+        if size_of(counted.ranges[value]) > largest:
+            outside = f"coalesce(abs({layers.column(value)[0]}) > {largest}, false)::INTEGER"
             clips.append(f"{times} * {outside}" if times > 1 else outside)
     hidden = []
     for number in sorted(layers.layers):
-        made = _SEPARATOR.join(layers.layers[number])
-        rows = f"(SELECT *,\n            {made}\n        FROM {rows})"
-        hidden += [one.rpartition(" AS ")[2] for one in layers.layers[number]]
+        layer = _SEPARATOR.join(layers.layers[number])
+        rows = f"(SELECT *,\n            {layer}\n        FROM {rows})"
+        hidden += [column.rpartition(" AS ")[2] for column in layers.layers[number]]
     exclude = f" EXCLUDE ({', '.join(hidden)})" if hidden else ""
     columns.append(f"{' + '.join(clips) or '0'} AS clipped")
     return f"(SELECT *{exclude},\n            {_SEPARATOR.join(columns)}\n        FROM {rows})"

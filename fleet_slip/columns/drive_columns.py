@@ -41,11 +41,11 @@ class DriveCounts:
     numbers: Mapping[str, int] = field(default_factory=dict)
 
     @property
-    def whole(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether no tick between the first and the last is missing."""
         return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
 
-    def part(
+    def segment(
         self, rows: Any, facts: Mapping[str, Any], numbers: Mapping[str, int]
     ) -> "DriveCounts":
         """Return some of the rows, as those of a drive of which that is known."""
@@ -114,16 +114,16 @@ class Workspace:
             if name in drive.present:
                 counts[~drive.present[name]] = np.nan
         self._part(Region.TICK, 0, rows)[:] = drive.ticks
-        for number, one in enumerate(code.of_car):
-            known = (
-                one.count(drive.facts[one.name])
-                if isinstance(one, VehicleAttribute)
-                else drive.numbers.get(one.name)
+        for number, car_input in enumerate(code.of_car):
+            value = (
+                car_input.count(drive.facts[car_input.name])
+                if isinstance(car_input, VehicleAttribute)
+                else drive.numbers.get(car_input.name)
             )
-            self._part(Region.OF_CAR, number, 1)[:] = np.nan if known is None else known
+            self._part(Region.OF_CAR, number, 1)[:] = np.nan if value is None else value
         summed = max(len(code.summed), len(code.kinds), 1)
         self._flags = np.zeros((2, summed), dtype=np.bool_)
-        self._flags[GAPS] = not drive.whole
+        self._flags[GAPS] = not drive.is_complete
 
     def _part(self, region: Region, number: int, size: int) -> FloatArray:
         begin, stride = self._regions[region]
@@ -137,9 +137,9 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
         raise DataError(
             "the ticks of a drive do not increase: it has no windows. Run: fleet-slip verify"
         )
-    for one in plan.windows.values():
-        summed = one.over not in {None, "lag"}
-        if summed and 2 * (rows + 1) * limit_of(one.of_bits) * one.ratio.numerator >= _EXACT:
+    for window in plan.windows.values():
+        summed = window.over not in {None, "lag"}
+        if summed and 2 * (rows + 1) * limit_of(window.of_bits) * window.ratio.numerator >= _EXACT:
             raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     if rows > plan.most_rows:
         raise DataError(f"the drive has {rows:,} rows: too many for windows.")
@@ -153,7 +153,7 @@ def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
 
 def compute_columns(plan: ColumnPlan, drive: DriveCounts) -> FloatArray:
     """Return all columns of a drive, (columns, rows), NaN where missing; raises as `blocks`."""
-    found = np.empty((len(plan.names), len(drive.ticks)))
+    columns = np.empty((len(plan.names), len(drive.ticks)))
     for rows, block, _ in Workspace(plan).blocks(drive):
-        found[:, rows] = block
-    return found
+        columns[:, rows] = block
+    return columns

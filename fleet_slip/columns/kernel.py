@@ -95,9 +95,9 @@ def compute(  # noqa: PLR0912 - one loop for each operation
         for i in range(size):
             out[i] = a[i] if a[i] == a[i] else b[i]
     elif operation == op.TO_BINARY64:
-        whole = memory.view(np.int64)[of_a : of_a + size]
+        integers = memory.view(np.int64)[of_a : of_a + size]
         for i in range(size):
-            out[i] = np.float64(whole[i])
+            out[i] = np.float64(integers[i])
     elif operation == op.CLIP:
         outside = 0
         for i in range(size):
@@ -125,12 +125,12 @@ def compute(  # noqa: PLR0912 - one loop for each operation
 def compute_integers(operation: int, memory: Any, places: Any, size: int, number: int) -> None:
     """Do an operation that writes int64; `COPY` is from binary64."""
     at, of_a, of_b = places
-    whole = memory.view(np.int64)
-    out, a, b = whole[at : at + size], whole[of_a : of_a + size], whole[of_b : of_b + size]
-    given = memory[of_a : of_a + size]
+    integers = memory.view(np.int64)
+    out, a, b = integers[at : at + size], integers[of_a : of_a + size], integers[of_b : of_b + size]
+    floats = memory[of_a : of_a + size]
     if operation == op.COPY:
         for i in range(size):
-            out[i] = np.int64(given[i] if given[i] == given[i] else 0.0)
+            out[i] = np.int64(floats[i] if floats[i] == floats[i] else 0.0)
     elif operation <= op.SIGN:
         _calculate(operation, out, a, b)
     elif operation == op.FILL:
@@ -227,7 +227,7 @@ def divide_sums(
     """
     at, of_sums, of_counts, of_begins, of_values = places
     out, clipped = memory[at : at + size], memory[0:size]
-    numerator, fixed, each, limit = ratio[NUMERATOR], ratio[FIXED], ratio[EACH], ratio[LIMIT]
+    numerator, fixed, per_value, limit = ratio[NUMERATOR], ratio[FIXED], ratio[EACH], ratio[LIMIT]
     sums, counts = memory[of_sums:], memory[of_counts:]
     begins, values = memory[of_begins + first :], memory[of_values : of_values + size]
     # The rows before `single` are divided one by one, the others by the same number.
@@ -238,7 +238,7 @@ def divide_sums(
         t = first + i
         begin = int(begins[i]) if gaps else (max(t + 1 - ticks, 0) if ticks else 0)
         count = counts[t + 1] - counts[begin] if gaps else float(t + 1 - begin)
-        divisor = fixed + each * count
+        divisor = fixed + per_value * count
         value = nearest(sums[t + 1] - sums[begin], numerator, divisor)
         if np.isnan(values[i]):
             value = np.nan
@@ -247,7 +247,7 @@ def divide_sums(
     # Slices of one length and a count of integers: then the loop is vectorised.
     rows, until = size - single, first + single + 1
     newest, oldest = sums[until : until + rows], sums[until - ticks : until - ticks + rows]
-    written, divisor = out[single:], fixed + each * ticks
+    written, divisor = out[single:], fixed + per_value * ticks
     outside = 0
     for i in range(rows):
         value = nearest(newest[i] - oldest[i], numerator, divisor)
@@ -265,8 +265,8 @@ def values_ago(memory: Any, places: Any, first: int, size: int, ticks: int) -> N
     at, of_values, of_ticks, of_begins = places
     for i in range(size):
         begin = int(memory[of_begins + first + i])
-        there = memory[of_ticks + begin] == memory[of_ticks + first + i] - ticks
-        memory[at + i] = memory[of_values + begin] if there else np.nan
+        is_logged = memory[of_ticks + begin] == memory[of_ticks + first + i] - ticks
+        memory[at + i] = memory[of_values + begin] if is_logged else np.nan
 
 
 @inner_loop

@@ -57,36 +57,36 @@ def _corners(compute: Callable[[int, int], int]) -> Callable[[Range, Range], Ran
     """Return the range of what rises or falls in each operand: its extremes are at the ends."""
 
     def range_of(a: Range, b: Range) -> Range:
-        found = [compute(x, y) for x in a for y in b]
-        return min(found), max(found)
+        corners = [compute(x, y) for x in a for y in b]
+        return min(corners), max(corners)
 
     return range_of
 
 
 def _quotients(compute: Callable[[int, int], int]) -> Callable[[Range, Range], Range]:
-    found = _corners(compute)
-    return lambda a, b: found(a, (max(1, b[0]), max(1, b[1])))
+    range_of = _corners(compute)
+    return lambda a, b: range_of(a, (max(1, b[0]), max(1, b[1])))
 
 
 def _first(a: Range, *_: object) -> Range:
     return a
 
 
-def _powers(a: Range, most: Range) -> Range:
-    return power(a[0], most[0]), power(a[1], most[0])
+def _powers(a: Range, divisor: Range) -> Range:
+    return power(a[0], divisor[0]), power(a[1], divisor[0])
 
 
 POWERS = 32
 """So many powers of two a target that cannot count them compares with."""
 
 
-def power(value: int, most: int) -> int:
-    """Return the least power of two, at least 1, times which `most` is not below a value."""
-    return 1 << max(0, (max(value, 1) - 1) // most).bit_length()
+def power(value: int, divisor: int) -> int:
+    """Return the least power of two, at least 1, times which `divisor` is not below a value."""
+    return 1 << max(0, (max(value, 1) - 1) // divisor).bit_length()
 
 
-def _sums(a: Range, _: int, most: int) -> Range:
-    return min(0, a[0] * most), max(0, a[1] * most)
+def _sums(a: Range, _: int, count: int) -> Range:
+    return min(0, a[0] * count), max(0, a[1] * count)
 
 
 OPERATIONS: Mapping[str, Operation] = {
@@ -106,7 +106,7 @@ OPERATIONS: Mapping[str, Operation] = {
     "negative": Operation(lambda a: (-a[1], -a[0]), 1),
     "abs": Operation(lambda a: (0 if a[0] <= 0 <= a[1] else min(map(abs, a)), max(map(abs, a))), 1),
     "sign": Operation(lambda a: ((a[0] > 0) - (a[0] < 0), (a[1] > 0) - (a[1] < 0)), 1),
-    "clip": Operation(lambda *of: (-of[1][1], of[1][1])),
+    "clip": Operation(lambda _, limit: (-limit[1], limit[1])),
     "power": Operation(_powers),  # of two, the least p with a <= b p
     # What may be missing.
     "at_least": Operation(_first, missing="less"),
@@ -115,7 +115,7 @@ OPERATIONS: Mapping[str, Operation] = {
     # What looks back, on so many ticks.
     "ago": Operation(_first, 1, "given", over_time=True),
     "sum": Operation(_sums, 1, "never", over_time=True),
-    "values": Operation(lambda *of: (0, of[2]), 1, "never", over_time=True),
+    "values": Operation(lambda *operands: (0, operands[2]), 1, "never", over_time=True),
 }
 
 GIVEN = ("signal", "fact", "number")
@@ -128,7 +128,7 @@ def operation_of(step: Step) -> str:
 
 def plain_of(step: Step) -> tuple[int, ...]:
     """Return everything that a step works on: numbers of steps, then plain numbers."""
-    return tuple(int(one) for one in step[1:])
+    return tuple(int(operand) for operand in step[1:])
 
 
 def operands_of(step: Step) -> tuple[int, ...]:
@@ -136,68 +136,70 @@ def operands_of(step: Step) -> tuple[int, ...]:
     return plain_of(step)[: OPERATIONS[operation_of(step)].steps]
 
 
-def ranges_of(steps: Sequence[Step], given: Mapping[str, Sequence[Range]]) -> list[Range]:
-    """Return the range of each step, zero included in what is `given`, as for missing values."""
-    found: list[Range] = []
+def ranges_of(steps: Sequence[Step], inputs: Mapping[str, Sequence[Range]]) -> list[Range]:
+    """Return the range of each step, zero included in what is `inputs`, as for missing values."""
+    ranges: list[Range] = []
     for step in steps:
         name, plain = operation_of(step), plain_of(step)
-        one = OPERATIONS[name]
+        operation = OPERATIONS[name]
         if name in GIVEN:
-            least, most = given[name][plain[0]]
-            found.append((min(least, 0), max(most, 0)))
+            least, largest = inputs[name][plain[0]]
+            ranges.append((min(least, 0), max(largest, 0)))
         else:
-            of = [found[i] for i in plain[: one.steps]]
-            found.append(one.range_of(*of, *plain[one.steps :]))
-    return found
+            operands = [ranges[i] for i in plain[: operation.steps]]
+            ranges.append(operation.range_of(*operands, *plain[operation.steps :]))
+    return ranges
 
 
 def roots_of(steps: Sequence[Step], ranges: Sequence[Range]) -> list[tuple[int, ...]]:
     """Return, for each step, the steps that must be there by themselves for it to be there."""
-    found: list[tuple[int, ...]] = []
+    result: list[tuple[int, ...]] = []
     for number, step in enumerate(steps):
-        missing, of = OPERATIONS[operation_of(step)].missing, operands_of(step)
-        roots = [root for i in of for root in found[i]]
+        missing, operands = OPERATIONS[operation_of(step)].missing, operands_of(step)
+        roots = [root for i in operands for root in result[i]]
         if step[0] == "where":  # a value of now is one of its window's, so that it has values
-            roots = [one for one in roots if one not in _mean_of(steps, of[0], of[1])]
-        if missing == "less" or (missing == "divisor" and ranges[of[1]][0] <= 0):
+            roots = [
+                root for root in roots if root not in _mean_of(steps, operands[0], operands[1])
+            ]
+        if missing == "less" or (missing == "divisor" and ranges[operands[1]][0] <= 0):
             roots.append(number)
-        elif missing == "given" or (missing == "both" and all(found[i] for i in of)):
+        elif missing == "given" or (missing == "both" and all(result[i] for i in operands)):
             roots = [number]
         elif missing in ("never", "both"):
             roots = []
-        found.append(tuple(dict.fromkeys(roots)))
-    return found
+        result.append(tuple(dict.fromkeys(roots)))
+    return result
 
 
 def _mean_of(steps: Sequence[Step], mean: int, now: int) -> set[int]:
     """Return the quotients in a mean by the number of values of a window that `now` is in."""
-    found, inner = set[int](), [mean]
+    quotients, inner = set[int](), [mean]
     while inner:
         number = inner.pop()
-        one = steps[number]
-        if one[0] in ("clip", "where"):
-            inner.append(operands_of(one)[0])
-        elif one[0] == "nearest":
-            divisor = steps[operands_of(one)[1]]
+        step = steps[number]
+        if step[0] in ("clip", "where"):
+            inner.append(operands_of(step)[0])
+        elif step[0] == "nearest":
+            divisor = steps[operands_of(step)[1]]
             counts = [divisor, *(steps[i] for i in operands_of(divisor) if divisor[0] == "*")]
             if any(count[:2] == ("values", now) for count in counts):
-                found.add(number)
-    return found
+                quotients.add(number)
+    return quotients
 
 
 def rings_of(steps: Sequence[Step]) -> dict[int, int]:
     """Return the steps that are looked back on, and how many ticks; 0 are all since the start."""
-    found: dict[int, int] = {}
+    rings: dict[int, int] = {}
     for step in steps:
         if OPERATIONS[operation_of(step)].over_time:
-            of, ticks, *_ = plain_of(step)
-            found[of] = max(found.get(of, 0), ticks)
-    return found
+            source, ticks, *_ = plain_of(step)
+            rings[source] = max(rings.get(source, 0), ticks)
+    return rings
 
 
-def size_of(one: Range) -> int:
+def size_of(interval: Range) -> int:
     """Return the largest size of a value of a range."""
-    return max(-one[0], one[1])
+    return max(-interval[0], interval[1])
 
 
 def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
@@ -271,9 +273,9 @@ class Lowering:
     ) -> tuple["Lowering", list[int]]:
         """Lower columns; return the step of each, too."""
         self = cls({name: place for place, name in enumerate(signals)})
-        for one in columns:
-            self._rows(one)
-        return self, [self.column(one) for one in columns]
+        for column in columns:
+            self._rows(column)
+        return self, [self.column(column) for column in columns]
 
     def ranges(self, signals: Sequence[Range]) -> list[Range]:
         """Return the range of each step, given those of the signals.
@@ -281,13 +283,13 @@ class Lowering:
         Raises `QuestionError` for a step that may need more than 63 bits.
         """
         steps = tuple(self.steps)
-        found = ranges_of(steps, given_ranges(signals, self.facts, self.numbers))
-        if any(largest_in(step, i, found) > LARGEST_WORD for i, step in enumerate(steps)):
+        ranges = ranges_of(steps, given_ranges(signals, self.facts, self.numbers))
+        if any(largest_in(step, i, ranges) > LARGEST_WORD for i, step in enumerate(steps)):
             raise QuestionError(
                 "a column may need more than 63 bits: choose smaller coefficients, or columns of "
                 "fewer bits."
             )
-        return found
+        return ranges
 
     def do(self, operation: str, *operands: int) -> int:
         """Add a step; return its number."""
@@ -301,9 +303,9 @@ class Lowering:
         """Return a step within ±limit."""
         return self.do("clip", step, self.constant(limit))
 
-    def clip_where(self, step: int, limit: int, there: Callable[[], int]) -> int:
+    def clip_where(self, step: int, limit: int, presence: Callable[[], int]) -> int:
         """Return a step within ±limit, where another one is there too, which comes after it."""
-        return self.do("where", self.clip(step, limit), there())
+        return self.do("where", self.clip(step, limit), presence())
 
     def nearest(self, step: int, numerator: int, divisor: int) -> int:
         """Return a step times a constant over another step, rounded."""
@@ -314,79 +316,79 @@ class Lowering:
         """Return a step less a constant."""
         return self.do("-", step, self.constant(constant)) if constant else step
 
-    def _rows(self, one: Definition) -> None:
+    def _rows(self, column: Definition) -> None:
         """Add what a column is made of at one tick, before anything that looks back."""
-        self.row(one)
-        if one.gate is not None:
-            self.row(one.gate.by)
-        if one.number is not None and one.number.running is not None:
-            self.row(one.number.running)
+        self.row(column)
+        if column.gate is not None:
+            self.row(column.gate.by)
+        if column.number is not None and column.number.running is not None:
+            self.row(column.number.running)
 
-    def row(self, one: Definition) -> int:
+    def row(self, column: Definition) -> int:
         """Return the step of what a column looks back on: a signal, or a feature clipped."""
-        if one.made:
-            key = id(one.made)  # of several columns, computed again for none
+        if column.made:
+            key = id(column.made)  # of several columns, computed again for none
             if key not in self._made:
-                self._made[key] = self._made_of(one.made)
-            return self.clip(self._made[key], limit_of(one.of_bits))
-        if not one.sql:
-            return self.do("signal", self.signals[one.of])
-        arithmetic = parse(one.sql)
-        found: list[int] = []
+                self._made[key] = self._made_of(column.made)
+            return self.clip(self._made[key], limit_of(column.of_bits))
+        if not column.sql:
+            return self.do("signal", self.signals[column.of])
+        arithmetic = parse(column.sql)
+        results: list[int] = []
         for step in arithmetic.steps:
             if step.name:
-                found.append(self.do("signal", self.signals[step.name]))
+                results.append(self.do("signal", self.signals[step.name]))
             elif not step.function:
-                found.append(self.constant(step.value))
+                results.append(self.constant(step.value))
             else:
-                found.append(self.do(step.function, *(found[i] for i in step.operands)))
-        limit = limit_of(one.of_bits)
+                results.append(self.do(step.function, *(results[i] for i in step.operands)))
+        limit = limit_of(column.of_bits)
         if arithmetic.guard is None:
-            return self.clip(found[-1], limit)
-        guard, least = found[arithmetic.guard], arithmetic.at_least
+            return self.clip(results[-1], limit)
+        guard, least = results[arithmetic.guard], arithmetic.at_least
         return self.clip_where(
-            found[-1], limit, lambda: self.do("at_least", guard, self.constant(least))
+            results[-1], limit, lambda: self.do("at_least", guard, self.constant(least))
         )
 
-    def column(self, one: Definition) -> int:
+    def column(self, column: Definition) -> int:
         """Return the step of a column."""
-        if one.number is not None:
-            return self._numbered(one, one.number)
-        if one.gate is not None:
-            return self._gated(one.ungated, one.gate)
-        if one.fact is not None:
-            return self._factor(one, one.fact)
-        return self._window(one)
+        if column.number is not None:
+            return self._numbered(column, column.number)
+        if column.gate is not None:
+            return self._gated(column.ungated, column.gate)
+        if column.fact is not None:
+            return self._factor(column, column.fact)
+        return self._window(column)
 
-    def _window(self, one: Definition) -> int:
-        now = total = self.row(one)
-        numerator = one.ratio.numerator
-        divisor = self.constant(one.ratio.denominator)
-        if one.over == "lag":
-            now = total = self.do("ago", now, one.ticks)
-        elif one.over == "change":
-            total = self.do("-", now, self.do("ago", now, one.ticks))
-        elif one.over is not None:
-            window = (now, one.ticks, most_values(one))
+    def _window(self, column: Definition) -> int:
+        now = total = self.row(column)
+        numerator = column.ratio.numerator
+        divisor = self.constant(column.ratio.denominator)
+        if column.over == "lag":
+            now = total = self.do("ago", now, column.ticks)
+        elif column.over == "change":
+            total = self.do("-", now, self.do("ago", now, column.ticks))
+        elif column.over is not None:
+            window = (now, column.ticks, most_values(column))
             total = self.do("sum", *window)
-            if one.over != "sum":
+            if column.over != "sum":
                 divisor = self.do("*", divisor, self.do("values", *window))
-        found, limit = self.nearest(total, numerator, divisor), limit_of(one.bits)
+        value, limit = self.nearest(total, numerator, divisor), limit_of(column.bits)
         return (
-            self.clip(found, limit) if total == now else self.clip_where(found, limit, lambda: now)
+            self.clip(value, limit) if total == now else self.clip_where(value, limit, lambda: now)
         )
 
-    def _factor(self, one: Definition, fact: AttributeFactor) -> int:
+    def _factor(self, column: Definition, fact: AttributeFactor) -> int:
         place = _place(self.facts, VehicleAttribute(fact.name, fact.equals))
-        of = self.column(one.model_copy(update={"fact": None}))
+        base = self.column(column.model_copy(update={"fact": None}))
         less = 0 if fact.equals is not None else fact.less
-        times = self.do("*", of, self.less(self.do("fact", place), less))
+        times = self.do("*", base, self.less(self.do("fact", place), less))
         divisor = self.constant(fact.ratio.denominator)
-        return self.clip(self.nearest(times, fact.ratio.numerator, divisor), limit_of(one.bits))
+        return self.clip(self.nearest(times, fact.ratio.numerator, divisor), limit_of(column.bits))
 
     def _gated(self, ungated: Definition, gate: Gate) -> int:
-        of, by = self.column(ungated), self.column(gate.by)
-        times = self.do("*", of, self.weight(by, gate))
+        base, by = self.column(ungated), self.column(gate.by)
+        times = self.do("*", base, self.weight(by, gate))
         return self.nearest(times, 1, self.constant(WEIGHT))
 
     def weight(self, by: int, gate: Gate) -> int:
@@ -403,37 +405,41 @@ class Lowering:
         times = self.do("*", self.less(by, low), self.constant(WEIGHT))
         return self.do("//", times, self.constant(high - low))
 
-    def _numbered(self, one: Definition, number: ParameterFactor) -> int:
-        of = self.column(one.model_copy(update={"number": None}))
+    def _numbered(self, column: Definition, number: ParameterFactor) -> int:
+        base = self.column(column.model_copy(update={"number": None}))
         running = None if number.running is None else self.column(number.running)
         unit = CALIBRATION_PARAMETERS[number.name].unit
         place = _place(self.numbers, ParameterCount(number.name, unit, number.grain))
         stand_in = self.constant(0) if running is None else running
         factor = self.do("else", self.less(self.do("number", place), number.less), stand_in)
-        return self.do("where", factor, of) if number.alone else self.do("*", of, factor)
+        return self.do("where", factor, base) if number.alone else self.do("*", base, factor)
 
-    def _made_of(self, made: Made) -> int:
+    def _made_of(self, composite: Made) -> int:
         """Return the step of what is made of columns.
 
         Raises `QuestionError` for the estimate of a line that has not been fitted.
         """
-        if isinstance(made, Slope):
-            return self._slope(made)
-        if isinstance(made, Product):
-            factors = [self.column(one) for one in made.of] or [self.constant(1)]
-            found = factors[0] if len(factors) == 1 else self.do("*", *factors)
-            return self.nearest(found, made.ratio.numerator, self.constant(made.ratio.denominator))
-        if made.line == "":
+        if isinstance(composite, Slope):
+            return self._slope(composite)
+        if isinstance(composite, Product):
+            factors = [self.column(column) for column in composite.of] or [self.constant(1)]
+            product = factors[0] if len(factors) == 1 else self.do("*", *factors)
+            return self.nearest(
+                product, composite.ratio.numerator, self.constant(composite.ratio.denominator)
+            )
+        if composite.line == "":
             raise QuestionError(
                 "its columns are made of the estimate of a line, which is fitted first. Run: "
                 "fleet-slip publish NAME --models learning, or another list of its feature set"
             )
         terms = [
-            self.column(one) if times == 1 else self.do("*", self.column(one), self.constant(times))
-            for times, one in made.terms
+            self.column(column)
+            if times == 1
+            else self.do("*", self.column(column), self.constant(times))
+            for times, column in composite.terms
         ]
-        total = reduce(lambda a, b: self.do("+", a, b), terms, self.constant(made.intercept))
-        return self.nearest(total, 1, self.constant(made.divisor))
+        total = reduce(lambda a, b: self.do("+", a, b), terms, self.constant(composite.intercept))
+        return self.nearest(total, 1, self.constant(composite.divisor))
 
     def _slope(self, slope: Slope) -> int:
         """Eliminate all unknowns but the first, which comes before the right-hand side.
@@ -448,50 +454,59 @@ class Lowering:
         largest = reduce(lambda a, b: self.do("max", a, b), places)
         scale = self.do("power", largest, self.constant(PIVOT))
         del sums[last, last]
-        left = {at: self.clip(self.nearest(one, 1, scale), PIVOT) for at, one in sums.items()}
+        entries = {
+            at: self.clip(self.nearest(total, 1, scale), PIVOT) for at, total in sums.items()
+        }
         for pivot in range(last - 1):
-            divisor = self.do("max", left[pivot, pivot], self.constant(1))
+            divisor = self.do("max", entries[pivot, pivot], self.constant(1))
             for i in range(pivot + 1, last):
                 for j in range(i, last + 1):
-                    times = self.do("*", left[pivot, i], left[pivot, j])
-                    less = self.do("-", left[i, j], self.do("nearest", times, divisor))
-                    left[i, j] = self.clip(less, PIVOT)
-        square = self.do("max", left[last - 1, last - 1], self.constant(1))
+                    times = self.do("*", entries[pivot, i], entries[pivot, j])
+                    less = self.do("-", entries[i, j], self.do("nearest", times, divisor))
+                    entries[i, j] = self.clip(less, PIVOT)
+        square = self.do("max", entries[last - 1, last - 1], self.constant(1))
         times = self.do("*", square, self.constant(slope.ratio.denominator))
-        return self.nearest(left[last - 1, last], slope.ratio.numerator, times)
+        return self.nearest(entries[last - 1, last], slope.ratio.numerator, times)
 
     def _normal_equations(self, slope: Slope) -> dict[tuple[int, int], int]:
         """Return sums of products, with the ridge: the first unknown last, then `y`."""
         order = [*range(len(slope.ridge) - 1, -1, -1), None]
-        products = [self._products_of(one, order) for one in slope.equations]
-        found = {}
+        products = [self._products_of(equation, order) for equation in slope.equations]
+        sums = {}
         for at in products[0]:
-            each = reduce(lambda a, b: self.do("+", a, b), (one[at] for one in products))
-            total = self.do("sum", each, 0, most_products(len(products)))
+            tick_sum = reduce(
+                lambda a, b: self.do("+", a, b), (equation[at] for equation in products)
+            )
+            total = self.do("sum", tick_sum, 0, most_products(len(products)))
             unknown = order[at[0]]
             if at[0] == at[1] and unknown is not None:
                 total = self.do("+", total, self.constant(slope.ridge[unknown]))
-            found[at] = total
-        return found
+            sums[at] = total
+        return sums
 
     def _products_of(
-        self, one: Equation, order: Sequence[int | None]
+        self, equation: Equation, order: Sequence[int | None]
     ) -> dict[tuple[int, int], int]:
         """Return the products of an equation's columns at one tick; 0 where one is missing."""
-        columns = [one.y if unknown is None else one.x[unknown] for unknown in order]
-        steps = [self.constant(of) if isinstance(of, int) else self.column(of) for of in columns]
-        varying = [step for step, of in zip(steps, columns, strict=True) if not isinstance(of, int)]
-        there = reduce(lambda a, b: self.do("+", a, b), varying)
-        divisor, found = GRAIN * one.weight.denominator, {}
+        columns = [equation.y if unknown is None else equation.x[unknown] for unknown in order]
+        steps = [
+            self.constant(column) if isinstance(column, int) else self.column(column)
+            for column in columns
+        ]
+        varying = [
+            step for step, column in zip(steps, columns, strict=True) if not isinstance(column, int)
+        ]
+        presence = reduce(lambda a, b: self.do("+", a, b), varying)
+        divisor, products = GRAIN * equation.weight.denominator, {}
         for i, j in combinations_with_replacement(range(len(order)), 2):
             a, b = columns[i], columns[j]
             if isinstance(a, int) and isinstance(b, int):
-                product = self.constant(nearest(a * b * one.weight.numerator, divisor))
+                product = self.constant(nearest(a * b * equation.weight.numerator, divisor))
             else:
                 times = self.do("*", steps[i], steps[j])
-                product = self.nearest(times, one.weight.numerator, self.constant(divisor))
-            found[i, j] = self.do("else", self.do("where", product, there), self.constant(0))
-        return found
+                product = self.nearest(times, equation.weight.numerator, self.constant(divisor))
+            products[i, j] = self.do("else", self.do("where", product, presence), self.constant(0))
+        return products
 
 
 GRAIN = 16
@@ -503,8 +518,8 @@ PIVOT = 2**25
 
 def most_products(equations: int) -> int:
     """Return how many ticks a slope sums up at most, so that twice a sum is below 2^53."""
-    each = equations * nearest(limit_of(COUNT_BITS) ** 2, GRAIN)
-    return 2**51 // each
+    largest = equations * nearest(limit_of(COUNT_BITS) ** 2, GRAIN)
+    return 2**51 // largest
 
 
 def given_ranges(
@@ -514,20 +529,20 @@ def given_ranges(
     fact = (-MAX_ATTRIBUTE, MAX_ATTRIBUTE)
     return {
         "signal": list(signals),
-        "fact": [fact if one.equals is None else (0, 1) for one in facts],
+        "fact": [fact if attribute.equals is None else (0, 1) for attribute in facts],
         "number": [(-COUNT_MAX, COUNT_MAX)] * len(numbers),
     }
 
 
-def most_values(one: Definition) -> int:
+def most_values(column: Definition) -> int:
     """Return how many values a window adds up at most, so that 2 sum numerator has 64 bits."""
-    if one.over != "running_mean":
-        return one.ticks
-    limit = limit_of(one.of_bits) if one.sql else COUNT_MAX
-    each = 2 * limit * one.ratio.numerator + one.ratio.denominator
-    return min(MOST_VALUES, LARGEST_WORD // each)
+    if column.over != "running_mean":
+        return column.ticks
+    limit = limit_of(column.of_bits) if column.sql else COUNT_MAX
+    largest = 2 * limit * column.ratio.numerator + column.ratio.denominator
+    return min(MOST_VALUES, LARGEST_WORD // largest)
 
 
-def _place(known: dict[Key, int], key: Key) -> int:
+def _place(places: dict[Key, int], key: Key) -> int:
     """Return the place of a key, in the order in which they came."""
-    return known.setdefault(key, len(known))
+    return places.setdefault(key, len(places))

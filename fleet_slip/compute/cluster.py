@@ -259,21 +259,21 @@ def work(expected: Mapping[str, str], task: bytes) -> Any:
 
     Raises `RefusedError` for other versions, `StorageError` where the marker is not seen.
     """
-    here = f"worker {socket.gethostname()}:{os.getpid()}"
-    _require_same(here, expected, environment())
+    this_worker = f"worker {socket.gethostname()}:{os.getpid()}"
+    _require_same(this_worker, expected, environment())
     marker, function, item = pickle.loads(task)  # noqa: S301 - from the scheduler, which is trusted
-    marker.require_seen(here)
+    marker.require_seen(this_worker)
     try:
         return function(item)
     except FleetSlipError as error:
-        raise type(error)(f"{error} [{here}]") from None
+        raise type(error)(f"{error} [{this_worker}]") from None
 
 
-def _require_same(where: str, expected: Mapping[str, str], found: Mapping[str, str]) -> None:
+def _require_same(where: str, expected: Mapping[str, str], actual: Mapping[str, str]) -> None:
     different = [
-        f"{name} {found.get(name, 'none')} instead of {wanted}"
-        for name, wanted in expected.items()
-        if found.get(name) != wanted
+        f"{name} {actual.get(name, 'none')} instead of {version}"
+        for name, version in expected.items()
+        if actual.get(name) != version
     ]
     if different:
         raise RefusedError(

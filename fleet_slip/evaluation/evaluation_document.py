@@ -103,7 +103,7 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
         f"scenario|won by|RMSE deg|{model} deg|ratio",
         (standing for standing in ranking["standings"] if standing["same_as"] is None),
         "{scenario}|{winner}|{winner_rmse_deg:.3f}|{rmse_deg:.3f}|{ratio:.2f}",
-        left=2,
+        text_columns=2,
     )
 
 
@@ -122,7 +122,7 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
         "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
         "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
         "{kinds:.3f}",
-        left=2,
+        text_columns=2,
     )
     yield (
         "±: standard error over drives; worst: RMSE of the worst drive.\n"

@@ -107,7 +107,7 @@ def table_one(data: ReportData) -> ReportTable:
     else:
         note += f"Every RMSE here includes the label noise, {degrees(noise, 4)}."
     caption = "Table I. Properties of the estimation models: cross-validated correlation"
-    return ReportTable("table-1", caption, head, rows, left=2, note=note)
+    return ReportTable("table-1", caption, head, rows, text_columns=2, note=note)
 
 
 def table_two(data: ReportData) -> ReportTable:
@@ -191,7 +191,7 @@ def measured_drives(data: ReportData) -> list[ReportTable]:
             "Measured drives with a label",
             ["estimator", "source", "RMSE", "mean", "error std", "correlation", "rows"],
             rows,
-            left=2,
+            text_columns=2,
             note=f"{count(len(content['drives']))} drives, held out by {content['parts_of']}: "
             f"{content['cohort']}. Green: the smallest.",
         )

@@ -44,7 +44,7 @@ from fleet_slip.catalog.course import (
 )
 from fleet_slip.catalog.definitions import plain_column
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S
 from fleet_slip.columns.column_sql import rows_of
 from fleet_slip.columns.lowering import Lowering
 from fleet_slip.errors import RefusedError
@@ -132,7 +132,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     with_attribute = [
         name
         for name in over_time
-        if any(part.fact for part in catalog.time_columns[name].definition.parts)
+        if any(part.fact for part in catalog.time_columns[name].definition.components)
     ]
     if with_attribute or len(columns) > MAX_SIGNALS:
         has = with_attribute[0] if with_attribute else pluralize(len(columns), "column")
@@ -211,6 +211,8 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
     widths = [len(on_board.columns) for on_board in sets]
     sizes = [width + packed_size(width) for width in widths]
     numbers = [count * size for count, size in zip(blocks, sizes, strict=True)]
+    message_bytes = [HEADER_BYTES + 8 * size + CHECKSUM_BYTES for size in sizes]
+    message_bytes[1:] = [size + MOST_COLUMNS // 8 for size in message_bytes[1:]]
     words: dict[str, Any] = {
         "prefix": prefix,
         "upper": prefix.upper(),
@@ -221,87 +223,38 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
         "rows": rows,
         "max_blocks": MAX_BLOCKS,
         "max_rows": ROWS_IN_A_SUM,
-        "blocks": sum(blocks),
-        "numbers": sum(numbers),
+        "row_limits": [most_rows(on_board.ranges) for on_board in sets],
+        "blocks": blocks,
+        "first_blocks": [0, *accumulate(blocks[:-1])],
+        "numbers": numbers,
+        "first_numbers": [0, *accumulate(numbers[:-1])],
         "max_vehicle": MAX_VEHICLE_BYTES,
-        "max_message": max(
-            HEADER_BYTES + MOST_COLUMNS // 8 * (i > 0) + 8 * size + CHECKSUM_BYTES
-            for i, size in enumerate(sizes)
-        ),
+        "max_message": max(message_bytes),
         "header_bytes": HEADER_BYTES,
         "magic": MAGIC,
         "layout": LAYOUT,
         "set_layout": SET_LAYOUT,
-        "counted": _counted(sets, blocks, numbers),
     }
     if changed:
-        words |= _words_of_changes(catalog.signals, steps, writer, places, changed)
-        words["places"] = [place for on_board in sets for place in on_board.places]
-        words["firsts"] = [0, *accumulate(widths[:-1])]
+        words["course"], words["yaw_rate"] = (writer.word(places[n]) for n in (COURSE, YAW_RATE))
+        words |= {
+            "keeps": keep_lines(steps, writer),
+            "state": [field for field in state_fields(steps) if field.name != "nothing"],
+            "start": start_lines(steps, writer),
+            "units": course_units(catalog.signals),
+            "half_turn": HALF_TURN,
+            "coarser": COARSER,
+            "delay_parts": LATE_PARTS,
+            "min_delay": MOST_EARLY,
+            "max_delay": MOST_LATE,
+            "delay_ms": f"{1000 * float(SAMPLE_TIME_S) / LATE_PARTS:g}",
+            "history": max(on_board.history_ticks for _, on_board in changed),
+            "max_times": max(len(on_board.counted.times) for _, on_board in changed),
+            "max_columns": max(len(s.computed) for _, s in changed) + len(BESIDE) + 1,
+            "columns_bytes": MOST_COLUMNS // 8,
+            "places": [place for on_board in sets for place in on_board.places],
+            "firsts": [0, *accumulate(widths[:-1])],
+        }
+        writer.counts["nearest_64"] += 1
     words |= {"lines": [*writer.lines, *words.get("keeps", ())], "helpers": helper_texts(writer)}
     return words
-
-
-def _counted(
-    sets: Sequence[OnBoard], blocks: Sequence[int], numbers: Sequence[int]
-) -> list[list[str]]:
-    """Return the rows of the table of sets, one entry for each field of `counted_set`."""
-    firsts = zip(accumulate(blocks, initial=0), accumulate(numbers, initial=0), strict=True)
-    return [
-        [
-            f"{len(on_board.columns)}U",
-            f"{count}U",
-            f"{first_block}U",
-            f"{first_number}U",
-            f"{most_rows(on_board.ranges)}U",
-            f"0x{on_board.counted.definition:016X}ULL",
-            "true" if on_board.complete else "false",
-        ]
-        for on_board, count, (first_block, first_number) in zip(sets, blocks, firsts, strict=False)
-    ]
-
-
-def _words_of_changes(
-    signals: SignalCatalog,
-    steps: Steps,
-    writer: StepWriter,
-    places: Mapping[str, int],
-    changed: Sequence[tuple[int, OnBoard]],
-) -> dict[str, Any]:
-    """Return the words of the templates that count changes of columns between fixes."""
-    sets = [on_board for _, on_board in changed]
-    units, history = course_units(signals), max(on_board.history_ticks for on_board in sets)
-    course, yaw_rate = (writer.word(places[name]) for name in (COURSE, YAW_RATE))
-    keeps = keep_lines(steps, writer)
-    writer.counts["nearest_64"] += 1
-    max_columns = max(len(on_board.computed) for on_board in sets) + len(BESIDE) + 1
-    constants = {
-        "CHANGED": f"{len(changed)}U",
-        "MAX_TIMES": f"{max(len(on_board.counted.times) for on_board in sets)}U",
-        "MAX_COLUMNS": f"{max_columns}U",
-        "HISTORY": f"{history}U",
-        "TURN": f"INT64_C({units.turn})",
-        "COURSE_COUNTS": f"INT64_C({2 * HALF_TURN})",
-        "DIVISOR": f"INT64_C({units.divisor})",
-        "MAX_REMAINDER": f"INT64_C({units.largest})",
-        "SLOW": units.slow,
-        "STRAIGHT": units.unturned,
-        "COARSER": COARSER,
-        "DELAY_PARTS": LATE_PARTS,
-        "ROUND_DELAY": LATE_PARTS // 2,
-        "MIN_DELAY": -MOST_EARLY,
-        "GAIN": f"INT64_C({4 * HALF_TURN // LATE_PARTS})",
-    }
-    return {
-        "history": history,
-        "state": [field for field in state_fields(steps) if field.name != "nothing"],
-        "start": start_lines(steps, writer),
-        "keeps": keeps,
-        "course": course,
-        "yaw_rate": yaw_rate,
-        "constants": constants,
-        "min_delay": LATE_PARTS * MOST_EARLY,
-        "max_delay": LATE_PARTS * MOST_LATE,
-        "delay_ms": f"{1000 * float(SAMPLE_TIME_S) / LATE_PARTS:g}",
-        "columns_bytes": MOST_COLUMNS // 8,
-    }

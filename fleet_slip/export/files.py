@@ -214,26 +214,25 @@ def _c(subject: Subject) -> dict[str, str]:
 # The SQL statement is one SELECT over rows in SI units, for DuckDB, SQLite and PostgreSQL. Values
 # that are used more than once are columns of a layer of their own.
 
-ROWS = "log"
-"""Table or view of the plain statement: `drive_id`, `tick`, and columns in SI units."""
 
+def _sql(subject: Subject) -> dict[str, str]:
+    """Return the statement for the view `log`, and as a macro of DuckDB for any table.
 
-def sql_statement(
-    version: ModelVersion, program: Program, rows: str = ROWS, macro: str = ""
-) -> str:
-    """Return the statement with the columns `drive_id`, `tick`, `angle` in counts and in SI units.
-
-    `angle` is null if there is none. Rows are the ticks of drives, in any order.
+    The columns are `drive_id`, `tick`, and the angle in counts and in SI units, or null.
     """
-    layers = [*_input_layers(program), *_layers(program)]
-    words = {"layers": layers, "rounded": _rounded(program), "rows": rows, "macro": macro}
-    return fill_in_version("templates/statement.sql", version, program, **words)
+    version, program = subject.version, subject.program
+    prefix, layers = file_prefix(version), [*_input_layers(program), *_step_layers(program)]
 
+    def statement(rows: str, macro: str = "") -> str:
+        words = {"layers": layers, "rounded": _sql_angle(program), "rows": rows, "macro": macro}
+        return fill_in_version("templates/statement.sql", version, program, **words)
 
-def sql_macro(version: ModelVersion, program: Program) -> str:
-    """Return the statement as a macro of DuckDB with the name of a table as argument."""
-    name = f"{program.angle.name}_{version.manifest.name}"
-    return sql_statement(version, program, "query_table(source)", name)
+    macro = f"{program.angle.name}_{version.manifest.name}"
+    return {
+        f"{prefix}.sql": statement("log"),
+        f"{prefix}_macro.sql": statement("query_table(source)", macro),
+        f"{prefix}_checks.csv": subject.table,
+    }
 
 
 def _input_layers(program: Program) -> list[list[str]]:
@@ -245,28 +244,30 @@ def _input_layers(program: Program) -> list[list[str]]:
         half = f"CASE WHEN ABS({ratio} - ROUND({ratio})) = 0.5 THEN 2 * ROUND({ratio} / 2)"
         rounded.append(f"{half} ELSE ROUND({ratio}) END AS rounded_{place}")
         ends = (signal.min_count, signal.max_count)
-        valid.append(f"{_within(f'rounded_{place}', *ends)} AS signal_{place}")
+        valid.append(f"{_sql_within(f'rounded_{place}', *ends)} AS signal_{place}")
     for place, number in enumerate(program.numbers):
         counts.append(f"ROUND({number.name} / {number.grain:f}) AS ratio_number_{place}")
-        valid.append(f"{_within(f'ratio_number_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}")
-    facts = [f"{attribute_sql(one)} AS fact_{place}" for place, one in enumerate(program.facts)]
+        valid.append(
+            f"{_sql_within(f'ratio_number_{place}', -COUNT_MAX, COUNT_MAX)} AS number_{place}"
+        )
+    facts = [f"{attribute_sql(fact)} AS fact_{place}" for place, fact in enumerate(program.facts)]
     return [[*counts, *facts], rounded, valid]
 
 
-def _within(value: str, low: int, high: int) -> str:
+def _sql_within(value: str, low: int, high: int) -> str:
     return f"CASE WHEN {value} BETWEEN {low} AND {high} THEN CAST({value} AS BIGINT) END"
 
 
-def _layers(program: Program) -> list[list[str]]:
+def _step_layers(program: Program) -> list[list[str]]:
     """Return the columns of each layer; the last layer has the parts of the angle."""
     sql = SqlLayers(program.steps, program.ranges, PLAIN_SQL, lambda name, place: f"{name}_{place}")
     terms = [sql.text(step) for step, _ in program.angle.terms]
     last = max(layer for _, layer in terms)
-    sql.layers[last + 1] += _parts(program, [text for text, _ in terms])
+    sql.layers[last + 1] += _sql_sums(program, [text for text, _ in terms])
     return [sql.layers[number] for number in sorted(sql.layers)]
 
 
-def _parts(program: Program, terms: list[str]) -> list[str]:
+def _sql_sums(program: Program, terms: list[str]) -> list[str]:
     """Return the sums of the upper and of the lower parts; see `fixed_point`."""
     (high, low), *parts = program.angle.parts
     return [
@@ -277,28 +278,18 @@ def _parts(program: Program, terms: list[str]) -> list[str]:
     ]
 
 
-def _rounded(program: Program) -> str:
+def _sql_angle(program: Program) -> str:
     angle = program.angle
     shift = angle.bits - angle.low_bits
-    carried = f"(high + {_floor('low', angle.low_bits)} + {2 ** (shift - 1)})"
-    return PLAIN_SQL["clip"].format(_floor(carried, shift), angle.limit)
+    carried = f"(high + {_sql_floor('low', angle.low_bits)} + {2 ** (shift - 1)})"
+    return PLAIN_SQL["clip"].format(_sql_floor(carried, shift), angle.limit)
 
 
-def _floor(value: str, bits: int) -> str:
+def _sql_floor(value: str, bits: int) -> str:
     """Return SQL of a value over 2^bits, rounded down, by its non-negative remainder."""
     size = 2**bits
     remainder = f"(({value} % {size} + {size}) % {size})"
     return f"CAST(ROUND(({value} - {remainder}) / {size}) AS BIGINT)"
-
-
-def _sql(subject: Subject) -> dict[str, str]:
-    version, program = subject.version, subject.program
-    prefix = file_prefix(version)
-    return {
-        f"{prefix}.sql": sql_statement(version, program),
-        f"{prefix}_macro.sql": sql_macro(version, program),
-        f"{prefix}_checks.csv": subject.table,
-    }
 
 
 FIRST_ID = 0x100

@@ -294,7 +294,7 @@ def write_program(catalog: Catalog, manifest: Manifest) -> Program:
 def _inputs(signals: SignalCatalog, manifest: Manifest) -> tuple[Input, ...]:
     used: set[str] = set()
     for term in manifest.terms:
-        parts = term.definition.parts if term.definition else (term,)
+        parts = term.definition.components if term.definition else (term,)
         if not term.inputs or any(part.sql and not parse(part.sql).inputs for part in parts):
             raise DataError(f"the feature {term.signal} uses no signal. Publish the model again.")
         used |= {*term.inputs}

@@ -139,7 +139,7 @@ class Preview(FileReport, Answer):
             "signal|unit|least|most|missing",
             self.ranges,
             "{signal}|{unit}|{low:.4g}|{high:.4g}|{missing:.1%}",
-            left=2,
+            text_columns=2,
         )
         yield from (f"looks wrong: {fault}" for fault in self.suspicions)
 

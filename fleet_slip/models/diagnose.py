@@ -81,7 +81,7 @@ class Diagnosis(Answer):
             rows,
             "{robust.name}|{unit}|{robust.value:.6g}|{robust.standard_error:.2g}|{robust.t:.1f}|"
             "{naive.standard_error:.2g}|{vif:.3g}",
-            left=2,
+            text_columns=2,
         )
         if self.cluster == "row":
             yield Remark(

@@ -216,7 +216,7 @@ def predict(
             and (count := round_number(Fraction(float(values[first])), grain)) is not None
         }
         known = {name: values[first].as_py() for name, values in facts.items()}
-        angle[at] = predictor(drive.part(at, known, own), workspace)
+        angle[at] = predictor(drive.segment(at, known, own), workspace)
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 

@@ -203,7 +203,7 @@ class ModelVersion:
     def _repr_html_(self) -> str:
         terms = [(one.column, one.unit, one.coefficient) for one in self.manifest.terms]
         terms.append(("intercept", self.manifest.label.unit, self.manifest.intercept))
-        table = TextTable("", "signal|unit|coefficient", terms, "{0}|{1}|{2:.6g}", left=2)
+        table = TextTable("", "signal|unit|coefficient", terms, "{0}|{1}|{2:.6g}", text_columns=2)
         return f"<pre>{escape(repr(self)[1:-1])}\n{escape(table.text())}</pre>"
 
     @property
@@ -534,7 +534,7 @@ class Difference(Answer):
         if not rows:
             yield Remark(f"{one} and {other} are the same estimator from the same data")
             return
-        yield TextTable("", f"what differs|{one}|{other}", rows, left=3)
+        yield TextTable("", f"what differs|{one}|{other}", rows, text_columns=3)
         if self.drives:
             only_one, only_other, both = self.drives
             yield Remark(

@@ -453,7 +453,11 @@ def find_complete_cases(
             common |= signals
             comparable.add(i)
         elif i < len(candidates):
-            skipped[name] = _reason_to_skip(folds, label, signals, total - remaining, total)
+            rare = [one for one in sorted(signals) if drives_with([one]) < total] or sorted(signals)
+            lost = f"{total - remaining:,} of {pluralize(total, 'drive')}"
+            skipped[name] = _missing_signals(folds, label, signals) or (
+                f"not comparable: {lost} lack {', '.join(rare)}, and only a tenth may be left out"
+            )
     chosen = sorted(comparable)
     return ComparedRows(
         folds.with_signals([*common, label]),
@@ -462,18 +466,13 @@ def find_complete_cases(
     )
 
 
-def _reason_to_skip(
-    folds: CohortFolds, label: str, signals: Collection[str], lost: int, total: int
-) -> str:
-    """Return why a candidate is not compared: signals that no drive, or that few drives have."""
+def _missing_signals(folds: CohortFolds, label: str, signals: Collection[str]) -> str | None:
+    """Return why no fold has rows with the signals; None if folds have."""
     try:
         folds.complete_cases(sorted(signals), label, sparse=True)
     except DataError as error:
         return str(error)
-    return (
-        f"not comparable: it cannot be evaluated on {lost:,} of {pluralize(total, 'drive')}, which "
-        "lack a signal of it; at most a tenth may be left out"
-    )
+    return None
 
 
 def _cross_validate_candidates(

@@ -126,7 +126,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
         }
         for one in shown
     )
-    return TextTable(title, header, rows, row, left=1 + listed)
+    return TextTable(title, header, rows, row, text_columns=1 + listed)
 
 
 def _label_noise(selection: "Selection") -> Remark:
@@ -195,7 +195,7 @@ def _distances(found: NestedDistances) -> Iterator[Part]:
         f"distance D of equation (2) by the number of signals; {_worth(found.evidence)}",
         f"|added|{DISTANCES}",
         _distance_rows(found.order, found.evidence),
-        left=2,
+        text_columns=2,
     )
     yield f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n"
 
@@ -213,7 +213,7 @@ def _choice(choice: "SearchChoice") -> Iterator[Part]:
                 [*line, f"{value:,.4f}{' <' if j == nested.size else '  '}"]
                 for j, (line, value) in enumerate(rows)
             ),
-            left=2,
+            text_columns=2,
         )
     if choice.subsets is not None and (picks := choice.picks) is not None:
         rows_of_sizes = (
@@ -229,7 +229,7 @@ def _choice(choice: "SearchChoice") -> Iterator[Part]:
             "size|signals|picked by|R squared|gap to second",
             rows_of_sizes,
             "{best.size}|{best.model.signals}|{picked_by}|{best.r_squared:.6f}|{gap:.2g}",
-            left=3,
+            text_columns=3,
         )
 
 

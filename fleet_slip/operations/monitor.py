@@ -109,7 +109,7 @@ class Chart(Answer):
             ({**vars(one), "kind": "training" if one.training else "new"} for one in self.days),
             "{day}|{kind}|{drives:,}|{rows:,}|{rmse_deg:.4f}|{error_mean_deg:+.4f}|"
             "{error_std_deg:.4f}|{alarms}",
-            left=2,
+            text_columns=2,
         )
         yield from remark_left_out(self.drives_left_out, self.feature_set)
 

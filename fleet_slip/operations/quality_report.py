@@ -79,7 +79,7 @@ class QualityReport(Answer):
         if self.findings:
             header = "drive|car|fault|signals|what shows it"
             row = "{drive_id}|{vehicle_id}|{fault.kind}|{fault.signals}|{fault.figure}"
-            yield TextTable(checked, header, self.findings, row, left=5)
+            yield TextTable(checked, header, self.findings, row, text_columns=5)
         elif self.systematic:
             yield checked
         else:

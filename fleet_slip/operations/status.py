@@ -106,25 +106,25 @@ class WarehouseStatus(Answer):
                 for name, one in self.tables.items()
             ),
             "{name}|{committed_at:%Y-%m-%d %H:%M}|{version}|{files:,}|{rows:,}|{size_mb:,.1f}",
-            left=2,
+            text_columns=2,
         )
         backlog = f"{pluralize(self.backlog_files, 'file')}, {pluralize(self.backlog_rows, 'row')}"
         facts = {"newest day": str(self.newest_day or "none"), "waiting for the Gram job": backlog}
         if self.disk_free_bytes is not None and self.disk_free_fraction is not None:
             free = f"{self.disk_free_bytes / 1e9:,.1f} GB free, {self.disk_free_fraction:.0%}"
             facts["disk"] = free
-        yield TextTable("", "|", facts.items(), left=2)
+        yield TextTable("", "|", facts.items(), text_columns=2)
         if self.last_runs:
             header = "command|started|state|seconds|rows"
             row = "{command}|{started_at:%Y-%m-%d %H:%M:%S}|{state}|{seconds:.1f}|{rows:,}"
-            yield TextTable("\nlast runs", header, self.last_runs, row, left=3)
+            yield TextTable("\nlast runs", header, self.last_runs, row, text_columns=3)
         if self.champions:
             header = "model|published|age h|logs behind|grams behind"
             row = (
                 "{model}@{version}|{published_at:%Y-%m-%d %H:%M}|{age_hours:,.1f}|"
                 "{logs_behind}|{grams_behind}"
             )
-            yield TextTable("\nchampions", header, self.champions, row, left=2)
+            yield TextTable("\nchampions", header, self.champions, row, text_columns=2)
 
     @property
     def problem(self) -> AlarmError | None:

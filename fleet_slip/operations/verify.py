@@ -130,7 +130,9 @@ class Verification(Answer):
             yield Remark(f"accepted the loss of {path}; repeat the command that wrote it")
         for title in ("damage", "remarks"):
             if findings := getattr(self, title):
-                yield TextTable(title, "where|problem", findings, "{path}|{problem}", left=2)
+                yield TextTable(
+                    title, "where|problem", findings, "{path}|{problem}", text_columns=2
+                )
         yield Remark(
             f"{pluralize(self.files, 'file')} with {self.size_bytes:,} bytes and "
             f"{pluralize(self.documents, 'document')} were read, the Gram rows of "

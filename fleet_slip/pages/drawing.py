@@ -146,13 +146,13 @@ def draw(picture: Picture) -> Drawn:
 def _lean(svg: str) -> str:
     """Drop comments and metadata, and keep a hundredth of a point of each coordinate."""
     svg = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r' d="([^"]*)"', lambda found: f' d="{_short(found[1])}"', svg)
+    svg = re.sub(r' d="([^"]*)"', lambda match: f' d="{_short(match[1])}"', svg)
     return re.sub(r"\n\s*\n+", "\n", svg)
 
 
 def _short(path: str) -> str:
     rounded = re.sub(
-        r"-?\d+\.\d+", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), path
+        r"-?\d+\.\d+", lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), path
     )
     return re.sub(r"\s*([A-Za-z])\s*", r"\1", " ".join(rounded.split()))
 

@@ -61,13 +61,13 @@ class Cell(str):
 
 @dataclass(frozen=True)
 class ReportTable:
-    """A table with a caption; the first `left` columns are text, the others are numbers."""
+    """A table with a caption; the first `text_columns` columns are text, the others are numbers."""
 
     key: str
     caption: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
-    left: int = 1
+    text_columns: int = 1
     note: str = ""
 
 

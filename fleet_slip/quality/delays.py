@@ -32,6 +32,8 @@ MIN_EXPLAINED = 0.5
 """Share of the variance that must be explained at the best lag, else the signals are unrelated."""
 MIN_IMPROVEMENT = 1.5
 """Unexplained variance without a lag over that at the best lag. A late signal has 10 and more."""
+PERIODIC_TOLERANCE = 0.1
+"""Share of the variance by which minima may differ: on a sine every period has one."""
 MAX_STANDARD_ERRORS = 4.0
 """A delay must exceed so many, for one false alarm in ten thousand drives."""
 
@@ -69,10 +71,10 @@ def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> D
     best = _lowest(unexplained)
     if best is None or total[:, 0, 0].min() < MIN_ROWS:
         return None
-    lowest = unexplained.min()
-    if lowest > 1 - MIN_EXPLAINED:
+    at_best = unexplained[round(best) + MAX_LAG]
+    if at_best > 1 - MIN_EXPLAINED:
         return None
-    if unexplained[MAX_LAG] < MIN_IMPROVEMENT * lowest:
+    if unexplained[MAX_LAG] < MIN_IMPROVEMENT * at_best:
         return NO_DELAY
     without = [_lowest(_unexplained(total - block)) for block in moments]
     if None in without:
@@ -115,13 +117,16 @@ def _unexplained(moments: FloatArray) -> FloatArray:
 
 
 def _lowest(unexplained: FloatArray) -> float | None:
-    """Return the lag of the minimum by a parabola, None at the end of the range."""
-    at = int(np.argmin(unexplained))
-    if not 0 < at < len(unexplained) - 1:
+    """Return the lag of the minimum next to 0 by a parabola; None at the end of the range."""
+    inner, before, after = unexplained[1:-1], unexplained[:-2], unexplained[2:]
+    is_low = inner <= unexplained.min() + PERIODIC_TOLERANCE
+    minima = np.flatnonzero((inner <= before) & (inner <= after) & is_low) + 1
+    if not minima.size:
         return None
-    before, middle, after = unexplained[at - 1 : at + 2].tolist()
-    curvature = before - 2 * middle + after
-    shift = 0.5 * (before - after) / curvature if curvature > 0 else 0.0
+    at = int(minima[np.argmin(np.abs(minima - MAX_LAG))])
+    first, middle, last = unexplained[at - 1 : at + 2].tolist()
+    curvature = first - 2 * middle + last
+    shift = 0.5 * (first - last) / curvature if curvature > 0 else 0.0
     return at - MAX_LAG + shift
 
 
@@ -150,8 +155,9 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
         second = next(name for name in delays if name != reference)
         late = delays[second]
         if late.exceeds(MUTUAL_DELAY.high) and (second not in STEERING or late.value_s > 0):
-            pair = (*WITNESSES[second], *WITNESSES[reference])
-            yield MUTUAL_DELAY.fault(*pair, delay_s=late.value_s, error_s=late.error_s)
+            pair = (second, reference) if late.value_s > 0 else (reference, second)
+            names = [signal for name in pair for signal in WITNESSES[name]]
+            yield MUTUAL_DELAY.fault(*names, delay_s=abs(late.value_s), error_s=late.error_s)
         return
     middle = float(np.median([delay.value_s for delay in delays.values()]))
     errors = sorted(delay.error_s for delay in delays.values())

@@ -1,6 +1,6 @@
-"""Ranking and criterion together: which of the k+1 nested models, and how well that choice does.
+"""Choice among cross-validated models, and among the k + 1 nested models of a ranking.
 
-A choice flatters its winner, so that it is made again inside every training fold.
+The figures of a chosen model are optimistic, so the choice is repeated in every training fold.
 """
 
 import math
@@ -29,13 +29,12 @@ from fleet_slip.regression.least_squares import Fit, Scales, fit_moments, moment
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_size, criterion_values
 
-# Which model wins: the fewest signals whose shortfall from the best is negligible.
+# The winner is the model with the fewest signals whose gap to the best is negligible.
 #
-# A gain must be worth having, which a user says. What a model lacks is sqrt(MSE - MSE of the
-# best), in which the label's noise cancels: of nested models, how far their estimates lie apart.
-# And it must be real: larger than its standard error, paired over the same folds, whose difficulty
-# cancels (Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's
-# own figure).
+# A gain must reach a tolerance, which a user sets. The gap is sqrt(MSE - MSE of the best), in which
+# the label's noise cancels: for nested models it is the RMS difference of their estimates. A gain
+# must also exceed its standard error, paired over the same folds, whose difficulty cancels
+# (Breiman, Friedman, Olshen and Stone 1984, section 3.4.3, take that of the best model's figure).
 #
 # Without folds, the same rows are divided into groups of independent units, cars or drives. With d
 # a group's difference of squared errors and n its rows, the difference of the mean squared errors
@@ -45,9 +44,9 @@ from fleet_slip.regression.subsets import best_size, criterion_values
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The smallest gain that is worth a signal.
+    """The smallest gain that justifies a signal.
 
-    Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a part of the best's.
+    Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a fraction of the best's.
     """
 
     amount: float
@@ -65,7 +64,7 @@ class Tolerance:
 
 
 DEFAULT_TOLERANCE = Tolerance(math.radians(0.025))
-"""A quarter of what the best reference sensors are accurate to, about 0.1 deg."""
+"""A quarter of the accuracy of the best reference sensors, about 0.1 deg."""
 
 
 ZERO_TOLERANCE = Tolerance(0.0)
@@ -74,10 +73,10 @@ ZERO_TOLERANCE = Tolerance(0.0)
 
 @dataclass(frozen=True)
 class RmseGap:
-    """How much larger a `model`'s RMSE (rad) is than the best's, over the same folds.
+    """Difference of a `model`'s RMSE (rad) to the best's, over the same folds.
 
-    `square` is the difference of mean squared errors, rad^2. A gap `within_tolerance` is too small
-    to be worth a signal.
+    `square` is the difference of mean squared errors, rad^2. A gap `within_tolerance` is below the
+    smallest gain that justifies a signal.
     """
 
     model: CrossValidation
@@ -88,7 +87,7 @@ class RmseGap:
 
     @property
     def independent_error(self) -> float:
-        """What the model lacks, in rad, without the noise of the label; 0 if it is the better."""
+        """The gap in rad without the noise of the label; 0 if this model is better."""
         return math.sqrt(max(self.square, 0.0))
 
     @property
@@ -98,11 +97,11 @@ class RmseGap:
 
     @property
     def negligible(self) -> bool:
-        """True if the best model is no reason to do without this one."""
+        """True if the best model is not relevantly better."""
         return self.within_tolerance or not self.is_significant
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
+        """Return the entries of a JSON document."""
         return {
             "rmse_deg": math.degrees(self.rmse),
             "standard_error_deg": math.degrees(self.standard_error),
@@ -126,10 +125,30 @@ class Winner:
 
 
 def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOLERANCE) -> Winner:
-    """Return the winner of cross-validated models, given in their declared order.
+    """Choose among cross-validated models by the one-standard-error rule.
 
-    Among those negligibly worse than the best pooled correlation the fewest signals win, then the
-    higher exact correlation, then the declared order. Raises `QuestionError` for none.
+    Of the models that are negligibly worse than the best pooled correlation, those with the fewest
+    signals win, then the higher exact correlation, then the declared order.
+
+    Parameters
+    ----------
+    models : sequence of CrossValidation
+        In their declared order.
+    tolerance : Tolerance
+        Smallest gain that is worth a signal.
+
+    Returns
+    -------
+    Winner
+
+    Raises
+    ------
+    QuestionError
+        If there are no models.
+
+    References
+    ----------
+    Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, section 3.4.3.
     """
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
@@ -144,14 +163,14 @@ def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOL
 
 
 def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolerance) -> RmseGap:
-    """Return how much larger a model's RMSE is than another's, over the same folds."""
+    """Return the difference of two models' RMSE, over the same folds."""
     difference, square = _differences(model, best)
     within_tolerance = square < tolerance.squared(best.pooled.rmse)
     return RmseGap(model, difference, _standard_error(model, best), square, within_tolerance)
 
 
 def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
-    """Return how much larger a model's pooled RMSE is than another's, and its square."""
+    """Return the differences of two models' pooled RMSE and of their squares."""
     first, second = model.pooled.rmse, other.pooled.rmse
     return first - second, (first - second) * (first + second)
 
@@ -205,7 +224,27 @@ def _reason(
 
 
 def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: Tolerance) -> RmseGap:
-    """Return how much larger a model's RMSE is, folds being independent. Raises `ValueError`."""
+    """Return the difference of two models' RMSE, with a standard error over independent groups.
+
+    Parameters
+    ----------
+    model, other : CrossValidation
+        Tested on the same rows; each fold is an independent group.
+    tolerance : Tolerance
+
+    Returns
+    -------
+    RmseGap
+
+    Raises
+    ------
+    ValueError
+        If the models were not tested on the same rows.
+
+    References
+    ----------
+    Cochran, Sampling Techniques, 1977, section 6.4.
+    """
     rows = _common_rows(model, other)
     differences = [
         n * (first.rmse - second.rmse) * (first.rmse + second.rmse)
@@ -263,16 +302,16 @@ def nested_fits(
 
 
 CROSS_VALIDATION = "cross-validation"
-"""The criterion that cross-validates all nested models; the smallest that is nearly best wins."""
+"""Criterion: cross-validate all nested models; the smallest that is nearly best wins."""
 
 
 FEWEST_FOLDS = 3
-"""To make a choice again inside the training folds, two of them must be left."""
+"""Minimum number of folds to repeat a choice in the training folds, of which two must remain."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A ranking, a criterion or `CROSS_VALIDATION`, and what a signal must gain to be kept."""
+    """A ranking, a criterion or `CROSS_VALIDATION`, and the gain that justifies a signal."""
 
     ranking: str
     criterion: str
@@ -314,7 +353,7 @@ class NestedDistances(Record):
 
 @dataclass(frozen=True)
 class TrainingFolds:
-    """The rows to choose on: their folds, and the moments of each drive of them.
+    """The training rows of a choice: their folds, and the moments of each drive.
 
     `scales` is the physical value of a count of each signal. Without `intercept` moments are about
     zero.
@@ -335,7 +374,7 @@ class TrainingFolds:
         return nested_fits(self.folds.total, order, label, intercept=self.intercept)
 
     def evidence(self, fits: Sequence[Fit]) -> Evidence:
-        """Return what the rows say of the nested models of an order; raises like `Evidence`."""
+        """Return the evidence for the nested models of an order; raises like `Evidence`."""
         return Evidence.clustered(fits, self.drives)
 
     def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
@@ -347,7 +386,28 @@ class TrainingFolds:
 def select_nested(
     training: TrainingFolds, inputs: Sequence[str], label: str, rule: Rule
 ) -> NestedChoice:
-    """Rank the inputs and choose a nested model. Raises `DataError` and `QuestionError`."""
+    """Rank the inputs and choose one of the nested models.
+
+    Parameters
+    ----------
+    training : TrainingFolds
+    inputs : sequence of str
+        The k candidate signals.
+    label : str
+    rule : Rule
+        Ranking and criterion.
+
+    Returns
+    -------
+    NestedChoice
+
+    Raises
+    ------
+    DataError
+        If inputs are linearly dependent, or there are too few rows.
+    QuestionError
+        For an unknown ranking or criterion.
+    """
     order = rank(rule.ranking, training.total, inputs, label)
     fits = training.nested_fits(order, label)
     evidence = training.evidence(fits)
@@ -362,7 +422,7 @@ def select_nested(
 
 
 def measure_distances(training: TrainingFolds, order: Sequence[str], label: str) -> NestedDistances:
-    """Return the distances of an order as it is given. Raises `DataError` as `select_nested`."""
+    """Return the distances of a given order. Raises `DataError` as `select_nested`."""
     evidence = training.evidence(training.nested_fits(order, label))
     null = training.cross_validate("none", (), label)
     return NestedDistances(tuple(order), evidence, null)
@@ -386,7 +446,30 @@ def cross_validate_selection(
     label: str,
     rule: Rule,
 ) -> CrossValidation:
-    """Cross-validate the choice itself, `fold` saying each drive's fold. Raises `DataError`."""
+    """Cross-validate the choice itself: each training set ranks and chooses anew.
+
+    Parameters
+    ----------
+    name : str
+        Name of the result.
+    training : TrainingFolds
+    fold : integer array, shape (drives,)
+        Fold of each drive.
+    inputs : sequence of str
+    label : str
+    rule : Rule
+
+    Returns
+    -------
+    CrossValidation
+
+    Raises
+    ------
+    DataError
+        If a training set determines no model.
+    QuestionError
+        If there are fewer than three folds.
+    """
     folds = training.folds
     tests = []
     for number, test in enumerate(folds.grams):

@@ -1,6 +1,6 @@
-"""Per-drive moments in float64 for what needs every drive: clusters and resampling.
+"""Moments of each drive in float64, for clusters and resampling.
 
-They are about the cohort's mean, rounded to a count, while integers: nothing cancels.
+They are taken about the cohort's mean, rounded to a count, in integers: nothing cancels.
 """
 
 from collections.abc import Sequence
@@ -16,11 +16,11 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.least_squares import LinearModel
 
 ClusterUnit = Literal["drive", "vehicle"]
-"""What counts as one independent piece of evidence."""
+"""The independent unit of evidence: a cluster."""
 
 
 def missing_signals_error(signals: Sequence[str]) -> DataError:
-    """Return the error that no drive of a cohort has all of some signals."""
+    """Return the error for a cohort without a drive that has all signals."""
     return DataError(
         f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
         "cohort."
@@ -30,7 +30,24 @@ def missing_signals_error(signals: Sequence[str]) -> DataError:
 def complete_cases(
     tables: Sequence[GramTable], signals: Sequence[str]
 ) -> tuple[GramTable, BoolArray]:
-    """Return one table of drives with all signals, and their mask. Raises `DataError` for none."""
+    """Return the drives that have all signals.
+
+    Parameters
+    ----------
+    tables : sequence of GramTable
+        Drives by set of signals.
+    signals : sequence of str
+
+    Returns
+    -------
+    tuple of (GramTable, bool array)
+        The drives, and their mask among all drives of `tables`.
+
+    Raises
+    ------
+    DataError
+        If there are none.
+    """
     served = [set(signals) <= set(table.signals) for table in tables]
     if not any(served):
         raise missing_signals_error(signals)
@@ -49,14 +66,22 @@ def complete_cases(
 
 @dataclass(frozen=True)
 class DriveMoments:
-    """Moments of u = (1, (count - centre) / spread) of each drive; the label is last.
+    """Moments of u = (1, (count - centre) / spread) of each drive. The label is last.
 
-    Attributes:
-        centre: mean count of each signal over all drives, rounded to an integer.
-        spread: standard deviation of each signal's counts; 1 for a constant.
-        moments: of u, shape (drives, k+1, k+1).
-        cluster: number of each drive's piece of evidence, shape (drives,); None: its own.
-        unit: what a piece of evidence is: drives of a car share its biases and tyres.
+    Attributes
+    ----------
+    signals : tuple of str
+        The k signals.
+    centre : tuple of int, shape (k,)
+        Mean count over all drives, rounded.
+    spread : float array, shape (k,)
+        Standard deviation of the counts; 1 for a constant.
+    moments : float array, shape (drives, k + 1, k + 1)
+        Sums of products of u.
+    cluster : integer array, shape (drives,), or None
+        Cluster of each drive; None if each drive is a cluster.
+    unit : str
+        The independent unit: drives of a vehicle share its biases and tyres.
     """
 
     signals: tuple[str, ...]
@@ -93,11 +118,11 @@ class DriveMoments:
 
     @property
     def clusters(self) -> int:
-        """How many pieces of evidence there are."""
+        """Number of clusters."""
         return len(self) if self.cluster is None else len(np.unique(self.cluster))
 
     def by_cluster(self, values: FloatArray) -> FloatArray:
-        """Add up what is given for each drive, drives first, over each piece of evidence."""
+        """Sum values of drives, shape (drives, ...), over each cluster."""
         if self.cluster is None:
             return values
         order = np.argsort(self.cluster, kind="stable")

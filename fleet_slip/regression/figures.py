@@ -1,4 +1,4 @@
-"""Figures of merit from exact sums of predictions and labels."""
+"""Accuracy of predictions from exact sums of predictions and labels."""
 
 import math
 import operator
@@ -44,7 +44,17 @@ class ErrorSums:
         return covariance * abs(covariance) / variances
 
     def figures(self, unit: Fraction) -> "Figures":
-        """Round each figure once; `unit` is the physical value of one count of the label."""
+        """Return the figures, each rounded once.
+
+        Parameters
+        ----------
+        unit : Fraction
+            Physical value of one count of the label, in rad.
+
+        Returns
+        -------
+        Figures
+        """
         bias = (self.p - self.y) / self.n
         spread = self.squared_error - self.n * bias**2
         square = self.signed_r_squared
@@ -60,12 +70,18 @@ class ErrorSums:
 
 @dataclass(frozen=True)
 class Figures(Record):
-    """How well a model predicts rows it was not fitted on, in units of the label (rad).
+    """Accuracy of a model on rows that it was not fitted on, in units of the label (rad).
 
-    Attributes:
-        correlation: of prediction and label (0 if one of them is constant), as in Table I.
-        error_mean, error_std: of prediction minus label, as in Table II.
-        relative_rmse: RMSE over that of always predicting the mean of the training rows.
+    Attributes
+    ----------
+    rows : int
+    correlation : float
+        Of prediction and label, as in Table I; 0 if one of them is constant.
+    rmse : float
+    error_mean, error_std : float
+        Of prediction minus label, as in Table II.
+    relative_rmse : float
+        RMSE over that of the training rows' mean as prediction.
     """
 
     DOCUMENT = "rows correlation rmse_deg error_mean_deg error_std_deg relative_rmse"
@@ -94,9 +110,22 @@ class Figures(Record):
 
 
 def error_sums(model: LinearModel, gram: Gram, training_mean: Fraction | None = None) -> ErrorSums:
-    """Return a model's sums over the rows of a Gram, exactly: sum (p - y)^2 = v'Gv, v = (b, -1).
+    """Return the error sums of a model over the rows of a Gram, exactly.
 
-    Without a training mean, the rows' own mean is the reference of `null`.
+    The sum of squared errors is v'Gv, with v = (coefficients, -1).
+
+    Parameters
+    ----------
+    model : LinearModel
+        In counts.
+    gram : Gram
+        Test rows, of at least the model's signals and label.
+    training_mean : Fraction, optional
+        Mean label of the training rows, the reference of `null`. Default: that of the test rows.
+
+    Returns
+    -------
+    ErrorSums
     """
     part = gram.restrict([*model.signals, model.label])
     k, n = len(model.signals), part.n

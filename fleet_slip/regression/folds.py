@@ -1,7 +1,7 @@
-"""Which fold a drive belongs to: the SHA-256 of its trip modulo the number of folds.
+"""Folds of drives, by the SHA-256 of their trips modulo the number of folds, and cross-validation.
 
-It depends on the drive alone, so that models of different days share a split, which rules that even
-the folds out cannot. Sizes vary by chance; a fold that no drive falls into is left out.
+The fold depends on the drive only, so that models of different days share a split. Sizes vary by
+chance; empty folds are dropped.
 """
 
 import math
@@ -24,7 +24,7 @@ from fleet_slip.regression.least_squares import LinearModel, Scales, condition_n
 
 @dataclass(frozen=True)
 class FoldAssignment:
-    """The fold 0..len(names)-1 of each drive, shape (drives,), and what each fold is called."""
+    """The fold 0..len(names)-1 of each drive, shape (drives,), and the names of the folds."""
 
     fold: IntArray
     names: tuple[str, ...]
@@ -38,9 +38,23 @@ class FoldAssignment:
 
 
 def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
-    """Deal drives into `count` folds by the hash of a key: the drive id, or a vehicle or track.
+    """Assign drives to folds by the hash of a key.
 
-    Folds that no drive falls into are left out. Raises `DataError` if fewer than two are left.
+    Parameters
+    ----------
+    keys : sequence of str, shape (drives,)
+        Trip, vehicle or circuit of each drive.
+    count : int
+        Number of folds. Empty folds are dropped.
+
+    Returns
+    -------
+    FoldAssignment
+
+    Raises
+    ------
+    DataError
+        If fewer than two folds have drives.
     """
     numbers = [hash_fold(key, count) for key in keys]
     used = sorted(set(numbers))
@@ -49,7 +63,21 @@ def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
 
 
 def by_value(values: Sequence[Any]) -> FoldAssignment:
-    """Make one fold of each distinct value. Raises `DataError` if one is missing or all agree."""
+    """Make one fold of each distinct value.
+
+    Parameters
+    ----------
+    values : sequence, shape (drives,)
+
+    Returns
+    -------
+    FoldAssignment
+
+    Raises
+    ------
+    DataError
+        If a value is missing, or all are equal.
+    """
     if any(value is None for value in values):
         raise DataError(
             "a drive has no value of the column to fold by: fold by another, or leave such drives "
@@ -62,9 +90,24 @@ def by_value(values: Sequence[Any]) -> FoldAssignment:
 
 
 def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
-    """Cut a number's range into `count` bands of about as many distinct values: whole folds.
+    """Divide the range of a number into bands with about as many distinct values each.
 
-    Unlike the other folds these move with the cohort. Raises `DataError` as `by_value`.
+    The bands depend on the cohort, unlike other folds.
+
+    Parameters
+    ----------
+    values : sequence, shape (drives,)
+    count : int
+        Number of bands.
+
+    Returns
+    -------
+    FoldAssignment
+
+    Raises
+    ------
+    DataError
+        If a value is missing, or all are equal.
     """
     assignment = by_value(values)
     if len(assignment.names) <= count:
@@ -79,9 +122,9 @@ def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
 
 @dataclass(frozen=True)
 class Folds:
-    """One Gram a fold, their names and numbers of drives; rows `auxiliary` are always trained on.
+    """One Gram per fold, with names and number of drives; rows `auxiliary` are always trained on.
 
-    These have an intercept of their own: what they tell is how columns and label change together.
+    These have an intercept of their own: they contribute products about the means only.
     """
 
     grams: tuple[Gram, ...]
@@ -92,7 +135,7 @@ class Folds:
 
     @cached_property
     def total(self) -> Gram:
-        """The Gram of all that a model is trained on, in whole parts of a row's weight."""
+        """The Gram of all training rows, with integer weights."""
         scaled_total = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
         if self.auxiliary is None or not self.weight:
             return scaled_total
@@ -107,16 +150,16 @@ class Folds:
 
     @cached_property
     def _row_factor(self) -> int:
-        """How often each row counts, so that all weights are whole."""
+        """The weight of each row of the folds that makes all weights integers."""
         return self._divisor // math.gcd(self.weight.numerator, self._divisor)
 
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
-        """Yield for each fold the Gram of all others, to train on, and its own, to test on."""
+        """Yield the training Gram and the test Gram of each fold."""
         for fold in self.grams:
             yield self.total - fold.scaled(self._row_factor), fold
 
     def without(self, number: int, drives: int) -> "Folds":
-        """Return the other folds, which hold so many drives."""
+        """Return the folds without one, with the number of their drives."""
         grams = self.grams[:number] + self.grams[number + 1 :]
         names = self.names[:number] + self.names[number + 1 :]
         return replace(self, grams=grams, names=names, drives=drives)
@@ -126,7 +169,7 @@ class Folds:
 class CohortFolds:
     """The folds of a cohort whose drives may have different signals: `tables` of Grams by set.
 
-    `count_drives` tells how many drives have a row in some of the tables, by their places; for
+    `count_drives` returns the number of drives with rows in some tables, given by index; for
     `auxiliary` and `weight` see `Folds`.
     """
 
@@ -140,7 +183,7 @@ class CohortFolds:
     def from_tables(
         cls, tables: Sequence[GramTable], assignment: FoldAssignment, drives: IntArray | None = None
     ) -> "CohortFolds":
-        """Add up each fold's Gram rows; `drives` numbers their drives, by default one each."""
+        """Sum the Gram rows of each fold; `drives` numbers their drives, by default one per row."""
         sizes = [len(table) for table in tables]
         if sum(sizes) != len(assignment.fold):
             raise ValueError("the assignment is not of these drives")
@@ -205,22 +248,30 @@ class CohortFolds:
         return Folds(folds, names, self.count_drives(served), auxiliary, self.weight)
 
 
-# Cross-validation from one Gram a fold: train on the total minus it; pool all sums (Table I).
+# Cross-validation from one Gram per fold: train on the total minus it; pool all sums (Table I).
 
 Procedure = Callable[[Gram], LinearModel]
-"""Makes a model of counts from a training Gram: any fit, with any selection inside."""
+"""Returns a model of counts for a training Gram. It may select signals."""
 
 
 @dataclass(frozen=True)
 class CrossValidation(Record):
-    """A model's figures on rows that it was not fitted on, and its fit to all rows.
+    """Held-out figures of a model, and its fit to all rows.
 
-    Attributes:
-        drives: number of drives it used: those that have all its signals.
-        pooled, folds: figures over all folds' test rows together, and of each fold.
-        condition_number: of the correlation matrix of the inputs, all rows.
-        model, counts: exact fit to all rows, in physical units and in counts.
-        sums: exact pooled sums behind `pooled`, in counts.
+    Attributes
+    ----------
+    drives : int
+        Number of drives that have all its signals.
+    pooled : Figures
+        Over the test rows of all folds together, as in Table I.
+    folds : tuple of Figures
+        Of each fold.
+    condition_number : float
+        Of the correlation matrix of the inputs, all rows.
+    model, counts : LinearModel
+        Exact fit to all rows, in physical units and in counts.
+    sums : ErrorSums
+        Exact pooled sums behind `pooled`, in counts.
     """
 
     DOCUMENT = (
@@ -257,7 +308,17 @@ class CrossValidation(Record):
 
 
 def error_of_mean(values: Sequence[float]) -> float:
-    """Return the standard error of the mean of independent values."""
+    """Return the standard error of the mean of independent values.
+
+    Parameters
+    ----------
+    values : sequence of float
+        Two or more.
+
+    Returns
+    -------
+    float
+    """
     mean = math.fsum(values) / len(values)
     square = math.fsum((value - mean) ** 2 for value in values)
     return math.sqrt(square / (len(values) - 1) / len(values))
@@ -271,7 +332,27 @@ def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) 
 def cross_validate(
     name: str, folds: Folds, procedure: Procedure, scales: Scales
 ) -> CrossValidation:
-    """Cross-validate a procedure that sees training Grams alone. Raises `DataError`."""
+    """Cross-validate a procedure: k-fold, section III of the paper.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model.
+    folds : Folds
+    procedure : callable
+        Returns a model of counts for a training Gram. It may select signals.
+    scales : mapping of str to Fraction
+        Physical value of one count of each signal.
+
+    Returns
+    -------
+    CrossValidation
+
+    Raises
+    ------
+    DataError
+        If a training set determines no model.
+    """
     tests = [
         held_out_errors(procedure(training), training, test) for training, test in folds.splits()
     ]
@@ -281,7 +362,7 @@ def cross_validate(
 def assemble(
     name: str, folds: Folds, tests: Sequence[ErrorSums], counts: LinearModel, scales: Scales
 ) -> CrossValidation:
-    """Put together the held-out sums of each fold and the model of counts fitted to all rows."""
+    """Combine the held-out sums of each fold with the model of counts fitted to all rows."""
     pooled = sum(tests[1:], tests[0])
     unit = scales[counts.label]
     return CrossValidation(
@@ -307,11 +388,32 @@ def cross_validate_inputs(
     *,
     intercept: bool = True,
 ) -> CrossValidation:
-    """Cross-validate least squares over all drives that have the inputs. Raises `DataError`."""
+    """Cross-validate least squares on the drives that have all inputs.
+
+    Parameters
+    ----------
+    name : str
+        Name of the model.
+    cohort : CohortFolds
+    inputs : sequence of str
+    label : str
+    scales : mapping of str to Fraction
+        Physical value of one count of each signal.
+    intercept : bool
+
+    Returns
+    -------
+    CrossValidation
+
+    Raises
+    ------
+    DataError
+        If a fold has no complete case, or inputs are linearly dependent.
+    """
     folds = cohort.complete_cases(inputs, label)
     return cross_validate(name, folds, least_squares(inputs, label, intercept=intercept), scales)
 
 
 def held_out_errors(model: LinearModel, training: Gram, test: Gram) -> ErrorSums:
-    """Return the error sums on a test Gram of a model that was fitted on the training Gram."""
+    """Return the error sums, on a test Gram, of a model that was fitted on the training Gram."""
     return error_sums(model, test, Fraction(training.sum(model.label), training.n))

@@ -25,13 +25,24 @@ def packed_size(k: SomeSize) -> SomeSize:
 
 
 def packed_position(i: int, j: int) -> int:
-    """Return where the product of signals i and j stands: (0,0), (1,0), (1,1), (2,0), ..."""
+    """Return the position of the product of signals i and j: (0,0), (1,0), (1,1), (2,0), ..."""
     return packed_size(max(i, j)) + min(i, j)
 
 
 @dataclass(frozen=True)
 class Gram:
-    """Number of rows, k sums and k(k+1)/2 products (lower triangle by rows) of integer counts."""
+    """Sums and products of rows of integer counts: the sufficient statistics of linear models.
+
+    Attributes
+    ----------
+    signals : tuple of str
+        The k signals.
+    n : int
+        Number of rows.
+    sums : tuple of int, shape (k,)
+    products : tuple of int, shape (k(k+1)/2,)
+        Sums of products, the lower triangle by rows.
+    """
 
     signals: tuple[str, ...]
     n: int
@@ -56,7 +67,24 @@ class Gram:
 
     @classmethod
     def from_counts(cls, signals: Sequence[str], counts: NDArray[Any]) -> "Gram":
-        """Return the Gram of rows of integer counts of any size, shape (n, k)."""
+        """Sum up rows of integer counts, exactly.
+
+        Parameters
+        ----------
+        signals : sequence of str
+            The k signals.
+        counts : integer array, shape (n, k)
+            Counts of any size.
+
+        Returns
+        -------
+        Gram
+
+        Raises
+        ------
+        ValueError
+            For another shape or for numbers that are not integers.
+        """
         if counts.ndim != 2 or counts.shape[1] != len(signals):
             raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
         if counts.dtype.kind not in "iuO":
@@ -79,7 +107,13 @@ class Gram:
         )
 
     def __sub__(self, other: "Gram") -> "Gram":
-        """Return the Gram of the other rows. Raises `DataError` if `other` was no part of it."""
+        """Return the Gram of the rows without those of `other`.
+
+        Raises
+        ------
+        DataError
+            If the signals differ, or `other` is not part of this Gram.
+        """
         self._require_same_signals(other)
         difference = Gram(
             self.signals,
@@ -96,7 +130,7 @@ class Gram:
         return difference
 
     def scaled(self, count: int) -> "Gram":
-        """Return the Gram in which each row counts so many times."""
+        """Return the Gram in which each row counts `count` times."""
         return Gram(
             self.signals,
             self.n * count,
@@ -115,11 +149,11 @@ class Gram:
         )
 
     def about_origin(self) -> "Gram":
-        """Return the Gram with all sums zero, of the rows and their mirror: no intercept."""
+        """Return the Gram with all sums zero, that of rows and their mirror image: no intercept."""
         return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
 
     def centered(self) -> "Gram":
-        """Return n times the Gram of the rows less their mean, as of no rows: no part of a mean."""
+        """Return n times the Gram of the rows minus their mean, with n = 0: no effect on means."""
         return Gram(
             self.signals,
             0,
@@ -132,9 +166,22 @@ class Gram:
         )
 
     def combine(self, combinations: Mapping[str, Mapping[str, int]]) -> "Gram":
-        """Return the Gram of integer combinations, such as {"difference": {"a": 1, "b": -1}}.
+        """Return the Gram of integer combinations of signals.
 
-        Raises `DataError` for a signal that the Gram lacks.
+        Parameters
+        ----------
+        combinations : mapping of str to mapping of str to int
+            Weights of signals by the name of the combination, such as
+            ``{"difference": {"a": 1, "b": -1}}``.
+
+        Returns
+        -------
+        Gram
+
+        Raises
+        ------
+        DataError
+            For a signal that the Gram lacks.
         """
         weights = [
             dict(zip(positions(self.signals, [*old]), old.values(), strict=True))
@@ -197,7 +244,7 @@ NAMES_SHOWN = 4
 
 
 def require_signals(signals: Sequence[str], required: Sequence[str]) -> None:
-    """Raise `DataError` for a wanted signal that is absent."""
+    """Raise `DataError` for a required signal that is absent."""
     missing = [name for name in required if name not in signals]
     if missing:
         more = len(missing) - NAMES_SHOWN
@@ -206,14 +253,14 @@ def require_signals(signals: Sequence[str], required: Sequence[str]) -> None:
 
 
 def positions(signals: Sequence[str], required: Sequence[str]) -> list[int]:
-    """Return the index of each wanted signal. Raises `DataError` for an absent one."""
+    """Return the index of each required signal. Raises `DataError` for an absent one."""
     require_signals(signals, required)
     return [signals.index(name) for name in required]
 
 
 @cache
 def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
-    """Return where the products of some of the signals stand, in the order of a packed triangle."""
+    """Return the positions of the products of some signals, in the order of a packed triangle."""
     places = np.array(at, dtype=np.int64)
     row, column = np.tril_indices(len(at))
     larger = np.maximum(places[row], places[column])
@@ -228,9 +275,17 @@ _MODULUS = 2**64
 
 @dataclass(frozen=True)
 class GramTable:
-    """Many Grams of the same k signals, one a drive: packed products are (drives, k(k+1)/2).
+    """Grams of the same k signals, one per drive.
 
-    Numbers are int64; sums and products that need more bits are integers of Python.
+    Sums and products that exceed int64 are Python integers in arrays of objects.
+
+    Attributes
+    ----------
+    signals : tuple of str
+        The k signals.
+    n : integer array, shape (drives,)
+    sums : integer array, shape (drives, k)
+    products : integer array, shape (drives, k(k+1)/2)
     """
 
     signals: tuple[str, ...]
@@ -271,7 +326,19 @@ class GramTable:
         )
 
     def totals(self, groups: NDArray[Any], count: int) -> list[Gram]:
-        """Return the exact sum over each group of drives; `groups` says each one's, 0..count-1."""
+        """Return the exact sum of each group of drives.
+
+        Parameters
+        ----------
+        groups : integer array, shape (drives,)
+            Group of each drive, in 0..count-1.
+        count : int
+            Number of groups.
+
+        Returns
+        -------
+        list of Gram, length count
+        """
         if groups.shape != self.n.shape:
             raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
         if len(groups) and not 0 <= groups.min() <= groups.max() < count:
@@ -288,7 +355,12 @@ class GramTable:
         return GramTable(self.signals, *(np.add.reduceat(part[order], first) for part in parts))
 
     def moments(self) -> FloatArray:
-        """Return the sums of the products of (1, signals) of each drive, (drives, k+1, k+1)."""
+        """Return the sums of products of (1, signals) of each drive.
+
+        Returns
+        -------
+        float array, shape (drives, k + 1, k + 1)
+        """
         k = len(self.signals)
         moments = np.empty((len(self), k + 1, k + 1))
         moments[:, 0, 0] = self.n
@@ -322,9 +394,18 @@ class GramTable:
 
 
 def exact_sum(values: IntArray) -> list[int]:
-    """Return the sums of an int64 array's columns, shape (rows < 2^26, columns), exactly.
+    """Return the exact sums of the columns of an int64 array.
 
-    The int64 sum is right modulo 2^64; the float64 sum tells how often it wrapped around.
+    The int64 sum is right modulo 2^64; the float64 sum gives the number of wrap-arounds.
+
+    Parameters
+    ----------
+    values : integer array, shape (rows, columns)
+        Fewer than 2^26 rows.
+
+    Returns
+    -------
+    list of int, length columns
     """
     wrapped = values.sum(axis=0)
     totals: list[int] = [int(total) for total in wrapped.tolist()]

@@ -1,8 +1,8 @@
-"""How much each signal of an order contributes, and how much data says so.
+"""Standard errors of coefficients, contributions of signals, and shrinkage within groups.
 
 In the orthogonal basis of a nested order, signal j has the squared length A_j in units of the
-noise, and every criterion is a price on it. Neighbouring rows at 100 Hz are not independent, so the
-evidence that decides is over drives.
+noise; every criterion compares it with a price. Neighbouring rows at 100 Hz are not independent, so
+the evidence is taken over drives.
 """
 
 import math
@@ -22,12 +22,12 @@ from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
 
-# Standard errors that hold with few clusters, from Gram rows alone.
+# Standard errors that are valid for few clusters, from Gram rows.
 #
 # Residuals of a cluster shrink with its leverage, and a sandwich of few is uncertain. CR2 (Bell
 # and McCaffrey, Survey Methodology 28, 2002) multiplies the residuals by (I - H_g)^(-1/2), H_g
 # their block of the hat matrix; degrees of freedom are Satterthwaite's (Imbens and Kolesar, Review
-# of Economics and Statistics 98, 2016). Both take rows for independent only for the mean of a
+# of Economics and Statistics 98, 2016). Both assume independent rows only for the mean of a
 # matrix.
 #
 # No row is needed: in inputs x~ whose moments are I, with N_g those of a cluster, X~' (I - X~
@@ -35,14 +35,29 @@ from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
 # covariances are S_g N_g S_g within a cluster, and -S_g N_g N_h S_h between two.
 
 SINGULAR = 1e-9
-"""A direction of which one cluster has all but so little: without it nothing is known of it."""
+"""Share of a direction outside one cluster below which only that cluster determines it."""
 
 
 def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, FloatArray]:
-    """Return the CR2 variance of each coefficient, in counts, and its degrees of freedom.
+    """Return cluster-robust variances of the coefficients (CR2).
 
-    The variance is a sum of squares, one a cluster. With P the covariance of what is squared, were
-    rows independent, they are (tr P)^2 / tr P^2.
+    The degrees of freedom are Satterthwaite's, (tr P)^2 / tr P^2, with P the covariance of the
+    scores if rows were independent.
+
+    Parameters
+    ----------
+    fitted : Fit
+    drives : DriveMoments
+
+    Returns
+    -------
+    tuple of (float array, float array)
+        Variance in counts and degrees of freedom of each coefficient, the intercept first if any.
+
+    References
+    ----------
+    Bell and McCaffrey, Survey Methodology 28, 2002.
+    Imbens and Kolesar, Review of Economics and Statistics 98, 2016.
     """
     at, first = _columns(fitted, drives), int(not fitted.has_intercept)
     chosen = at[first:]
@@ -73,7 +88,7 @@ INTERCEPT = "intercept"
 class Estimate:
     """A coefficient or the "intercept" in physical units.
 
-    p is two-sided, by t = value / error with so many degrees of freedom.
+    p is two-sided, of t = value / standard_error with `degrees_of_freedom`.
     """
 
     name: str
@@ -91,11 +106,25 @@ class Inference:
     estimates: tuple[Estimate, ...]
     residual_std: float
     degrees_of_freedom: int
-    """Pieces of independent evidence less one, or of rows what the fit leaves."""
+    """Clusters minus one, or rows minus the number of coefficients."""
 
 
 def noise_variance(fitted: Fit) -> Fraction:
-    """Return sigma^2 = RSS / (n - k - 1) in counts^2. Raises `DataError` for too few rows."""
+    """Return the variance of the noise, sigma^2 = RSS / (n - k - 1), in counts^2.
+
+    Parameters
+    ----------
+    fitted : Fit
+
+    Returns
+    -------
+    Fraction
+
+    Raises
+    ------
+    DataError
+        If there are too few rows.
+    """
     if fitted.degrees_of_freedom <= 0:
         raise DataError(
             f"{fitted.gram.n} rows are too few to estimate the noise of a model with "
@@ -105,7 +134,21 @@ def noise_variance(fitted: Fit) -> Fraction:
 
 
 def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
-    """Return Var b0 = sigma^2 (1/n + m'S^-1 m) and Var b = sigma^2 S^-1, in counts, exactly."""
+    """Return the variances of the coefficients for independent rows, exactly.
+
+    Var b0 = sigma^2 (1/n + m'S^-1 m) and Var b = sigma^2 S^-1.
+
+    Parameters
+    ----------
+    fitted : Fit
+    variance : Fraction
+        Variance sigma^2 of the noise, in counts^2.
+
+    Returns
+    -------
+    list of Fraction
+        In counts, the intercept first if any.
+    """
     inputs, gram = fitted.model.signals, fitted.gram
     scale = gram.n if fitted.has_intercept else 1
     part = gram.restrict(inputs)
@@ -121,7 +164,23 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
 
 
 def infer_classically(fitted: Fit, scales: Scales) -> Inference:
-    """Return standard errors for independent rows, rounded once. Raises `DataError` for too few."""
+    """Return standard errors for independent rows, each rounded once.
+
+    Parameters
+    ----------
+    fitted : Fit
+    scales : mapping of str to Fraction
+        Physical value of one count of each signal.
+
+    Returns
+    -------
+    Inference
+
+    Raises
+    ------
+    DataError
+        If there are too few rows.
+    """
     sigma2 = noise_variance(fitted)
     units = _units(fitted, scales)
     errors = [
@@ -132,10 +191,25 @@ def infer_classically(fitted: Fit, scales: Scales) -> Inference:
 
 
 def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
-    """Return cluster-robust standard errors, a cluster being a drive or a car.
+    """Return cluster-robust standard errors (CR2), with a drive or a vehicle as cluster.
 
-    CR2 with Satterthwaite's degrees of freedom: the intervals of few clusters, or of such that
-    differ in size, hold. Raises `DataError` for one cluster, or too few rows.
+    With Satterthwaite's degrees of freedom, intervals hold for few clusters and for unequal ones.
+
+    Parameters
+    ----------
+    fitted : Fit
+    drives : DriveMoments
+    scales : mapping of str to Fraction
+        Physical value of one count of each signal.
+
+    Returns
+    -------
+    Inference
+
+    Raises
+    ------
+    DataError
+        If there is one cluster, or too few rows.
     """
     clusters = _require_clusters(drives.clusters, drives.unit)
     variances, degrees = clustered_variances(fitted, drives)
@@ -154,7 +228,17 @@ def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
 
 
 def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
-    """Return each cluster's sum of (1, inputs) times residual, standardised, (clusters, k+1)."""
+    """Return the standardised scores of each cluster, sums of (1, inputs) times residual.
+
+    Parameters
+    ----------
+    fitted : Fit
+    drives : DriveMoments
+
+    Returns
+    -------
+    float array, shape (clusters, k + 1)
+    """
     scores = -(drives.moments @ drives.direction(fitted.model))[:, _columns(fitted, drives)]
     return drives.by_cluster(scores)
 
@@ -167,7 +251,22 @@ def _require_clusters(clusters: int, unit: str) -> int:
 
 
 def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
-    """Return 1 / (1 - R^2) of each input on the others. Raises `DataError` if dependent."""
+    """Return the variance inflation factor 1 / (1 - R^2) of each input on the others.
+
+    Parameters
+    ----------
+    gram : Gram
+    inputs : sequence of str
+
+    Returns
+    -------
+    dict of str to float
+
+    Raises
+    ------
+    DataError
+        If inputs are linearly dependent.
+    """
     relations = dependence(gram, inputs)
     if relations:
         raise DataError(relations)
@@ -217,13 +316,20 @@ def _inference(
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the data says about the k+1 nested models of an order; variances are in counts^2.
+    """The evidence of the data for the k + 1 nested models of an order.
 
-    Attributes:
-        contributions: A_j of each signal of the order.
-        rows: number of independent rows, at most the number of rows.
-        design_effect: variance of an estimate over what independent rows would give.
-        kind: "rows" if rows count as independent, "drives" or "vehicles" if only those do.
+    Attributes
+    ----------
+    contributions : tuple of float, shape (k,)
+        A_j of each signal: its squared length in units of the noise.
+    rows : float
+        Effective number of independent rows.
+    design_effect : float
+        Variance of an estimate over that of independent rows.
+    variance, full_rss : float
+        Noise variance and residual sum of squares of the full model, in counts^2.
+    kind : {"rows", "drives", "vehicles"}
+        The independent unit.
     """
 
     contributions: tuple[float, ...]
@@ -235,7 +341,18 @@ class Evidence:
 
     @classmethod
     def naive(cls, fits: Sequence[Fit]) -> "Evidence":
-        """A_j = (RSS_{j-1} - RSS_j) / sigma^2 of k+1 nested fits. Raises `DataError`."""
+        """Return the evidence if rows were independent, A_j = (RSS_{j-1} - RSS_j) / sigma^2.
+
+        Parameters
+        ----------
+        fits : sequence of Fit, length k + 1
+            Nested fits of 0 to k signals.
+
+        Raises
+        ------
+        DataError
+            If there is no noise, or too few rows.
+        """
         full, variance = fits[-1], _variance(fits[-1])
         return cls(
             tuple(float(gain / variance) for gain in _gains(fits)),
@@ -248,12 +365,27 @@ class Evidence:
 
     @classmethod
     def clustered(cls, fits: Sequence[Fit], drives: DriveMoments) -> "Evidence":
-        """Take drives, or cars, for independent: A_j is a squared cluster-robust t value.
+        """Return the evidence with independent drives or vehicles: A_j is a squared robust t value.
 
-        With q_j the orthogonal direction of signal j and e the full model's residuals, A_j =
-        (q_j'y)^2 / (c sum_p (q_j'e)_p^2) over clusters p. Its ratio to the naive A_j is the
-        direction's design effect (Kish 1965); rows over the mean effect are effective, at least k +
-        2. Raises `DataError`.
+        With q_j the orthogonal direction of signal j and e the residuals of the full model,
+        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2) over clusters p. Its ratio to the naive A_j is the
+        design effect of the direction (Kish 1965). The effective rows are the rows over the mean
+        design effect, at least k + 2.
+
+        Parameters
+        ----------
+        fits : sequence of Fit, length k + 1
+            Nested fits of 0 to k signals.
+        drives : DriveMoments
+
+        Raises
+        ------
+        DataError
+            If there is one cluster, no noise, or too few rows.
+
+        References
+        ----------
+        Kish, Survey Sampling, 1965.
         """
         full, variance = fits[-1], _variance(fits[-1])
         at = _columns(full, drives)
@@ -294,16 +426,30 @@ class Evidence:
         return len(self.contributions)
 
     def excess(self) -> FloatArray:
-        """Return sum_{i>j} A_i for j = 0..k: what leaving out the rest costs."""
+        """Return the cost of leaving out the last signals, sum_{i>j} A_i for j = 0..k.
+
+        Returns
+        -------
+        float array, shape (k + 1,)
+        """
         tail = np.cumsum([0.0, *reversed(self.contributions)])[::-1]
         return np.ascontiguousarray(tail)
 
     def excess_of(self, rss: FloatArray) -> FloatArray:
-        """Return the same for any subset models, from their residual sums of squares."""
+        """Return the excess of subset models from their residual sums of squares, in counts^2."""
         return np.asarray((rss - self.full_rss) / (self.variance * self.design_effect))
 
     def distances(self) -> tuple[float, ...]:
-        """Return unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2), j = 0..k (Mallows 1973)."""
+        """Return unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2) of the paper, j = 0..k.
+
+        Returns
+        -------
+        tuple of float, shape (k + 1,)
+
+        References
+        ----------
+        Mallows, Technometrics 15, 1973.
+        """
         size = np.arange(self.inputs + 1)
         return tuple((self.excess() + 2 * size - self.inputs).tolist())
 
@@ -323,28 +469,32 @@ def _variance(full: Fit) -> Fraction:
     return variance
 
 
-# Estimates for the members of a group, each drawn towards the group's mean.
+# Shrinkage: estimates for the members of a group, each moved towards the group's mean.
 #
-# A member's number is the kind's mean, what the member differs by (variance A), and an error of
-# known variance V. A is where A times its likelihood, of residuals about the mean, is largest: so
-# it is never 0, where numbers happen to differ no more than their errors do. Members are drawn by
-# B = V / (V + A), and their standard errors have what the uncertainties of A and of the mean add:
+# A member's value is the mean of the group, plus a deviation of variance A, plus an error of known
+# variance V. The estimate of A maximises A times its likelihood, given the residuals: it is never
+# 0, also if values differ no more than their errors. Members are shrunk by B = V / (V + A). Their
+# standard errors include the uncertainties of A and of the mean:
 # C. N. Morris and R. Tang, "Estimating random effects via adjustment for density maximization",
 # Statistical Science 26 (2011), 271-287.
 
 FEWEST_MEMBERS = 4
-"""Of fewer nothing says how much they differ."""
+"""Minimum number of members: fewer do not determine their variance."""
 _HALVINGS, _STEP = 60, 1e-4
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """A kind, and its members as they are known together.
+    """Values of the members of a group, shrunk towards the mean of the group.
 
-    Attributes:
-        mean, mean_error: of the kind, with its standard error.
-        spread, spread_error: the same of the standard deviation of what members differ by, sqrt(A).
-        values, errors: of each member, shape (members,).
+    Attributes
+    ----------
+    mean, mean_error : float
+        Mean of the group, with its standard error.
+    spread, spread_error : float
+        Standard deviation between members, sqrt(A), with its standard error.
+    values, errors : float array, shape (members,)
+        Shrunk values, with their standard errors.
     """
 
     mean: float
@@ -356,9 +506,22 @@ class Pooled:
 
 
 def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
-    """Return numbers of the members of a kind, drawn towards their mean; None of too few.
+    """Shrink the values of the members of a group towards their mean.
 
-    `values` and `variances` have the shape (members,); variances are above 0.
+    Parameters
+    ----------
+    values : float array, shape (members,)
+    variances : float array, shape (members,)
+        Above 0.
+
+    Returns
+    -------
+    Pooled or None
+        None for fewer than `FEWEST_MEMBERS` members.
+
+    References
+    ----------
+    Morris and Tang, Statistical Science 26, 2011, 271-287.
     """
     if len(values) < FEWEST_MEMBERS:
         return None

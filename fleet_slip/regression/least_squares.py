@@ -22,7 +22,17 @@ Scales = Mapping[str, Fraction]
 
 @dataclass(frozen=True)
 class LinearModel(Record):
-    """label = intercept + sum of coefficient times signal, exactly; of counts, or `physical`."""
+    """A linear model with exact coefficients: label = intercept + sum of coefficient * signal.
+
+    Attributes
+    ----------
+    signals : tuple of str
+        The k inputs.
+    label : str
+    coefficients : tuple of Fraction, shape (k,)
+        Of counts, or of physical values after `physical`.
+    intercept : Fraction
+    """
 
     DOCUMENT = "intercept=offset *weights"
 
@@ -57,7 +67,18 @@ class LinearModel(Record):
 
 @dataclass(frozen=True)
 class Fit:
-    """Exact least-squares fit of a Gram of inputs and label, in counts; `rss` is in counts^2."""
+    """Exact least-squares fit of a label on inputs.
+
+    Attributes
+    ----------
+    gram : Gram
+        Sums and products of counts of the inputs and the label.
+    model : LinearModel
+        Coefficients in counts.
+    rss : Fraction
+        Residual sum of squares in counts^2.
+    has_intercept : bool
+    """
 
     gram: Gram
     model: LinearModel
@@ -118,7 +139,26 @@ def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True
 
 
 def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
-    """Fit the last signal of a Gram on all others, from its `moments`. Raises `DataError`."""
+    """Fit the last signal of a Gram on all others.
+
+    Parameters
+    ----------
+    part : Gram
+        The k inputs and the label, which is last.
+    matrix : list of list of int, shape (k + 1, k + 1)
+        Its `moments`.
+    intercept : bool
+        True for moments about the means.
+
+    Returns
+    -------
+    Fit
+
+    Raises
+    ------
+    DataError
+        If inputs are linearly dependent.
+    """
     *inputs, label = part.signals
     right = matrix[-1][:-1]
     solution = exact.solve([row[:-1] for row in matrix[:-1]], right)
@@ -137,7 +177,24 @@ def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
 
 
 def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
-    """Return n S about the means, or raw products. Raises `DataError` if there are no rows."""
+    """Return the matrix of the normal equations.
+
+    Parameters
+    ----------
+    gram : Gram
+        Of k signals.
+    intercept : bool
+        Return n times the sums of products about the means; without it, raw sums of products.
+
+    Returns
+    -------
+    list of list of int, shape (k, k)
+
+    Raises
+    ------
+    DataError
+        If there are no rows.
+    """
     if gram.n == 0:
         raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
     return gram.centered_products() if intercept else gram.raw()
@@ -198,7 +255,18 @@ def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction], *, inter
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:
-    """Return all correlations, (k, k), each rounded once; zeros for a constant signal."""
+    """Return the correlations of all signals, each rounded once.
+
+    Parameters
+    ----------
+    gram : Gram
+        Of k signals.
+
+    Returns
+    -------
+    float array, shape (k, k)
+        Zero for a constant signal.
+    """
     centred = gram.centered_products()
     correlations = np.zeros((len(centred), len(centred)))
     for i, row in enumerate(centred):
@@ -228,11 +296,11 @@ def condition_number(gram: Gram, inputs: Sequence[str]) -> float:
     return exact.condition_number(gram.restrict(inputs).centered_products()) if inputs else 1.0
 
 
-# Relations that hold on average, from sums of products: exactly, and how single drives move them.
+# Relations that hold on average, from sums of products: exact solutions, and influence of drives.
 #
-# A relation says y = theta_1 x_1 + theta_2 x_2 + ... + noise. Multiplied by instruments z and
-# summed up, it is as many linear equations. Products z x of three columns are often those of two
-# others, as (ay/v)(r v) = ay r, so that Gram rows have them although they have no x.
+# A relation is y = theta_1 x_1 + theta_2 x_2 + ... + noise. Multiplied by instruments z and summed
+# up, it gives as many linear equations. Products z x of three columns are often those of two
+# others, as (ay/v)(r v) = ay r, so that Gram rows contain them without a column x.
 
 ONE = "1"
 """The constant among the terms."""
@@ -244,18 +312,23 @@ Product = tuple[str, str]
 
 @dataclass(frozen=True)
 class Relation:
-    """What is summed up: for each instrument its products with the unknowns' terms, and with y.
+    """A linear relation of terms, y = theta_1 x_1 + theta_2 x_2 + ... + noise, with instruments.
 
-    Attributes:
-        instruments: names of terms, as many as unknowns.
-        left: a row for each instrument, of the products with each unknown's term.
-        right: the products with y.
-        noise: products that noise of unit variance adds, by row and unknown; that of y is -1.
+    Attributes
+    ----------
+    instruments : tuple of str
+        Terms z, as many as unknowns.
+    products : tuple of tuple of Product
+        For each instrument, its products with the terms x of the unknowns.
+    response_products : tuple of Product
+        For each instrument, its product with y.
+    noise : mapping of (int, int) to Product
+        Products that noise of unit variance adds, by row and unknown; that of y is -1.
     """
 
     instruments: tuple[str, ...]
-    left: tuple[tuple[Product, ...], ...]
-    right: tuple[Product, ...]
+    products: tuple[tuple[Product, ...], ...]
+    response_products: tuple[Product, ...]
     noise: Mapping[tuple[int, int], Product] = field(default_factory=dict)
 
     @classmethod
@@ -265,20 +338,43 @@ class Relation:
         by: tuple[str, ...],
         noise: Mapping[tuple[int, int], Product] = MappingProxyType({}),
     ) -> "Relation":
-        """Return that of a term by others, which are the instruments themselves."""
+        """Return the relation of a term to others, which are the instruments.
+
+        Parameters
+        ----------
+        response : str
+            The term y.
+        by : tuple of str
+            The terms x.
+        noise : mapping of (int, int) to Product
+
+        Returns
+        -------
+        Relation
+        """
         products = tuple(tuple((a, b) for b in by) for a in by)
         return cls(by, products, tuple((response, a) for a in by), noise)
 
     def system(
         self, sums: Callable[[str, str], Any], variance: Fraction | float
     ) -> list[list[Any]]:
-        """Return the rows of the equations, each with its right side last, free of noise.
+        """Return the linear equations of the unknowns, corrected for noise.
 
-        Entries are what `sums` gives: fractions, or arrays of drives.
+        Parameters
+        ----------
+        sums : callable
+            Returns the sum of products of two terms: fractions, or arrays of drives.
+        variance : Fraction or float
+            Variance of the noise.
+
+        Returns
+        -------
+        list of list
+            A row for each equation, with its right-hand side last.
         """
         rows = [
             [sums(a, b) for a, b in (*row, of_y)]
-            for row, of_y in zip(self.left, self.right, strict=True)
+            for row, of_y in zip(self.products, self.response_products, strict=True)
         ]
         for (row, column), (a, b) in self.noise.items():
             rows[row][column] = rows[row][column] - variance * sums(a, b)
@@ -322,7 +418,7 @@ class ExactSums:
         return self(name, name) / self.gram.n - self.mean(name) ** 2
 
     def residual_variance(self, name: str, inputs: Sequence[str]) -> Fraction | None:
-        """Return what least squares on other terms leave of a variance; None if undetermined."""
+        """Return the residual variance of a term on other terms, None if these are dependent."""
         matrix = self.gram.restrict((*inputs, name)).centered_products()
         inner = exact.determinant([row[:-1] for row in matrix[:-1]])
         if inner == 0:
@@ -337,11 +433,25 @@ def influence(
     noise: float,
     gradient: Sequence[float],
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Return how far each drive moves a combination of unknowns, and its share of the variance.
+    """Return each drive's influence on a combination of unknowns, and its share of the variance.
 
-    None if the equations are singular. `sums` gives the sums of each drive, shape (drives,). With
-    the equations A_g of a drive, A of all, and h = A'^-1 a, a drive moves a'theta by h'(y_g - A_g
-    theta); its share is h'Z_g'Z_g h.
+    With the equations A_g of a drive, A of all drives, and h = A'^-1 a, a drive moves a'theta by
+    h'(y_g - A_g theta); its share of the variance is h'Z_g'Z_g h.
+
+    Parameters
+    ----------
+    relation : Relation
+    sums : callable
+        Returns the sums of products of two terms of each drive, shape (drives,).
+    noise : float
+        Variance of the noise.
+    gradient : sequence of float, shape (k,)
+        The combination a of the k unknowns.
+
+    Returns
+    -------
+    tuple of (float array, float array) or None
+        Influence and share, each of shape (drives,). None if the equations are singular.
     """
     equations = _stacked(relation.system(sums, noise))
     coefficients, right = equations[:, :, :-1], equations[:, :, -1]

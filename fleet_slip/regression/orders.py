@@ -1,6 +1,6 @@
-"""Rankings: the predefined order on which nested models depend (Section II-B).
+"""Rankings: the predefined order of the signals of nested models (section II.B of the paper).
 
-All decide exactly; ties go to the declared order.
+All compare exactly; ties are resolved by the declared order.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
 
 
 def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Remove the signal whose loss costs least, of equals the later: Wang's and WEKA's order."""
+    """Remove, at each step, the signal whose loss costs least, as Wang and WEKA do."""
     return _stepwise(gram, inputs, label, "backward")
 
 
@@ -62,7 +62,28 @@ RANKINGS: dict[str, Ranking] = {
 
 
 def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order the inputs. Raises `QuestionError` for an unknown ranking, `DataError` if dependent."""
+    """Order the inputs by a ranking.
+
+    Parameters
+    ----------
+    name : str
+        One of `RANKINGS`.
+    gram : Gram
+    inputs : sequence of str
+    label : str
+
+    Returns
+    -------
+    tuple of str
+        The inputs, the first signal of nested models first.
+
+    Raises
+    ------
+    QuestionError
+        For an unknown ranking.
+    DataError
+        If inputs are linearly dependent.
+    """
     if name not in RANKINGS:
         raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
     return RANKINGS[name](gram, inputs, label)
@@ -76,7 +97,7 @@ def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
 
 
 def _stepwise(gram: Gram, inputs: Sequence[str], label: str, method: str) -> tuple[str, ...]:
-    """Return the order of a search, behind it what is as good as dependent, as declared."""
+    """Return the order of a search, followed by nearly dependent inputs in declared order."""
     _moments(gram, inputs, label)
     sets = stepwise_order(gram, inputs, label, method, len(inputs))
     order = sets[-1] if sets else ()
@@ -90,19 +111,18 @@ def _descending(inputs: Sequence[str], scores: Sequence[Fraction]) -> tuple[str,
 
 # Choosing among many inputs: forward, backward, or exchange.
 #
-# Steps are taken in extended precision (`numpy.longdouble`); where the two best sums of squares
-# differ by less than rounding could make, exact elimination decides, so an order is that of exact
-# arithmetic. A column that others explain but for 10^-9 of its variance counts as dependent, and is
-# left out.
+# Steps are computed in extended precision (`numpy.longdouble`). Where the two best sums of squares
+# differ by less than the rounding error, exact determinants decide, so the order is that of exact
+# arithmetic. A column is dependent, and left out, if others explain all but 10^-9 of its variance.
 
 LongArray = NDArray[np.longdouble]
 
 DEPENDENT = 1e-9
-"""Share of a column's variance that others must leave unexplained."""
+"""Minimum share of a column's variance that the others leave unexplained."""
 
 ROUNDING = 1e-6
-"""Relative difference of two gains below which they are compared exactly: far above what 64-bit
-fractions lose where no column is dependent."""
+"""Relative difference of two gains below which they are compared exactly: far above the rounding
+error of 64-bit fractions without dependent columns."""
 
 METHODS: Final = ("forward", "backward", "exchange")
 
@@ -110,9 +130,28 @@ METHODS: Final = ("forward", "backward", "exchange")
 def stepwise_order(
     gram: Gram, inputs: Sequence[str], label: str, method: str, max_size: int
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the chosen inputs of sizes 1, 2, ... up to `max_size`; all but exchange's are nested.
+    """Search for good subsets of each size.
 
-    Raises `QuestionError` for an unknown method, `DataError` for no rows.
+    Parameters
+    ----------
+    gram : Gram
+    inputs : sequence of str
+    label : str
+    method : {"forward", "backward", "exchange"}
+    max_size : int
+        Maximum number of inputs.
+
+    Returns
+    -------
+    tuple of tuple of str
+        The chosen inputs of sizes 1, 2, ... They are nested, except for "exchange".
+
+    Raises
+    ------
+    QuestionError
+        For an unknown method.
+    DataError
+        If there are no rows.
     """
     if method not in METHODS:
         raise QuestionError(f"unknown search {method!r}. Known: {', '.join(METHODS)}.")
@@ -127,7 +166,21 @@ def stepwise_order(
 
 
 def sweep(matrix: LongArray, pivot: int) -> LongArray:
-    """Return a matrix swept on a pivot (Goodnight 1979), which done again undoes it."""
+    """Sweep a matrix on a pivot. A second sweep restores it.
+
+    Parameters
+    ----------
+    matrix : longdouble array, shape (k, k)
+    pivot : int
+
+    Returns
+    -------
+    longdouble array, shape (k, k)
+
+    References
+    ----------
+    Goodnight, The American Statistician 33, 1979.
+    """
     row = matrix[pivot] / matrix[pivot, pivot]
     swept: LongArray = np.multiply.outer(matrix[:, pivot], row)
     np.subtract(matrix, swept, out=swept)
@@ -139,12 +192,12 @@ def sweep(matrix: LongArray, pivot: int) -> LongArray:
 
 
 class _Search:
-    """The correlation matrix of inputs and label, and exact sums of squares where it matters."""
+    """The correlation matrix of inputs and label, with exact sums of squares for ties."""
 
     def __init__(self, gram: Gram) -> None:
         self.exact = moments(gram)
         size = len(self.exact)
-        # An integer to 64 bits or more: its float, and what that leaves.
+        # Each integer as the sum of two floats: 64 bits or more.
         half = [x for i, row in enumerate(self.exact) for x in row[: i + 1]]
         high = np.array([float(x) for x in half])
         low = np.array(
@@ -163,7 +216,7 @@ class _Search:
         self.usable = self._independent()
 
     def _independent(self) -> list[int]:
-        """Return inputs that explain the others, each time the one that is explained least."""
+        """Return independent inputs, found by pivoting on the largest remaining variance."""
         if self._far_from_dependent():
             return list(range(self.inputs))
         work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
@@ -177,7 +230,7 @@ class _Search:
             work -= buffer
             taken.append(int(names[best]))
             remaining[best] = False
-            if 8 * remaining.sum() < 7 * len(remaining):  # what was taken is not looked at again
+            if 8 * remaining.sum() < 7 * len(remaining):  # drop the inputs that were taken
                 work, names = work[np.ix_(remaining, remaining)], names[remaining]
                 buffer, remaining = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
         return sorted(taken)
@@ -185,7 +238,7 @@ class _Search:
     def _far_from_dependent(self) -> bool:
         """Return True if no combination of inputs has twice as little variance as `DEPENDENT`.
 
-        What others leave of an input is no less than the least eigenvalue of the matrix.
+        The unexplained share of an input is at least the smallest eigenvalue of the matrix.
         """
         correlation = self.matrix[:-1, :-1].astype(np.float64)
         try:
@@ -224,7 +277,7 @@ class _Search:
     def _best_entry(
         self, variance: LongArray, with_label: LongArray, chosen: Sequence[int]
     ) -> int | None:
-        """Return the input that explains most beside those chosen, from what these leave."""
+        """Return the input that explains most of what the chosen ones leave unexplained."""
         eligible = np.zeros(len(variance), dtype=np.bool_)
         eligible[self.usable] = True
         eligible[chosen] = False
@@ -252,7 +305,7 @@ class _Search:
         while improved:
             improved = False
             for position, old in enumerate(chosen):
-                # Of the matrix swept on the old one only this is needed, until it is exchanged.
+                # Before an exchange, only these entries of the swept matrix are needed.
                 row = work[old] / work[old, old]
                 variance = work.diagonal() - work[:, old] * row
                 with_label = work[:, -1] - work[:, old] * row[-1]

@@ -1,14 +1,14 @@
-"""The best models of every size among all 2^k subsets of the signals.
+"""Best models of every size among all 2^k subsets of the signals, and selection criteria.
 
-Each signal doubles a list of moments into copies without it and with it (Schur complement) until
-2^k residual sums of squares are left, by bit mask: float64 on correlations. The best are ordered
+Each signal doubles a list of moments into copies without it and with it (Schur complement), until
+2^k residual sums of squares remain, by bit mask: float64 on correlations. The best are ordered
 exactly.
 
-Selection criteria: each is a value per model, and the smallest wins.
+A selection criterion gives a value per model, and the smallest wins.
 
-All are written in the excess x = (RSS - RSS_full) / sigma^2 of a model with j of k signals, for
-nested models and subsets and any effective number of rows n, less constants that models share. With
-nu = n - k - 1, RSS / RSS_full = 1 + x / nu.
+Criteria are functions of the excess x = (RSS - RSS_full) / sigma^2 of a model with j of k signals
+and of the effective rows n, without constants that all models share. With nu = n - k - 1,
+RSS / RSS_full = 1 + x / nu.
 """
 
 import math
@@ -29,7 +29,7 @@ from fleet_slip.regression.least_squares import Fit, correlation_matrix, depende
 
 @dataclass(frozen=True)
 class Problem:
-    """What a criterion looks at: x and j of each model, n (effective) rows, k inputs."""
+    """The input of a criterion: excess and size of each model, effective rows n, k inputs."""
 
     excess: FloatArray
     size: FloatArray
@@ -61,13 +61,50 @@ CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
 
 
 def criterion_values(name: str, evidence: Evidence) -> FloatArray:
-    """Return a criterion for the k+1 nested models. Raises `QuestionError` for an unknown name."""
+    """Return the values of a selection criterion for the k + 1 nested models.
+
+    Parameters
+    ----------
+    name : str
+        One of `CRITERIA`.
+    evidence : Evidence
+
+    Returns
+    -------
+    float array, shape (k + 1,)
+        The smallest value is the best.
+
+    Raises
+    ------
+    QuestionError
+        For an unknown criterion.
+    """
     size = np.arange(evidence.inputs + 1, dtype=np.float64)
     return _criterion(name)(Problem(evidence.excess(), size, evidence.rows, evidence.inputs))
 
 
 def subset_values(name: str, evidence: Evidence, rss: FloatArray, size: FloatArray) -> FloatArray:
-    """Return a criterion for subset models, from their RSS in counts^2 and their sizes."""
+    """Return the values of a selection criterion for subset models.
+
+    Parameters
+    ----------
+    name : str
+        One of `CRITERIA`.
+    evidence : Evidence
+    rss : float array, shape (models,)
+        Residual sums of squares in counts^2.
+    size : float array, shape (models,)
+        Numbers of signals.
+
+    Returns
+    -------
+    float array, shape (models,)
+
+    Raises
+    ------
+    QuestionError
+        For an unknown criterion.
+    """
     problem = Problem(evidence.excess_of(rss), size, evidence.rows, evidence.inputs)
     return _criterion(name)(problem)
 
@@ -86,7 +123,7 @@ def _criterion(name: str) -> Callable[[Problem], FloatArray]:
 
 
 MOST_INPUTS = 22
-"""Most signals of which all subsets are computed: 2^22 take about two seconds."""
+"""Maximum number of signals for all subsets: 2^22 take about two seconds."""
 
 _SPARE = 3
 
@@ -113,9 +150,27 @@ class SizeResult(Record):
 
 
 def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) -> list[SizeResult]:
-    """Return the `count` best models of each size 0..k, ordered exactly; ties as declared.
+    """Return the best models of each size, ordered exactly; equal ones in declared order.
 
-    Raises `DataError` for dependence or a constant label, `QuestionError` beyond `MOST_INPUTS`.
+    Parameters
+    ----------
+    gram : Gram
+    inputs : sequence of str
+        The k signals, at most `MOST_INPUTS`.
+    label : str
+    count : int
+        Number of models of each size.
+
+    Returns
+    -------
+    list of SizeResult, length k + 1
+
+    Raises
+    ------
+    DataError
+        If inputs are linearly dependent, or the label is constant.
+    QuestionError
+        If there are too many inputs.
     """
     relations = dependence(gram, inputs)
     if relations:
@@ -134,7 +189,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
 
 
 def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
-    """Return the size that each criterion picks; the evidence is that of the full model."""
+    """Return the size that each criterion chooses; the evidence is that of the full model."""
     rss = np.array([float(result.best.rss) for result in results])
     size = np.arange(len(results), dtype=np.float64)
     return {name: int(np.argmin(subset_values(name, evidence, rss, size))) for name in CRITERIA}
@@ -162,7 +217,18 @@ def subset_sizes(k: int) -> NDArray[np.uint8]:
 
 
 def all_rss(matrix: FloatArray) -> FloatArray:
-    """Return the RSS of all 2^k subsets of moments, label last; element m has the bits of m."""
+    """Return the residual sums of squares of all 2^k subsets.
+
+    Parameters
+    ----------
+    matrix : float array, shape (k + 1, k + 1)
+        Moments of the inputs and the label, which is last.
+
+    Returns
+    -------
+    float array, shape (2^k,)
+        Element m is that of the inputs whose bits are set in m.
+    """
     work: FloatArray = np.asarray(matrix, dtype=np.float64)[:, :, None]
     # Signals are taken from the last to the first, so that the first ends in the lowest bit.
     # The label moves to the front, out of the way.

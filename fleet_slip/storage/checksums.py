@@ -51,8 +51,8 @@ def fast_checksum_of(content: "pa.Buffer | bytes") -> str:
 
 def checksum_in(path: str) -> str | None:
     """Return the checksum in a data file's name; None in other names."""
-    found = _CHECKSUM.search(path)
-    return found[1] if found else None
+    match = _CHECKSUM.search(path)
+    return match[1] if match else None
 
 
 def require_content(path: str, content: "pa.Buffer | bytes", where: object) -> None:

@@ -47,9 +47,9 @@ def checked_note(
 
 def checksum_of_actions(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
     """Return the checksum of a note and of actions as the log has them, in any order."""
-    rest = {key: value for key, value in note.items() if key != CHECKSUM_KEY}
+    unchecked = {key: value for key, value in note.items() if key != CHECKSUM_KEY}
     texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]
-    text = "\n".join([canonical_json(rest), *sorted(texts)])
+    text = "\n".join([canonical_json(unchecked), *sorted(texts)])
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -66,7 +66,7 @@ def _as_logged(action: "AddAction | RemoveAction") -> Action:
     kind = "add" if isinstance(action, AddAction) else "remove"
     return {
         kind: {
-            re.sub(r"_(\w)", lambda found: found[1].upper(), name): getattr(action, name)
+            re.sub(r"_(\w)", lambda match: match[1].upper(), name): getattr(action, name)
             for name in _FIELDS[kind]
         }
     }
@@ -100,8 +100,8 @@ class Commit:
     @property
     def parameters(self) -> Mapping[str, Any]:
         """What the Delta library was asked to do."""
-        found = self.info.get("operationParameters")
-        return found if isinstance(found, Mapping) else {}
+        parameters = self.info.get("operationParameters")
+        return parameters if isinstance(parameters, Mapping) else {}
 
     def problem(self) -> str | None:
         """Return what is wrong with it, or None."""
@@ -113,9 +113,9 @@ class Commit:
             return "its content does not match the checksum that it states"
         if stated is None and checked:
             return "states no checksum: damage, or another program's"
-        made = {kind: content for action in self.actions for kind, content in action.items()}
+        contents = {kind: content for action in self.actions for kind, content in action.items()}
         for kind, key in (("metaData", "metadata"), ("protocol", "protocol")):
-            if self.version == 0 and made.get(kind) != _object(self.parameters.get(key)):
+            if self.version == 0 and contents.get(kind) != _object(self.parameters.get(key)):
                 return "defines the table twice, differently"
         return None
 
@@ -130,10 +130,10 @@ def _has_checksum(note: Mapping[str, Any], actions: Sequence[Action], stated: An
 def _object(text: Any) -> Mapping[str, Any]:
     """Return a JSON object from its text; an empty one if it is none."""
     try:
-        found = json.loads(text)
+        value = json.loads(text)
     except (TypeError, ValueError, RecursionError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return value if isinstance(value, dict) else {}
 
 
 def read_commit(log: Folder, version: int) -> Commit:
@@ -158,16 +158,16 @@ def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], d
 
     Delta cleans the earliest away after 30 days; the others must follow each other.
     """
-    there = {int(name[:20]) for name in log.names() if _COMMIT.fullmatch(name)}
-    newest = max(there, default=-1) if last is None else last
+    versions = {int(name[:20]) for name in log.names() if _COMMIT.fullmatch(name)}
+    newest = max(versions, default=-1) if last is None else last
     commits: list[Commit] = []
     faults: dict[str, str] = {}
-    for version in range(min(there, default=newest), newest + 1):
+    for version in range(min(versions, default=newest), newest + 1):
         name = f"{version:020}.json"
         try:
             commit = read_commit(log, version)
         except ValueError as error:
-            faults[name] = str(error) if version in there else "is missing"
+            faults[name] = str(error) if version in versions else "is missing"
             continue
         if problem := commit.problem():
             faults[name] = problem

@@ -47,9 +47,9 @@ def _local(path: Path) -> Folder:
         raise StorageError(
             f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another."
         )
-    if found := _ESCAPE.search(str(path.absolute())):
+    if match := _ESCAPE.search(str(path.absolute())):
         raise StorageError(
-            f"{path}: a data root cannot have {found[0]!r} in its full path: Delta reads it as one "
+            f"{path}: a data root cannot have {match[0]!r} in its full path: Delta reads it as one "
             "character. Choose another."
         )
     for folder in (place := Path(os.path.realpath(path)), *place.parents):
@@ -71,8 +71,8 @@ def _at_url(url: str) -> Folder:
         if parts.netloc not in ("", "localhost") or parts.query or parts.fragment:
             raise StorageError("a data root at a file URL is written as file:///PATH.")
         return _local(Path(unquote(parts.path)))
-    found = _OBJECT_URL.fullmatch(url)
-    if found is None:
+    match = _OBJECT_URL.fullmatch(url)
+    if match is None:
         raise StorageError(
             "a data root on an object store is written as s3://BUCKET/PATH, gs://BUCKET/PATH "
             "or az://CONTAINER/PATH, with letters, digits and any of _ . = + - in the path. "
@@ -80,4 +80,4 @@ def _at_url(url: str) -> Folder:
         )
     with require_extra("objects", "a data root on an object store"):
         from fleet_slip.storage.objects import ObjectFolder
-    return ObjectFolder(found["bucket"], found["path"].strip("/"))
+    return ObjectFolder(match["bucket"], match["path"].strip("/"))

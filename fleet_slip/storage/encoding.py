@@ -57,13 +57,13 @@ class Encoding:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        kept = rows.drop_columns([name for name in omitted if name in rows.schema.names])
+        stored_rows = rows.drop_columns([name for name in omitted if name in rows.schema.names])
         # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
         # would bring their names along: Parquet stores one as it is given.
-        columns = [_only_used_values(column) for column in kept.columns]
+        columns = [_only_used_values(column) for column in stored_rows.columns]
         # Declared so, a column without a null has no list of which values are null, which takes an
         # eighth of the time to write.
-        fields = [f.with_nullable(kept[f.name].null_count > 0) for f in kept.schema]
+        fields = [f.with_nullable(stored_rows[f.name].null_count > 0) for f in stored_rows.schema]
         stored = pa.Table.from_arrays(columns, schema=pa.schema(fields))
         sink = pa.BufferOutputStream()
         with pq.ParquetWriter(
@@ -94,12 +94,12 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
     if not pa.types.is_dictionary(column.type):
         return column
-    whole = column.combine_chunks()
-    used = whole.indices.unique().drop_null()
-    if used.to_pylist() == list(range(len(whole.dictionary))):
+    array = column.combine_chunks()
+    used = array.indices.unique().drop_null()
+    if used.to_pylist() == list(range(len(array.dictionary))):
         return column
-    codes = whole.indices.dictionary_encode()
-    values = whole.dictionary.take(codes.dictionary)
+    codes = array.indices.dictionary_encode()
+    values = array.dictionary.take(codes.dictionary)
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
 
 
@@ -112,9 +112,9 @@ def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, frozens
     stored = [name for name in columns if name in metadata.schema.names]
     with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:
         schema = parquet.schema_arrow
-        there = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
-        groups = [parquet.read_row_group(i, there) for i in range(parquet.num_row_groups)]
-    return {n: _names([chunk for rows in groups for chunk in rows[n].chunks]) for n in there}
+        dictionaries = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
+        groups = [parquet.read_row_group(i, dictionaries) for i in range(parquet.num_row_groups)]
+    return {n: _names([chunk for rows in groups for chunk in rows[n].chunks]) for n in dictionaries}
 
 
 def _names(chunks: Sequence[pa.DictionaryArray]) -> frozenset[str]:

@@ -58,10 +58,10 @@ class LocalFolder(Folder):
 
     def stamp(self, path: str) -> object:
         try:
-            found = (self.path / path).stat()
+            status = (self.path / path).stat()
         except OSError:
             return None
-        return found.st_ino, found.st_mtime_ns, found.st_size
+        return status.st_ino, status.st_mtime_ns, status.st_size
 
     def read(self, path: str) -> bytes:
         with (
@@ -120,8 +120,8 @@ class LocalFolder(Folder):
                 path.rename(aside)
             except FileNotFoundError:
                 return False
-            found = self._judge(aside)
-            same = found is not None and replace(found, path=file.path) == file
+            moved = self._judge(aside)
+            same = moved is not None and replace(moved, path=file.path) == file
             if not same:
                 with contextlib.suppress(FileExistsError):
                     path.hardlink_to(aside)
@@ -177,15 +177,15 @@ class LocalFolder(Folder):
 
     def _judge(self, path: Path) -> StoredFile | None:
         try:
-            found = path.stat(follow_symlinks=False)
+            status = path.stat(follow_symlinks=False)
         except FileNotFoundError:
             return None
         return StoredFile(
             self,
             path.relative_to(self.path).as_posix(),
-            found.st_size,
-            found.st_mtime_ns,
-            str(found.st_ino),
+            status.st_size,
+            status.st_mtime_ns,
+            str(status.st_ino),
         )
 
 

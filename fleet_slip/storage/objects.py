@@ -188,15 +188,15 @@ class ObjectFolder(Folder):
 
     def names(self) -> list[str]:
         with object_errors(str(self)):
-            found = obstore.list_with_delimiter(self._store, self.prefix or None)
-        paths = [*found["common_prefixes"], *(meta["path"] for meta in found["objects"])]
+            listing = obstore.list_with_delimiter(self._store, self.prefix or None)
+        paths = [*listing["common_prefixes"], *(meta["path"] for meta in listing["objects"])]
         return sorted(path.rpartition("/")[2] for path in paths)
 
     def files(self) -> list[StoredFile]:
         with object_errors(str(self)):
             pages = list(obstore.list(self._store, self.prefix or None))
-        found = [self.found(meta) for page in pages for meta in page]
-        return sorted(found, key=lambda file: file.path)
+        files = [self.stored_file(meta) for page in pages for meta in page]
+        return sorted(files, key=lambda file: file.path)
 
     def read(self, path: str) -> bytes:
         return _bytes_of(self._store, self._key(path), f"{self}/{path}")
@@ -231,7 +231,7 @@ class ObjectFolder(Folder):
                 meta = obstore.head(self._store, self._key(file.path))
             except FileNotFoundError:
                 return False
-            if self.found(meta) != file:
+            if self.stored_file(meta) != file:
                 return False
             obstore.delete(self._store, self._key(file.path))
         return True
@@ -264,7 +264,7 @@ class ObjectFolder(Folder):
                 return False
         return True
 
-    def found(self, meta: Any) -> StoredFile:
+    def stored_file(self, meta: Any) -> StoredFile:
         # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
         # and quotes when they are asked for it alone.
         return StoredFile(

@@ -62,10 +62,10 @@ def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
     """Return the lines that are what was written, and the numbers, from 1, of changed ones."""
     intact, changed = [], []
     for number, line in enumerate(content.split(b"\n"), 1):
-        found = _WITH_CHECKSUM.fullmatch(line)
-        if found and _checksum(found[1]) == found[2]:
+        match = _WITH_CHECKSUM.fullmatch(line)
+        if match and _checksum(match[1]) == match[2]:
             intact.append(line)
-        elif found or _is_record(line) or _ends(line) or _ends(line[:-1]):
+        elif match or _is_record(line) or _ends(line) or _ends(line[:-1]):
             changed.append(number)
     return intact, changed
 
@@ -92,10 +92,10 @@ def _intact_records(root: Folder, since: str) -> Iterator[dict[str, Any]]:
 
 def _ends(line: bytes) -> bool:
     """Whether a line ends as a line with a checksum does, but for one byte."""
-    there = line[-len(_END) :]
-    if len(there) < len(_END):
+    tail = line[-len(_END) :]
+    if len(tail) < len(_END):
         return False
-    pairs = zip(there, _END, strict=True)
+    pairs = zip(tail, _END, strict=True)
     hexadecimal = b"0123456789abcdef"
     return sum(a != b and not (b == 48 and a in hexadecimal) for a, b in pairs) <= 1
 
@@ -160,9 +160,9 @@ class Run:
     @property
     def shown_arguments(self) -> list[str]:
         """The command line without what the history must not keep."""
-        kept = publishable(self.arguments)
-        more = len(kept) - ARGUMENTS_MAX
-        return [*kept[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else kept
+        arguments = publishable(self.arguments)
+        more = len(arguments) - ARGUMENTS_MAX
+        return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
 
     def beginning(self) -> dict[str, Any]:
         """Return the line that is written when the run starts."""
@@ -192,7 +192,7 @@ class Run:
             "outcome": outcome,
             "exit_code": exit_code,
             "error": message if error is not None and exit_code else None,
-            "steps": [asdict(one) for one in self.steps],
+            "steps": [asdict(step) for step in self.steps],
         }
 
 
@@ -229,14 +229,14 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
 def step(name: str) -> Iterator[MeasuredStep]:
     """Time a step of the run under way, if there is one."""
     run = _current.get()
-    one = MeasuredStep(name)
+    measured = MeasuredStep(name)
     begun = time.monotonic()
     try:
-        yield one
+        yield measured
     finally:
-        one.seconds = round(time.monotonic() - begun, 6)
+        measured.seconds = round(time.monotonic() - begun, 6)
         if run:
-            run.steps.append(one)
+            run.steps.append(measured)
 
 
 @contextlib.contextmanager
@@ -254,10 +254,10 @@ def publishable(arguments: Sequence[str]) -> list[str]:
     person's car, since the history outlives it: --vehicle, --drive, conditions on such columns,
     names of data files.
     """
-    kept: list[str] = []
+    published: list[str] = []
     hide_next = False
     for argument in arguments:
-        text = hide_passwords(argument.encode(errors="replace").decode(), whole=True)
+        text = hide_passwords(argument.encode(errors="replace").decode(), to_end=True)
         if "://" not in text and (address := _ADDRESS.fullmatch(text)):
             text = f"{address[1] or ''}{HIDDEN}@{address[2]}"
         if _NAMES.search(text):
@@ -271,8 +271,8 @@ def publishable(arguments: Sequence[str]) -> list[str]:
         elif data_file := _DATA_FILE.fullmatch(text):
             text = f"{HIDDEN}{data_file[1]}"
         hide_next = private and not equals and not hide_next
-        kept.append(text)
-    return kept
+        published.append(text)
+    return published
 
 
 def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
@@ -322,7 +322,7 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
     """
     import pyarrow as pa
 
-    found = []
+    chunks = []
     for path, content in _read_history(root, since):
         lines, changed = read_lines(content)
         if changed:
@@ -330,8 +330,8 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
                 f"{root}/{FOLDER}/{path}: line {changed[0]} was changed or damaged. Restore the "
                 "file from a backup, or delete the line: no other depends on it."
             )
-        found.append(pa.array(lines, pa.binary()).cast(pa.string()))
-    rows = pa.chunked_array(found, pa.string())
+        chunks.append(pa.array(lines, pa.binary()).cast(pa.string()))
+    rows = pa.chunked_array(chunks, pa.string())
     database.register("run_lines", pa.table({"line": rows}))
     database.execute(read_sql("warehouse", "runs.sql"))
     database.unregister("run_lines")

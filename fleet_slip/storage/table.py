@@ -191,7 +191,7 @@ _CONFLICT = re.compile(
 )
 """What the Delta library says when another commit was faster; anything else is a fault."""
 
-Given = ParamSpec("Given")
+Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
@@ -207,9 +207,9 @@ def on_newest(
     for _ in range(LOOKS):
         before = _versions(tables)
         try:
-            found = look()
-            if not is_damage(found) or _versions(tables) == before:
-                return found
+            result = look()
+            if not is_damage(result) or _versions(tables) == before:
+                return result
         except StorageError:
             if _versions(tables) == before:
                 raise
@@ -217,14 +217,14 @@ def on_newest(
 
 
 def _versions(tables: Sequence[Table]) -> list[int | None]:
-    found: list[int | None] = []
+    versions: list[int | None] = []
     for table in tables:
         try:
             delta = table.open_delta()
         except StorageError:
             delta = None
-        found.append(None if delta is None else delta.version())
-    return found
+        versions.append(None if delta is None else delta.version())
+    return versions
 
 
 def retry_conflicts(attempt: Callable[[], Result]) -> Result:
@@ -238,12 +238,12 @@ def retry_conflicts(attempt: Callable[[], Result]) -> Result:
     return attempt()
 
 
-def retrying(commit: Callable[Given, Result]) -> Callable[Given, Result]:
+def retrying(commit: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Decorate a function that commits to a table, to be called as `retry_conflicts` does."""
 
     @functools.wraps(commit)
-    def retried(*given: Given.args, **named: Given.kwargs) -> Result:
-        return retry_conflicts(lambda: commit(*given, **named))
+    def retried(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
+        return retry_conflicts(lambda: commit(*arguments, **named))
 
     return retried
 
@@ -325,8 +325,8 @@ class Snapshot:
         if self.delta is None:
             return ()
         with storage_errors(self.table.folder):
-            every = sorted(_table_files(self._actions, self.table.folder), key=lambda f: f.path)
-        return tuple(file for file in every if file.path not in self.without)
+            files = sorted(_table_files(self._actions, self.table.folder), key=lambda f: f.path)
+        return tuple(file for file in files if file.path not in self.without)
 
     @property
     def has_same_columns(self) -> bool:
@@ -500,11 +500,11 @@ class Table:
 
         self.folder.check(path)
         with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
-            wanted = None if columns is None else list(columns)
+            names = None if columns is None else list(columns)
             # Not `read_table`: it imports pyarrow.dataset, and with it pandas if that is installed.
             with pq.ParquetFile(file, pre_buffer=True) as parquet:
-                rows = parquet.read(columns=wanted)
-        if absent := set(wanted or ()).difference(rows.column_names):
+                rows = parquet.read(columns=names)
+        if absent := set(names or ()).difference(rows.column_names):
             raise StorageError(f"{self.folder}/{path}: no column {min(absent)}.")
         return rows
 
@@ -524,8 +524,10 @@ class Table:
             pq.ParquetFile(file, read_dictionary=names, pre_buffer=True) as parquet,
         ):
             rows = parquet.read(columns=names).unify_dictionaries()
-        found = rows.group_by(names, use_threads=False).aggregate([])
-        return found.cast(pa.schema([(name, pa.string()) for name in found.column_names]))
+        combinations = rows.group_by(names, use_threads=False).aggregate([])
+        return combinations.cast(
+            pa.schema([(name, pa.string()) for name in combinations.column_names])
+        )
 
     def read_metadata(self, path: str) -> pq.FileMetaData:
         """Return the footer of one of the table's files."""
@@ -582,15 +584,17 @@ class Table:
 
         Raises `RefusedError` if the counts are in other scales.
         """
-        found = compare_schemas(self.schema, delta)
-        if found.rescaled:
-            changes = ", ".join(f"{n} {old} -> {new}" for n, (old, new) in found.rescaled.items())
+        evolution = compare_schemas(self.schema, delta)
+        if evolution.rescaled:
+            changes = ", ".join(
+                f"{n} {old} -> {new}" for n, (old, new) in evolution.rescaled.items()
+            )
             raise RefusedError(
                 f"{self.folder}: the counts are in other scales than those of the signal catalog "
                 f"({changes}). Use the catalog that the data was written with, or ingest the "
                 "logs into another data root."
             )
-        return found
+        return evolution
 
     def require_writable(self, columns: Iterable[str], delta: DeltaTable | None = None) -> None:
         """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""

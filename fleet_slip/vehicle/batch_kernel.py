@@ -182,28 +182,36 @@ def vacate(memory: FloatArray, lane_table: IntArray, lane: int) -> None:
     memory.reshape(ROWS, LANES)[:, lane] = 0.0
 
 
-CHANNELS = (
-    "ax_mps2",
-    "ay_mps2",
-    "yaw_rate_rad_s",
-    "steering_wheel_rad",
-    "wheel_fl_rad_s",
-    "wheel_fr_rad_s",
-    "wheel_rl_rad_s",
-    "wheel_rr_rad_s",
-    "steer_fl_rad",
-    "steer_fr_rad",
-    "sideslip_rad",
-    "vx_mps",
-    "vy_mps",
-    "station_m",
-    "lateral_offset_m",
-    "yaw_acceleration_rad_s2",
-    "leaning_ax_mps2",
-    "leaning_ay_mps2",
-)
-"""Channels that a lane records. Sensors need the last three: the yaw acceleration, and the
-accelerations behind the lags of pitch and roll."""
+STATE_CHANNELS = {
+    "yaw_rate_rad_s": STATE + State._fields.index("yaw_rate"),
+    "steering_wheel_rad": STATE + State._fields.index("steering_wheel"),
+    "wheel_fl_rad_s": STATE + State._fields.index("wheel_fl"),
+    "wheel_fr_rad_s": STATE + State._fields.index("wheel_fr"),
+    "wheel_rl_rad_s": STATE + State._fields.index("wheel_rl"),
+    "wheel_rr_rad_s": STATE + State._fields.index("wheel_rr"),
+    "vx_mps": STATE + State._fields.index("vx"),
+    "vy_mps": STATE + State._fields.index("vy"),
+    "station_m": POSE,
+    "lateral_offset_m": POSE + 1,
+    "yaw_acceleration_rad_s2": SLOPES + Slopes._fields.index("yaw_rate"),
+    "leaning_ax_mps2": STATE + State._fields.index("ax_lag"),
+    "leaning_ay_mps2": STATE + State._fields.index("ay_lag"),
+}
+"""Channels recorded before the first step of a sample, with their rows in memory. Sensors need the
+last three: the yaw acceleration, and the accelerations behind the lags of pitch and roll."""
+
+STEP_CHANNELS = {
+    "ax_mps2": FORCE,
+    "ay_mps2": FORCE + 1,
+    "steer_fl_rad": ANGLES,
+    "steer_fr_rad": ANGLES + 1,
+    "sideslip_rad": ANGLES + 2,
+}
+"""Channels recorded after the steps of a sample, with their rows in memory."""
+
+CHANNELS = (*STATE_CHANNELS, *STEP_CHANNELS)
+STATE_ROWS = tuple(STATE_CHANNELS.values())
+STEP_ROWS = tuple(STEP_CHANNELS.values())
 
 BLOCK = 2**16
 """Samples of a block: 11 minutes of a drive. Its channels fit into the processor's cache."""
@@ -293,19 +301,9 @@ def _record(
             if results[drive, LOST] == ABSENT and _has_lost(x, pose):
                 results[drive, LOST] = tick
             sample = tick - lane_table[FIRST, lane]
-            truth[block_index(lane, 2, sample)] = x.yaw_rate
-            truth[block_index(lane, 3, sample)] = x.steering_wheel
-            truth[block_index(lane, 4, sample)] = x.wheel_fl
-            truth[block_index(lane, 5, sample)] = x.wheel_fr
-            truth[block_index(lane, 6, sample)] = x.wheel_rl
-            truth[block_index(lane, 7, sample)] = x.wheel_rr
-            truth[block_index(lane, 11, sample)] = x.vx
-            truth[block_index(lane, 12, sample)] = x.vy
-            truth[block_index(lane, 13, sample)] = pose.station
-            truth[block_index(lane, 14, sample)] = pose.offset
-            truth[block_index(lane, 15, sample)] = read(memory, SLOPES, lane, Slopes).yaw_rate
-            truth[block_index(lane, 16, sample)] = x.ax_lag
-            truth[block_index(lane, 17, sample)] = x.ay_lag
+            for channel in range(len(STATE_ROWS)):
+                value = memory[STATE_ROWS[channel] * LANES + lane]
+                truth[block_index(lane, channel, sample)] = value
             route, lost = routes[drive], results[drive, LOST] != ABSENT
             entry, fraction = locate(route, pose.station)
             path = _preview(roads, route, x, pose.station, entry, fraction, lost)
@@ -373,12 +371,9 @@ def _finish_sample(memory: Any, lane_table: Any, routes: Any, truth: Any, result
         if drive != ABSENT:
             route = routes[drive]
             sample = tick - lane_table[FIRST, lane]
-            truth[block_index(lane, 0, sample)] = memory[FORCE * LANES + lane]
-            truth[block_index(lane, 1, sample)] = memory[(FORCE + 1) * LANES + lane]
-            for angle in range(3):
-                truth[block_index(lane, 8 + angle, sample)] = memory[
-                    (ANGLES + angle) * LANES + lane
-                ]
+            for channel in range(len(STEP_ROWS)):
+                value = memory[STEP_ROWS[channel] * LANES + lane]
+                truth[block_index(lane, len(STATE_ROWS) + channel, sample)] = value
             station = memory[POSE * LANES + lane]
             distance_m = lane_table[LAP, lane] * route.length_m + station
             if route.closed:

@@ -275,7 +275,7 @@ def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str
     if len(text) > LONGEST_QUERY:
         return [text]
     try:
-        return [one.query for one in database.extract_statements(text)] or [text]
+        return [statement.query for statement in database.extract_statements(text)] or [text]
     except (UnicodeEncodeError, duckdb.Error):
         return [text]
 
@@ -426,8 +426,8 @@ def _problem(node: Tree, columns: frozenset[str]) -> str | None:
     if kind is None:
         return None
     if kind not in _EXPRESSIONS or (kind == "OPERATOR" and node["type"] not in _OPERATORS):
-        what = str(node["type"]).replace("_", " ").lower()
-        return f"may not have this in it: {what}. Columns, constants, operators and functions may."
+        construct = str(node["type"]).replace("_", " ").lower()
+        return f"may not contain {construct}. Columns, constants, operators and functions may."
     if kind == "COLUMN_REF":
         return _column_problem(node, columns)
     if kind == "FUNCTION":

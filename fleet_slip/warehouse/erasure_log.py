@@ -186,8 +186,8 @@ class ErasureLog:
         `models` were trained on the subject; versions up to the number in `judged`, by model name,
         were examined. `counts` are the digests of the drives' counts.
         """
-        found = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
-        self._append(subject, {"event": "begun", **found, "counts": sorted(counts)})
+        impact = {"drives": drives, "models": sorted(models), "judged": dict(judged or {})}
+        self._append(subject, {"event": "begun", **impact, "counts": sorted(counts)})
 
     def end(self, subject: ErasureSubject, grams_version: int | None = None) -> None:
         """Record the end, and the version since which the Gram rows are without the subject."""

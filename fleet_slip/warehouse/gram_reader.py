@@ -78,10 +78,10 @@ class OpenedGrams:
         with guarded_query(self.database, predicate):
             yield from self.database.sql(text).to_arrow_reader(rows)
 
-    def values_of(self, column: str, predicate: Predicate, most: int | None = None) -> pa.Array:
+    def values_of(self, column: str, predicate: Predicate, limit: int | None = None) -> pa.Array:
         """Return the distinct values of a cohort's column, at most so many."""
         text = self.statement("cohort.sql", predicate)
-        query = f"SELECT DISTINCT {column} FROM ({text}){f' LIMIT {most}' if most else ''}"
+        query = f"SELECT DISTINCT {column} FROM ({text}){f' LIMIT {limit}' if limit else ''}"
         with guarded_query(self.database, predicate):
             return self.database.sql(query).to_arrow_table()[column].combine_chunks()
 
@@ -234,7 +234,7 @@ def _require_complete(
 def cohort_files(source: Warehouse | GramReader, predicate: Predicate) -> set[str]:
     """Return the log files that have a drive of a cohort. Raises `DataError` without one."""
     with open_grams(source, PLAIN, predicate) as opened:
-        found = opened.files(predicate)
-    if not found:
+        files = opened.files(predicate)
+    if not files:
         raise DataError(f"no drive with a log satisfies {predicate.quoted}.")
-    return found
+    return files

@@ -64,14 +64,14 @@ def is_onboard_file(file: TableFile) -> bool:
 def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
     """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
     for file in grams.files:
-        mine = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
-        if not pc.any(mine).as_py():
+        mask = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
+        if not pc.any(mask).as_py():
             continue
-        there = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
-        rows = grams.table.read(file.path, [name for name in columns if name in there])
-        for name in sorted(set(columns).difference(there)):
+        stored = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
+        rows = grams.table.read(file.path, [name for name in columns if name in stored])
+        for name in sorted(set(columns).difference(stored)):
             rows = rows.append_column(name, pa.nulls(len(rows)))
-        yield rows.filter(mine)
+        yield rows.filter(mask)
 
 
 # How the tables `logs` and `grams` differ.

@@ -34,31 +34,31 @@ SNAPSHOTS = 100
 def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnection:
     """Return a locked connection with the views that a query names. Raises `StorageError`."""
     warehouse.require()
-    wanted = views_in(query)
-    snapshots = table_snapshots(warehouse, wanted)
-    database = open_tables(warehouse, wanted, snapshots)
-    lock(database, paths_of(snapshots, wanted))
+    views = views_in(query)
+    snapshots = table_snapshots(warehouse, views)
+    database = open_tables(warehouse, views, snapshots)
+    lock(database, paths_of(snapshots, views))
     return database
 
 
-def views_in(query: str, known: Iterable[str] = TABLE_VIEWS) -> frozenset[str]:
+def views_in(query: str, views: Iterable[str] = TABLE_VIEWS) -> frozenset[str]:
     """Return the views that a query may need: those whose name occurs in it as a word.
 
     And what these are made of. DuckDB's own `get_table_names` is no help here: it binds the query,
     so that JOIN USING, UNPIVOT, COLUMNS and parameters are errors before the views are there. A
     word too many only opens a view too many.
     """
-    named = {name for name in known if re.search(rf"\b{name}\b", query, re.I)}
+    named = {name for name in views if re.search(rf"\b{name}\b", query, re.I)}
     return frozenset(named.union(*(_VIEWS_ON_VIEWS.get(name, ()) for name in named)))
 
 
-def table_snapshots(warehouse: Warehouse, wanted: Iterable[str]) -> list[Snapshot]:
+def table_snapshots(warehouse: Warehouse, views: Iterable[str]) -> list[Snapshot]:
     """Return snapshots of the tables that some views stand on."""
-    stored = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
-    found = [warehouse.quarantine.snapshot()] if "quarantine" in stored else []
+    stored = {_STORED_IN[name] for name in views if name in _STORED_IN}
+    snapshots = [warehouse.quarantine.snapshot()] if "quarantine" in stored else []
     if "grams" in stored:  # the log files tell which Gram rows count
-        return [*found, *gram_snapshots(warehouse)]
-    return [*found, warehouse.logs.snapshot()] if "logs" in stored else found
+        return [*snapshots, *gram_snapshots(warehouse)]
+    return [*snapshots, warehouse.logs.snapshot()] if "logs" in stored else snapshots
 
 
 def gram_snapshots(
@@ -81,23 +81,28 @@ def gram_snapshots(
     )
 
 
-def paths_of(snapshots: Iterable[Snapshot], wanted: Iterable[str]) -> list[str]:
+def paths_of(snapshots: Iterable[Snapshot], views: Iterable[str]) -> list[str]:
     """Return the data files of snapshots that some views read, as DuckDB opens them."""
-    read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
-    return [path for one in snapshots if one.table.folder.name in read for path in one.paths]
+    read = {_STORED_IN[name] for name in views if name in _STORED_IN}
+    return [
+        path
+        for snapshot in snapshots
+        if snapshot.table.folder.name in read
+        for path in snapshot.paths
+    ]
 
 
 def open_tables(
     warehouse: Warehouse,
-    wanted: Iterable[str],
+    views: Iterable[str],
     snapshots: Sequence[Snapshot],
     *,
     threads: int | None = None,
-    of: str = ALL_DRIVES,
+    drives: str = ALL_DRIVES,
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection, to be locked yet, with some views on snapshots of their tables.
 
-    Logs and Gram rows are `of` the drives that satisfy this SQL predicate. No view has rows of
+    Logs and Gram rows are those of `drives`, an SQL predicate. No view has rows of
     erased cars and drives, even if the tables have them again.
     """
     database = open_database(threads=threads, reading=warehouse.root, spill=True)
@@ -105,14 +110,14 @@ def open_tables(
     if "grams" in tables:
         active = [file.path for file in tables["logs"].files]
         database.execute("SET VARIABLE active_log_files = $active", {"active": active})
-    read = {_STORED_IN[name] for name in wanted if name in _STORED_IN}
+    read = {_STORED_IN[name] for name in views if name in _STORED_IN}
     if not read:
         return database
     signals = warehouse.catalog.signals
     sources = {f"stored_{name}": _source(database, tables[name], signals) for name in read}
-    if of != ALL_DRIVES:
+    if drives != ALL_DRIVES:
         for name in sources.keys() - {"stored_quarantine"}:
-            sources[name] = f"(FROM {sources[name]} WHERE {of})"
+            sources[name] = f"(FROM {sources[name]} WHERE {drives})"
     erased = find_erased(warehouse.root, warehouse.grams, snapshots)
     for column, names in erased.by_column.items():
         database.execute(f"SET VARIABLE erased_{column} = $names", {"names": names})
@@ -120,7 +125,7 @@ def open_tables(
     columns = _generated_columns(signals)
     with database_errors(f"opening the warehouse {warehouse.root}"):
         for view in TABLE_VIEWS:
-            if view in wanted:
+            if view in views:
                 database.execute(read_sql("warehouse", f"{view}.sql").format(**columns, **sources))
     return database
 
@@ -203,13 +208,13 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
         for column, unit in ((name, f"{signal.scale} {signal.unit}"), (signal.column, signal.unit)):
             common[column] = ColumnDescription(description=signal.description, unit=unit)
     common |= by_view[COMMON]
-    found = database.execute(
+    columns = database.execute(
         "SELECT table_name, column_name, data_type FROM duckdb_columns() "
         "WHERE NOT internal AND NOT starts_with(table_name, 'empty_') "
         "ORDER BY table_name, column_index"
     ).fetchall()
     rows = []
-    for view, column, data_type in found:
+    for view, column, data_type in columns:
         described = by_view.get(view, {}).get(column) or common.get(column)
         unit, description = (described.unit, described.description) if described else ("", "")
         row = {"view": view, "column": column, "type": data_type}

@@ -194,7 +194,7 @@ ROWS = [["2", "ax ay yaw_rate steering_wheel", "96", "0.0735"], ["ours", "", "",
 def table(width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", str(width))
-    print_parts([TextTable("", HEADER, ROWS, left=2)])
+    print_parts([TextTable("", HEADER, ROWS, text_columns=2)])
     return Text.from_ansi(capsys.readouterr().out).plain
 
 

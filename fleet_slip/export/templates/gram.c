@@ -20,8 +20,9 @@ typedef struct {
 } counted_set;
 
 static const counted_set counted[SETS] = {
-//% for one in counted
-    {${one|join(", ")}}${"," if not loop.last}
+//% for one in sets
+//% set i = loop.index0
+    {${one.columns|length}U, ${blocks[i]}U, ${first_blocks[i]}U, ${first_numbers[i]}U, ${row_limits[i]}U, 0x${"%016X"|format(one.counted.definition)}ULL, ${one.complete|lower}}${"," if not loop.last}
 //% endfor
 };
 
@@ -112,7 +113,7 @@ void ${prefix}_gram_start(${prefix}_gram *gram${", int32_t delay" if changed})
         gram->history[i].run = 0U;
     }
     gram->at = 0U;
-    gram->delay = (delay < (${min_delay})) ? (${min_delay}) : ((delay > ${max_delay}) ? ${max_delay} : delay);
+    gram->delay = (delay < (${delay_parts * min_delay})) ? (${delay_parts * min_delay}) : ((delay > ${delay_parts * max_delay}) ? ${delay_parts * max_delay} : delay);
     gram->started = false;
 //% endif
 }

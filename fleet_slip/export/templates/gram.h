@@ -36,8 +36,8 @@ typedef struct {
 
 //% endif
 typedef struct {
-    ${prefix}_gram_block blocks[${blocks}];
-    int64_t numbers[${numbers}]; /* sums, then products, of each block */
+    ${prefix}_gram_block blocks[${blocks|sum}];
+    int64_t numbers[${numbers|sum}]; /* sums, then products, of each block */
     uint32_t used[${sets|length}];
     uint32_t lost[${sets|length}];
 //% if changed
@@ -57,7 +57,7 @@ typedef struct {
 
 //% if changed
 /* Starts a drive. delay is the delay of the course in units of ${delay_ms} ms, from
- * ${min_delay} to ${max_delay}; 0 if it is unknown. */
+ * ${delay_parts * min_delay} to ${delay_parts * max_delay}; 0 if it is unknown. */
 void ${prefix}_gram_start(${prefix}_gram *gram, int32_t delay);
 
 //% else

@@ -1,7 +1,19 @@
-//% for name, value in constants.items()
-#define ${name} ${value}
-//% endfor
-${""}
+#define CHANGED ${changed|length}U
+#define MAX_TIMES ${max_times}U
+#define MAX_COLUMNS ${max_columns}U
+#define HISTORY ${history}U
+#define TURN INT64_C(${units.turn})
+#define COURSE_COUNTS INT64_C(${2 * half_turn})
+#define DIVISOR INT64_C(${units.divisor})
+#define MAX_REMAINDER INT64_C(${units.largest})
+#define SLOW ${units.slow}
+#define STRAIGHT ${units.unturned}
+#define COARSER ${coarser}
+#define DELAY_PARTS ${delay_parts}
+#define ROUND_DELAY ${delay_parts // 2}
+#define MAX_ADVANCE ${0 - min_delay}
+#define GAIN INT64_C(${4 * half_turn // delay_parts})
+
 /* Changes of the columns of a feature set. */
 typedef struct {
     uint32_t set;
@@ -80,7 +92,7 @@ static void count_change(${prefix}_gram *gram, const changed_set *spec, const in
 static void count_changes(${prefix}_gram *gram, const changed_set *spec, const int32_t *ring,
                           uint32_t newest, int32_t delay)
 {
-    const int32_t ticks = (((delay + ROUND_DELAY) + (DELAY_PARTS * MIN_DELAY)) / DELAY_PARTS) - MIN_DELAY;
+    const int32_t ticks = (((delay + ROUND_DELAY) + (DELAY_PARTS * MAX_ADVANCE)) / DELAY_PARTS) - MAX_ADVANCE;
     const int64_t gain = ((int64_t)delay - ((int64_t)ticks * DELAY_PARTS)) * GAIN;
     const uint32_t now_ago = (ticks > 0) ? (uint32_t)ticks : 0U;
     const uint32_t fix_ago = (ticks < 0) ? (uint32_t)(-ticks) : 0U;
