@@ -1,13 +1,13 @@
-"""How the sensors of every car are off, from the Gram rows of its drives: no label, no log row.
+"""Calibration of the sensors of each car from the Gram rows of its drives, without labels.
 
 The parameters of a car are exact functions of the sums of its drives (`sensor_relations`) and of
 what the roads of all cars have in common. They do not depend on the order of drives, and nothing of
 an erased drive remains in them.
 
-How sure they are follows from how much single drives move them: drives are the independent pieces
-of evidence. One drive has no other to differ from, so that the variance of residuals, as drives
-differ, is that of the whole fleet; how much a car's driving determines is its own. Drives go over
-the same roads again, so that there is a limit to what more of them determine.
+Uncertainties follow from the influence of single drives, which are independent observations. The
+variance of residuals between drives is estimated from the whole fleet, since a single drive has no
+other to differ from; the information in the driving is that of each car. Drives repeat the same
+roads, so that the effective number of drives has a limit.
 """
 
 from collections import Counter, defaultdict
@@ -26,20 +26,20 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.receiver_delay import (
-    LASTING_S,
     NO_RECEIVERS,
+    SYSTEMATIC_STD_S,
     ReceiverDelays,
     receiver_delays,
 )
 from fleet_slip.calibration.sensor_relations import (
+    EXCLUDED,
     KINDS,
-    LACKING,
-    LASTING_BY_SATELLITE,
+    SYSTEMATIC_STD_BY_SATELLITE,
     CarEstimate,
     CarTerms,
     Estimates,
     bank_of_bends,
-    estimate_numbers,
+    estimate_parameters,
     kinds_by_set,
 )
 from fleet_slip.catalog.calibration_parameters import (
@@ -60,15 +60,15 @@ from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.predicate import Predicate, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# The sums of every drive of every car, from Gram rows that are read batch by batch.
+# Sums of the drives of each car, from Gram rows read batch by batch.
 
 Drive = tuple[str, date, str]
-"""Car, day and name: the order in which a car drove."""
+"""Car, day and name of a drive, which sort drives by time."""
 
 
 @dataclass(frozen=True)
 class DriveSums:
-    """Sums of columns over rows that have them all, by drive; `cars` tells where each begins."""
+    """Sums of columns over the complete rows of each drive; `cars` are the drives of each car."""
 
     drives: tuple[Drive, ...]
     table: GramTable
@@ -79,74 +79,73 @@ def collect_sums(
     batches: Iterable[pa.RecordBatch],
     kinds: Mapping[str, tuple[str, ...]],
     *,
-    lacking: Mapping[str, str] = MappingProxyType({}),
+    excluded: Mapping[str, str] = MappingProxyType({}),
     unnamed: bool = False,
 ) -> dict[str, DriveSums]:
-    """Return the sums of the columns of each kind over every drive that says whose it is.
+    """Return the sums of the columns of each kind over the drives of named cars.
 
-    Rows that have the column that a kind is `lacking` are left out of it. With `unnamed` also over
-    drives that do not say it, as of a car without a name.
+    Gram rows with the `excluded` column of a kind do not count for it. `unnamed` includes drives of
+    cars without a name.
     """
-    parts: dict[str, list[GramTable]] = defaultdict(list)
+    tables: dict[str, list[GramTable]] = defaultdict(list)
     drives: dict[str, list[Drive]] = defaultdict(list)
     for batch in batches:
-        some = batch if unnamed else batch.filter(batch["vehicle_id"].is_valid())
-        for names, rows, _ in by_signals(some):
+        named = batch if unnamed else batch.filter(batch["vehicle_id"].is_valid())
+        for names, rows, _ in by_signals(named):
             if not len(rows):
                 continue
-            table = gram_table(names, rows)
+            table, present = gram_table(names, rows), set(names.split(","))
             keys = (rows[key].to_pylist() for key in ("vehicle_id", "day", "drive_id"))
-            of = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
+            row_drives = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
             for kind, columns in kinds.items():
-                there = set(names.split(","))
-                if set(columns) <= there and lacking.get(kind) not in there:
-                    parts[kind].append(table.restrict(columns))
-                    drives[kind] += of
-    return {kind: _sorted(some, drives[kind]) for kind, some in parts.items()}
+                if set(columns) <= present and excluded.get(kind) not in present:
+                    tables[kind].append(table.restrict(columns))
+                    drives[kind] += row_drives
+    return {kind: _merge_by_drive(tables[kind], drives[kind]) for kind in tables}
 
 
-def _sorted(parts: Sequence[GramTable], rows: Sequence[Drive]) -> DriveSums:
-    drives = sorted(set(rows))
-    number = {drive: i for i, drive in enumerate(drives)}
-    at = np.array([number[row] for row in rows], dtype=np.int64)
+def _merge_by_drive(tables: Sequence[GramTable], row_drives: Sequence[Drive]) -> DriveSums:
+    drives = sorted(set(row_drives))
+    numbers = {drive: i for i, drive in enumerate(drives)}
+    drive_of_row = np.array([numbers[drive] for drive in row_drives], dtype=np.int64)
     names = ("n", "sums", "products")
-    stacked = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
-    table = GramTable(parts[0].signals, *stacked).merged(at)
+    stacked = (np.concatenate([getattr(table, name) for table in tables]) for name in names)
+    merged = GramTable(tables[0].signals, *stacked).merged(drive_of_row)
     cars: dict[str, slice] = {}
     for i, (car, _, _) in enumerate(drives):
         cars[car] = slice(cars[car].start if car in cars else i, i + 1)
-    return DriveSums(tuple(drives), table, cars)
+    return DriveSums(tuple(drives), merged, cars)
 
 
-# What the roads of a fleet have in common: they lean to one side, and are banked in bends.
+# Roads of a fleet: camber, and bank in bends.
 #
-# No car alone separates a road that always leans from an accelerometer that is off. The offsets of
-# many cars are of both signs; the road's lean is not. The median, which all share, is the road's.
+# A single car cannot separate camber from the offset of its accelerometer. The offsets of many cars
+# have both signs, camber has one: the median of the fleet is the camber.
 
-FEWEST_CARS = 10
-"""Fewer do not separate the road's lean and their own offsets."""
+MIN_CARS = 10
+"""Minimum number of cars that separates camber from the offsets of accelerometers."""
 
 BANKED_M2PS2 = Fraction(-5)
-"""Lateral acceleration that bends take per curvature, from which on roads are banked: half a
-percent in bends of 100 m. Noise and slip make a fifth of it on flat ones."""
+"""Lateral acceleration per curvature in bends, below which roads count as banked: half a percent in
+bends of 100 m. On flat roads noise and slip make a fifth of it."""
 
-USUAL_LEAN_MPS2 = 0.2
-"""A crown of 2 %: the standard error of a lean that is unknown."""
+USUAL_CAMBER_MPS2 = 0.2
+"""Standard error of an unknown camber: 2 %."""
 
-SURE = Fraction(31)
-"""Square of three standard errors of a median over that of the median deviation and over one less
-the number of cars: 3 x 1.2533 x 1.4826, of normal numbers."""
+NINE_VARIANCES = Fraction(31)
+"""Square of three standard errors of a median, over the square of the median deviation and one over
+the number of cars: (3 x 1.2533 x 1.4826)^2 for normal deviates."""
 
 
 @dataclass(frozen=True)
 class Roads:
-    """The roads of a fleet.
+    """Roads of a fleet.
 
     Attributes:
-        banked: whether bends are, as far as can be determined.
-        lean: m/s^2, what they add to every car's lateral acceleration; None if unknown.
-        uncertainty: standard error of the lean.
-        cars: how many determined it.
+        banked: True unless bends are certainly flat.
+        lean: camber as lateral acceleration of every car, m/s^2; None if unknown.
+        uncertainty: standard error of the camber.
+        cars: number of cars that determined it.
     """
 
     banked: bool
@@ -156,56 +155,56 @@ class Roads:
 
     @property
     def hide_offsets(self) -> bool:
-        """Whether how an accelerometer is off cannot be separated from how the roads lean."""
+        """Return True if camber and offsets of accelerometers cannot be separated."""
         return self.banked and self.lean is None
 
 
 def are_banked(banks: Sequence[Fraction]) -> bool:
-    """Tell by the bank that each car met whether roads are banked: unless they surely are flat.
+    """Return True unless roads are flat by three standard errors of the bank that cars met.
 
-    Sure are three standard errors; fewer than `FEWEST_CARS` go by their median. The relation of
-    banked roads holds on flat ones, too, but not the other way round.
+    With fewer than `MIN_CARS` cars the median decides. The relation of banked roads holds on flat
+    ones, too, but not the other way round.
     """
     if not banks:
         return False
-    beyond = median(banks) - BANKED_M2PS2
-    if beyond <= 0 or len(banks) < FEWEST_CARS:
-        return beyond < 0
-    return beyond**2 <= _square_of_three_errors(banks)
+    excess = median(banks) - BANKED_M2PS2
+    if excess <= 0 or len(banks) < MIN_CARS:
+        return excess < 0
+    return excess**2 <= _square_of_three_errors(banks)
 
 
-def roads_of(banked: bool, offsets: Sequence[Fraction]) -> Roads:
-    """Return the roads by what each car's accelerometer says when it goes straight.
+def estimate_roads(banked: bool, offsets: Sequence[Fraction]) -> Roads:
+    """Estimate the camber from the lateral acceleration of each car in straight driving.
 
-    The median less the part that may be of the cars: with m the median and e its standard error,
-    m - (3 e)^2 / m, zero within three standard errors. So no car's number jumps as a fleet grows.
-    What is left of it is uncertain as well.
+    With the median m and its standard error e the camber is m - (3 e)^2 / m, and 0 within three
+    standard errors. It is continuous, so that no offset jumps as a fleet grows.
     """
     if not banked:
         return Roads(banked, None, 0.0, len(offsets))
-    if len(offsets) < FEWEST_CARS:
-        return Roads(banked, None, USUAL_LEAN_MPS2, len(offsets))
+    if len(offsets) < MIN_CARS:
+        return Roads(banked, None, USUAL_CAMBER_MPS2, len(offsets))
     middle, square = median(offsets), _square_of_three_errors(offsets)
-    left = middle if middle**2 <= square else square / middle
-    return Roads(banked, middle - left, hypot(sqrt_exact(square) / 3, float(left)), len(offsets))
+    of_cars = middle if middle**2 <= square else square / middle
+    error = hypot(sqrt_exact(square) / 3, float(of_cars))
+    return Roads(banked, middle - of_cars, error, len(offsets))
 
 
 def _square_of_three_errors(values: Sequence[Fraction]) -> Fraction:
     middle = median(values)
-    return SURE * median([abs(value - middle) for value in values]) ** 2 / len(values)
+    return NINE_VARIANCES * median([abs(value - middle) for value in values]) ** 2 / len(values)
 
 
-ROADS = 8
-"""So many drives are as good as endless ones: more are on the same roads again, whose slopes are
-the same."""
+MAX_EFFECTIVE_DRIVES = 8
+"""Cap on the effective number of drives: more are on the same roads again, whose errors are
+correlated and do not average out."""
 
-LEAST_PART = 1e-9
-"""A drive of which the others of its car are less than this part has no other to differ from."""
+MIN_SHARE = 1e-9
+"""Share of the other drives of a car, below which a drive has no other to differ from."""
 
-PAIRS = 300
-"""Cars of which two drives are compared: enough to determine a variance to a tenth."""
+MAX_PAIRS = 300
+"""Cars whose first two drives are compared: enough for a variance to a tenth."""
 
-LASTING: Mapping[bool, Mapping[CalibrationParameterName, float]] = {
+SYSTEMATIC_STD: Mapping[bool, Mapping[CalibrationParameterName, float]] = {
     False: {
         "steering_offset": 0.00004,
         "speed_ratio": 0.0015,
@@ -216,20 +215,20 @@ LASTING: Mapping[bool, Mapping[CalibrationParameterName, float]] = {
         "speed_ratio": 0.03,
     },
 }
-"""Standard errors that no drive takes away, on flat and on banked roads: noise flattens and wheels
-slip. Where bends are banked, a body that leans 2 to 6 degrees per g makes its accelerometer say 3
-to 10 % more, which is no speed."""
+"""Standard errors that drives do not average out, on flat and on banked roads, from the attenuation
+by noise and from wheel slip. In banked bends, a body that rolls by 2 to 6 degrees per g adds 3 to
+10 % to its accelerometer, which looks like speed."""
 
 
 @dataclass(frozen=True)
-class CalibratedNumber:
-    """One number of one car.
+class CalibratedParameter:
+    """Calibration parameter of a car.
 
     Attributes:
-        value: in its SI unit; the exact rational rounded once.
-        count: the integer count of its grain that models and boards use.
-        uncertainty: standard error in the same unit; None if no car has two drives.
-        drives, rows: what determines it.
+        value: in SI units; the exact rational, rounded once.
+        count: multiple of the grain that models and boards use.
+        uncertainty: standard error in SI units; None if no car has two drives.
+        drives, rows: amount of data.
     """
 
     value: float
@@ -239,42 +238,46 @@ class CalibratedNumber:
     rows: int
 
 
-LEANS = (
+NOT_SEPARABLE = (
     "roads are banked, and may always lean to one side, which cannot be separated from the car's "
-    f"own offset with fewer than {FEWEST_CARS} cars"
+    f"own offset with fewer than {MIN_CARS} cars"
 )
-BEYOND = "it is outside the range of 16 bits"
-"""Why a number is missing."""
+OUT_OF_RANGE = "it is outside the range of 16 bits"
+"""Reasons for a missing parameter."""
 
 
 class CarEvidence:
-    """Sums of the drives of all cars, and the variance of residuals as drives differ."""
+    """Sums of the drives of all cars, and the variance of residuals between drives."""
 
     def __init__(self, catalog: Catalog, sums: Mapping[str, DriveSums]) -> None:
-        """Take the sums by kind of plane, and learn the variances."""
+        """Estimate the parameters of all cars, the roads and the variances from sums by kind."""
         self.sums, self._terms = sums, CarTerms(catalog)
-        self._moments = {kind: one.table.moments() for kind, one in sums.items()}
-        self.cars = sorted({car for one in sums.values() for car in one.cars})
+        self._moments = {kind: of_kind.table.moments() for kind, of_kind in sums.items()}
+        self.cars = sorted({car for of_kind in sums.values() for car in of_kind.cars})
         banks = [bank_of_bends(self._terms, self._totals(self.slices(car))) for car in self.cars]
         self._banked = are_banked([bank for bank in banks if bank is not None])
-        self._whole = {car: self._estimate(self.slices(car)) for car in self.cars}
-        self.estimates = {car: _known(whole) for car, whole in self._whole.items()}
-        offsets = [one["ay_offset"].value for one in self.estimates.values() if "ay_offset" in one]
-        self.roads = roads_of(self._banked, offsets)
-        self.variances = self._variances()
-        self.variances_of_one = self._variances_of_one()
+        self._results = {car: self._estimate(self.slices(car)) for car in self.cars}
+        self.estimates = {car: _estimated(results) for car, results in self._results.items()}
+        offsets = [
+            estimates["ay_offset"].value
+            for estimates in self.estimates.values()
+            if "ay_offset" in estimates
+        ]
+        self.roads = estimate_roads(self._banked, offsets)
+        self.variances = self._estimate_variances()
+        self.single_drive_variances = self._estimate_single_drive_variances()
 
     def slices(self, car: str, first: int = 0, last: int | None = None) -> dict[str, slice]:
-        """Return where the drives `first` to `last` of a car stand, by kind."""
-        found = {}
-        for kind, one in self.sums.items():
-            if car in one.cars:
-                every = range(*one.cars[car].indices(len(one.drives)))[first:last]
-                found[kind] = slice(every.start, every.stop)
-        return found
+        """Return the positions of the drives `first` to `last` of a car, by kind."""
+        positions = {}
+        for kind, of_kind in self.sums.items():
+            if car in of_kind.cars:
+                drives = range(*of_kind.cars[car].indices(len(of_kind.drives)))[first:last]
+                positions[kind] = slice(drives.start, drives.stop)
+        return positions
 
     def means(self, car: str, terms: Sequence[str]) -> list[Fraction]:
-        """Return means of terms of the relations of course over a car's drives; 0 of no drive."""
+        """Return means of terms of the relations of course over the drives of a car; 0 if none."""
         totals = self._totals(self.slices(car))
         if not (course := totals.get("course")):
             return [Fraction(0) for _ in terms]
@@ -283,157 +286,168 @@ class CarEvidence:
 
     def _totals(self, slices: Mapping[str, slice]) -> dict[str, Gram]:
         return {
-            kind: self.sums[kind].table.take(at).total()
-            for kind, at in slices.items()
-            if at.stop > at.start
+            kind: self.sums[kind].table.take(drives).total()
+            for kind, drives in slices.items()
+            if drives.stop > drives.start
         }
 
     def estimate(self, slices: Mapping[str, slice]) -> dict[CalibrationParameterName, CarEstimate]:
-        """Return the numbers that some drives determine, with the lean of their roads."""
-        return _known(self._estimate(slices))
+        """Estimate the parameters that some drives determine, including the camber."""
+        return _estimated(self._estimate(slices))
 
     def _estimate(self, slices: Mapping[str, slice]) -> Estimates:
-        return estimate_numbers(self._terms, self._totals(slices), self._banked)
+        return estimate_parameters(self._terms, self._totals(slices), self._banked)
 
-    def influence(self, estimate: CarEstimate, at: slice) -> tuple[FloatArray, FloatArray] | None:
-        """Return how far drives move a number, and their shares of its variance."""
+    def influence(
+        self, estimate: CarEstimate, drives: slice
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return the shift of a parameter by each drive, and the drive's share of its variance."""
         signals = self.sums[estimate.kind].table.signals
-        sums = DriveTermSums(self._moments[estimate.kind][at], signals, estimate.terms)
+        sums = DriveTermSums(self._moments[estimate.kind][drives], signals, estimate.terms)
         return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
 
-    def _variances(self) -> dict[CalibrationParameterName, float]:
-        """Return the variance of residuals, as drives differ, of each number's plane.
+    def _estimate_variances(self) -> dict[CalibrationParameterName, float]:
+        """Estimate the variance of residuals between drives, for each parameter.
 
-        A drive's shift, about the number of its car, has the variance times its share times one
-        less the part of the share in the car's. Every drive counts the same: errors do not grow
-        with shares as noise does, and uninformative drives would decide for informative ones.
+        The shift of a drive about the parameter of its car has the variance times its share times
+        one less the fraction of the share in the car's. All drives have equal weight: errors do not
+        grow with shares as noise does, and uninformative drives would dominate informative ones.
         """
         ratios: dict[CalibrationParameterName, list[float]] = {}
         for car in self.cars:
             slices = self.slices(car)
             for name, estimate in self.estimates[car].items():
-                found = self.influence(estimate, slices[estimate.kind])
-                if found is None:
+                effect = self.influence(estimate, slices[estimate.kind])
+                if effect is None:
                     continue
-                shifts, shares = found
+                shifts, shares = effect
                 expected = shares * (1 - shares / shares.sum())
-                alone = expected <= LEAST_PART * shares
+                several = ~(expected <= MIN_SHARE * shares)
                 ratios.setdefault(name, []).extend(
-                    (shifts[~alone] ** 2 / expected[~alone]).tolist()
+                    (shifts[several] ** 2 / expected[several]).tolist()
                 )
-        return {name: sum(some) / len(some) for name, some in ratios.items() if some}
+        return {name: sum(values) / len(values) for name, values in ratios.items() if values}
 
-    def _variances_of_one(self) -> dict[CalibrationParameterName, float]:
-        """Return the same of the numbers of one drive: how far a car's first two differ.
+    def _estimate_single_drive_variances(self) -> dict[CalibrationParameterName, float]:
+        """Estimate the same for parameters of one drive, from the first two drives of each car.
 
-        What makes roads differ, such as the bank of their bends, moves a number that several roads
-        determine at once; one road alone explains its own.
+        Differences between roads, such as the bank of their bends, shift a parameter that several
+        roads determine together; one road alone explains its own.
         """
         ratios: dict[CalibrationParameterName, list[float]] = {}
-        pairs = [
+        cars = [
             car for car in self.cars if all(s.stop - s.start > 1 for s in self.slices(car).values())
         ]
-        for car in pairs[:PAIRS]:
-            one, other = (self._of_drive(car, drive) for drive in (0, 1))
-            for name in one.keys() & other.keys():
-                apart = one[name][0] - other[name][0]
-                ratios.setdefault(name, []).append(apart**2 / (one[name][1] + other[name][1]))
-        return {name: sum(some) / len(some) for name, some in ratios.items()}
+        for car in cars[:MAX_PAIRS]:
+            first, second = (self._estimate_drive(car, drive) for drive in (0, 1))
+            for name in first.keys() & second.keys():
+                (value, share), (other_value, other_share) = first[name], second[name]
+                ratios.setdefault(name, []).append(
+                    (value - other_value) ** 2 / (share + other_share)
+                )
+        return {name: sum(values) / len(values) for name, values in ratios.items()}
 
-    def _of_drive(
+    def _estimate_drive(
         self, car: str, drive: int
     ) -> dict[CalibrationParameterName, tuple[float, float]]:
-        """Return the numbers that a drive alone determines, and their shares."""
-        at = self.slices(car, drive, drive + 1)
-        found = {}
-        for name, estimate in self.estimate(at).items():
-            if (moved := self.influence(estimate, at[estimate.kind])) is not None:
-                found[name] = float(estimate.value), float(moved[1].sum())
-        return found
+        """Return the parameters that a drive alone determines, and their shares."""
+        slices = self.slices(car, drive, drive + 1)
+        values = {}
+        for name, estimate in self.estimate(slices).items():
+            if (effect := self.influence(estimate, slices[estimate.kind])) is not None:
+                values[name] = float(estimate.value), float(effect[1].sum())
+        return values
 
     def uncertainties(
-        self, estimates: Mapping[CalibrationParameterName, CarEstimate], slices: Mapping[str, slice]
+        self,
+        estimates: Mapping[CalibrationParameterName, CarEstimate],
+        slices: Mapping[str, slice],
     ) -> dict[CalibrationParameterName, float]:
-        """Return the standard errors of what some drives determine."""
-        own: dict[CalibrationParameterName, float] = {}
+        """Return the standard errors of parameters that some drives determine."""
+        variances: dict[CalibrationParameterName, float] = {}
         for name, estimate in estimates.items():
-            found = self.influence(estimate, slices[estimate.kind])
-            if found is None or name not in self.variances:
+            effect = self.influence(estimate, slices[estimate.kind])
+            if effect is None or name not in self.variances:
                 continue
-            drives, share = len(found[1]), float(found[1].sum())
-            of_one = self.variances_of_one if drives == 1 else self.variances
-            variance = of_one.get(name, self.variances[name]) * share
-            lasting = {**LASTING[self._banked], **LASTING_BY_SATELLITE.get(estimate.kind, {})}
-            own[name] = variance * (1 + drives / ROADS) + lasting.get(name, 0.0) ** 2
-        found_of: dict[CalibrationParameterName, float] = {}
-        for name, variance in own.items():
-            one = estimates[name]
-            others = sum(d**2 * own.get(other, 0.0) for other, d in one.also.items())
-            lean = self.roads.uncertainty * float(one.by_lean)
-            found_of[name] = sqrt(variance + others + lean**2)
-        return found_of
+            drives, share = len(effect[1]), float(effect[1].sum())
+            by_count = self.single_drive_variances if drives == 1 else self.variances
+            variance = by_count.get(name, self.variances[name]) * share
+            systematic = {
+                **SYSTEMATIC_STD[self._banked],
+                **SYSTEMATIC_STD_BY_SATELLITE.get(estimate.kind, {}),
+            }
+            variances[name] = (
+                variance * (1 + drives / MAX_EFFECTIVE_DRIVES) + systematic.get(name, 0.0) ** 2
+            )
+        errors: dict[CalibrationParameterName, float] = {}
+        for name, variance in variances.items():
+            estimate = estimates[name]
+            inherited = sum(d**2 * variances.get(key, 0.0) for key, d in estimate.also.items())
+            camber = self.roads.uncertainty * float(estimate.by_lean)
+            errors[name] = sqrt(variance + inherited + camber**2)
+        return errors
 
-    def stated(self, car: str) -> dict[CalibrationParameterName, "CalibratedNumber | str"]:
-        """Return the numbers of a car, by all of its drives; why, in the place of a missing one.
+    def parameters(self, car: str) -> dict[CalibrationParameterName, "CalibratedParameter | str"]:
+        """Return the parameters of a car by all of its drives, or the reasons for missing ones.
 
-        `ay_offset` is missing where it cannot be separated from the lean of the roads.
+        `ay_offset` is missing if it cannot be separated from the camber of the roads.
         """
         slices = self.slices(car)
-        sure = self.uncertainties(self.estimates[car], slices)
-        found: dict[CalibrationParameterName, CalibratedNumber | str] = {}
-        for name, about in CALIBRATION_PARAMETERS.items():
-            one = self._whole[car][name]
-            if isinstance(one, str):
-                found[name] = one
+        errors = self.uncertainties(self.estimates[car], slices)
+        parameters: dict[CalibrationParameterName, CalibratedParameter | str] = {}
+        for name, definition in CALIBRATION_PARAMETERS.items():
+            estimate = self._results[car][name]
+            if isinstance(estimate, str):
+                parameters[name] = estimate
                 continue
-            value = one.value - (self.roads.lean or 0) * one.by_lean
-            count, at = about.count(value), slices[one.kind]
+            value = estimate.value - (self.roads.lean or 0) * estimate.by_lean
+            count, drives = definition.count(value), slices[estimate.kind]
             if name == "ay_offset" and self.roads.hide_offsets:
-                found[name] = LEANS
+                parameters[name] = NOT_SEPARABLE
             elif count is None:
-                found[name] = BEYOND
+                parameters[name] = OUT_OF_RANGE
             else:
-                found[name] = CalibratedNumber(
+                parameters[name] = CalibratedParameter(
                     value=float(value),
                     count=count,
-                    uncertainty=three_digits(sure[name]) if name in sure else None,
-                    drives=at.stop - at.start,
-                    rows=int(self.sums[one.kind].table.n[at].sum()),
+                    uncertainty=three_digits(errors[name]) if name in errors else None,
+                    drives=drives.stop - drives.start,
+                    rows=int(self.sums[estimate.kind].table.n[drives].sum()),
                 )
-        return found
+        return parameters
 
 
-def _known(estimates: Estimates) -> dict[CalibrationParameterName, CarEstimate]:
-    return {name: one for name, one in estimates.items() if isinstance(one, CarEstimate)}
+def _estimated(results: Estimates) -> dict[CalibrationParameterName, CarEstimate]:
+    """Return the estimates without the reasons for missing ones."""
+    return {name: e for name, e in results.items() if isinstance(e, CarEstimate)}
 
 
 def three_digits(value: float) -> float:
-    """Return an uncertainty as it is stated, which is the same on every machine."""
+    """Round an uncertainty to three digits, which are the same on every machine."""
     return float(f"{value:.3g}")
 
 
 @dataclass(frozen=True)
 class Calibration(Answer):
-    """The numbers of every car of a cohort.
+    """Calibration parameters of the cars of a cohort.
 
     Attributes:
-        cars: the numbers of each car, by its `vehicle_id`; a number is missing that its drives do
-            not determine.
-        missing: why, of each car.
+        cars: the parameters of each car by `vehicle_id`, as far as its drives determine them.
+        missing: reasons for missing parameters, by car.
         logs_version, grams_version: versions of the Delta tables that were read.
-        evidence: sums and variances that the numbers came from.
-        receivers: how late satellite receivers are, by the Gram rows of `delay` that there are.
+        evidence: sums and variances that the parameters follow from.
+        receivers: delays of satellite receivers, from the Gram rows of `delay`.
     """
 
-    cars: Mapping[str, Mapping[CalibrationParameterName, CalibratedNumber]]
+    cars: Mapping[str, Mapping[CalibrationParameterName, CalibratedParameter]]
     missing: Mapping[str, Mapping[CalibrationParameterName, str]]
     logs_version: int
     grams_version: int
     evidence: CarEvidence
     receivers: ReceiverDelays = NO_RECEIVERS
 
-    def car(self, vehicle_id: str) -> Mapping[CalibrationParameterName, CalibratedNumber]:
-        """Return the numbers of a car. Raises `QuestionError` if no drive is of it."""
+    def car(self, vehicle_id: str) -> Mapping[CalibrationParameterName, CalibratedParameter]:
+        """Return the parameters of a car. Raises `QuestionError` for a car without a drive."""
         if vehicle_id not in self.cars:
             raise QuestionError(
                 f"no drive of {vehicle_id!r} is enough to calibrate it. See: fleet-slip sql "
@@ -442,14 +456,14 @@ class Calibration(Answer):
         return self.cars[vehicle_id]
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the integer counts of every car's numbers."""
+        """Return the counts of the parameters of each car."""
         return {
-            car: {name: one.count for name, one in numbers.items()}
-            for car, numbers in self.cars.items()
+            car: {name: parameter.count for name, parameter in parameters.items()}
+            for car, parameters in self.cars.items()
         }
 
     def parts(self, car: str | None = None) -> Iterator[Part]:
-        """Return a table of the numbers over all cars, or those of a car and how they go on board.
+        """Return a table of the parameters of all cars, or of one car with its counts on board.
 
         Raises `QuestionError` for an unknown car.
         """
@@ -458,42 +472,43 @@ class Calibration(Answer):
 
     def _of_all(self) -> Iterator[Part]:
         rows = []
-        for name, about in CALIBRATION_PARAMETERS.items():
-            cars = [numbers[name] for numbers in self.cars.values() if name in numbers]
-            known = [one.uncertainty for one in cars if one.uncertainty is not None]
+        for name, definition in CALIBRATION_PARAMETERS.items():
+            cars = [parameters[name] for parameters in self.cars.values() if name in parameters]
+            errors = [car.uncertainty for car in cars if car.uncertainty is not None]
             if cars:
-                values = [one.value for one in cars]
-                row = {"name": name, "unit": about.unit, "cars": len(cars)}
-                row |= {"median": median(values), "spread": pstdev(values)}
-                rows.append(row | {"known": median(known) if known else None})
+                values = [car.value for car in cars]
+                row = {"name": name, "unit": definition.unit, "cars": len(cars)}
+                row |= {"median": median(values), "std": pstdev(values)}
+                rows.append(row | {"error": median(errors) if errors else None})
         yield TextTable(
             f"{pluralize(len(self.cars), 'car')}, by their own drives",
-            "number|unit|cars|median|differs by|known to +-",
+            "parameter|unit|cars|median|differs by|known to +-",
             rows,
-            "{name}|{unit}|{cars:,}|{median:.3g}|{spread:.2g}|{known:.2g}",
+            "{name}|{unit}|{cars:,}|{median:.3g}|{std:.2g}|{error:.2g}",
             text_columns=2,
         )
-        if not any(one.uncertainty for cars in self.cars.values() for one in cars.values()):
+        parameters = (parameter for car in self.cars.values() for parameter in car.values())
+        if not any(parameter.uncertainty for parameter in parameters):
             yield Remark("no car has two drives: uncertainties cannot be estimated")
         types = self._types_of_receivers()
         if types:
             yield TextTable(
-                "\nhow late types of satellite receivers are",
+                "\ndelay of types of satellite receivers",
                 "type|cars|delay s|+-|differs by",
-                ({"name": name, **one} for name, one in types.items()),
+                ({"name": name, **figures} for name, figures in types.items()),
                 "{name}|{cars:,}|{delay_s:.3f}|{uncertainty_s:.2g}|{spread_s:.2g}",
             )
 
     def _of_car(self, car: str) -> Iterator[Part]:
         yield TextTable(
             f"{car}, by its own drives",
-            "number|unit|value|+-|drives|count on board|of",
+            "parameter|unit|value|+-|drives|count on board|of",
             (
-                {"name": k, "of": CALIBRATION_PARAMETERS[k], "one": one}
-                for k, one in self.car(car).items()
+                {"name": name, "definition": CALIBRATION_PARAMETERS[name], "car": parameter}
+                for name, parameter in self.car(car).items()
             ),
-            "{name}|{of.unit}|{one.value:.6g}|{one.uncertainty:.2g}|{one.drives}|{one.count}|"
-            "{of.grain}",
+            "{name}|{definition.unit}|{car.value:.6g}|{car.uncertainty:.2g}|{car.drives}|"
+            "{car.count}|{definition.grain}",
             text_columns=2,
         )
         missing = self.missing[car]
@@ -505,25 +520,25 @@ class Calibration(Answer):
             yield Remark(f"its satellite receiver is late by {delay}")
 
     def _types_of_receivers(self) -> dict[str, dict[str, float]]:
-        cars = Counter(one.receiver for one in self.receivers.cars.values())
+        cars = Counter(delay.receiver for delay in self.receivers.cars.values())
         return {
             name: {
                 "cars": cars[name],
-                "delay_s": one.mean,
-                "uncertainty_s": hypot(one.mean_error, LASTING_S),
-                "spread_s": one.spread,
-                "spread_uncertainty_s": one.spread_error,
+                "delay_s": pooled.mean,
+                "uncertainty_s": hypot(pooled.mean_error, SYSTEMATIC_STD_S),
+                "spread_s": pooled.spread,
+                "spread_uncertainty_s": pooled.spread_error,
             }
-            for name, one in self.receivers.types.items()
+            for name, pooled in self.receivers.types.items()
         }
 
     def _remarks_on_roads(self) -> Iterator[Remark]:
         if self.evidence.roads.hide_offsets:
-            yield Remark(f"no car has ay_offset: {LEANS}")
+            yield Remark(f"no car has ay_offset: {NOT_SEPARABLE}")
         elif not self.evidence.roads.banked:
             yield Remark(
-                "bends are seen not to be banked: a road that always leans to one side counts as "
-                f"ay_offset. {FEWEST_CARS} cars or more separate the two"
+                "bends are not banked: a road that always leans to one side counts as "
+                f"ay_offset. {MIN_CARS} cars or more separate the two"
             )
 
     def as_dict(self) -> dict[str, Any]:
@@ -533,13 +548,14 @@ class Calibration(Answer):
             "logs_version": self.logs_version,
             "grams_version": self.grams_version,
             "numbers": {
-                name: one.model_dump(mode="json") for name, one in CALIBRATION_PARAMETERS.items()
+                name: definition.model_dump(mode="json")
+                for name, definition in CALIBRATION_PARAMETERS.items()
             },
             "cars": {
-                car: {name: vars(one) for name, one in numbers.items()}
-                for car, numbers in self.cars.items()
+                car: {name: vars(parameter) for name, parameter in parameters.items()}
+                for car, parameters in self.cars.items()
             },
-            "missing": {car: why for car, why in self.missing.items() if why},
+            "missing": {car: reasons for car, reasons in self.missing.items() if reasons},
             "roads": {
                 "banked": roads.banked,
                 "lean_mps2": None if roads.lean is None else float(roads.lean),
@@ -549,13 +565,13 @@ class Calibration(Answer):
             "receivers": {
                 "cars": {
                     car: {
-                        "receiver": one.receiver,
-                        "delay_s": one.value,
-                        "uncertainty_s": one.uncertainty,
-                        "drives": one.drives,
-                        "rows": one.rows,
+                        "receiver": delay.receiver,
+                        "delay_s": delay.value,
+                        "uncertainty_s": delay.uncertainty,
+                        "drives": delay.drives,
+                        "rows": delay.rows,
                     }
-                    for car, one in self.receivers.cars.items()
+                    for car, delay in self.receivers.cars.items()
                 },
                 "types": self._types_of_receivers(),
             },
@@ -563,23 +579,23 @@ class Calibration(Answer):
 
 
 def calibration_of(opened: OpenedGrams, predicate: Predicate) -> Calibration:
-    """Return the numbers that Gram rows of `calibration` determine of every car of a cohort.
+    """Estimate the parameters of the cars of a cohort from the Gram rows of `calibration`.
 
-    With those of the sets that satellites determine more by, as far as there are any.
+    Uses the feature sets with satellite signals, too, if they were computed.
     """
-    sums = collect_sums(opened.batches(predicate), KINDS, lacking=LACKING)
+    sums = collect_sums(opened.batches(predicate), KINDS, excluded=EXCLUDED)
     catalog = opened.catalog
     for name, kinds in kinds_by_set(catalog.signals.label).items():
         if name in catalog.sets:
             satellite = replace(opened, identity=catalog.identity(name))
             sums |= collect_sums(satellite.batches(predicate), kinds)
     evidence = CarEvidence(catalog, sums)
-    cars: dict[str, dict[CalibrationParameterName, CalibratedNumber]] = {}
+    cars: dict[str, dict[CalibrationParameterName, CalibratedParameter]] = {}
     missing: dict[str, dict[CalibrationParameterName, str]] = {}
     for car in evidence.cars:
-        stated = evidence.stated(car)
-        missing[car] = {name: one for name, one in stated.items() if isinstance(one, str)}
-        cars[car] = {name: one for name, one in stated.items() if not isinstance(one, str)}
+        parameters = evidence.parameters(car)
+        missing[car] = {name: p for name, p in parameters.items() if isinstance(p, str)}
+        cars[car] = {name: p for name, p in parameters.items() if not isinstance(p, str)}
     return Calibration(cars, missing, opened.logs_version, opened.grams_version, evidence)
 
 
@@ -589,11 +605,10 @@ def calibrate(
     *,
     receivers: bool = False,
 ) -> Calibration:
-    """Return the numbers of every car that has drives of a cohort, from their Gram rows.
+    """Calibrate the cars of a cohort from their Gram rows; labels are not needed.
 
-    Drives without a label count as others do; `receivers` asks how late these are, too. Raises
-    `QuestionError` for an invalid predicate, and `DataError` if no drive satisfies it or the Gram
-    rows of `calibration` are missing.
+    `receivers` includes the delays of satellite receivers. Raises `QuestionError` for an invalid
+    predicate, and `DataError` if no drive satisfies it or Gram rows of `calibration` are missing.
     """
     catalog = source.catalog
     predicate = parse_predicate(catalog.signals, predicate)
@@ -605,6 +620,8 @@ def calibrate(
             )
             calibration = replace(calibration, receivers=delays)
     if not calibration.cars:
-        of = "" if predicate.text == ALL_DRIVES else f" of {predicate.quoted}"
-        raise DataError(f"no drive{of} has yaw rate, ay and wheel speeds. Choose another cohort.")
+        cohort = "" if predicate.text == ALL_DRIVES else f" of {predicate.quoted}"
+        raise DataError(
+            f"no drive{cohort} has yaw rate, ay and wheel speeds. Choose another cohort."
+        )
     return calibration

@@ -1,4 +1,4 @@
-"""How late the satellite receiver of each car is, from Gram rows: its speed against acceleration.
+"""Delay of the satellite receiver of each car: its speed against the acceleration, from Gram rows.
 
 A receiver's speed is as late as its course. The change of speed over 0.4 s is the integral of the
 longitudinal acceleration; changes of both over 0.4 s more are free of its offset. The lag of the
@@ -34,16 +34,16 @@ SPAN, STEP, STEPS = 40, 5, 12
 """Ticks of the integral, between two lags, and how many lags there are beside the first. Receivers
 of 5 Hz have fixes that are so far apart."""
 EARLY = 20
-"""So many ticks before its fix a speed may be of: an accelerometer may be later than a receiver."""
+"""Ticks by which a receiver may be earlier than the accelerometer."""
 SPEEDS = (f"satellite_speed_late_{EARLY}", f"satellite_speed_late_{EARLY + SPAN}")
-LASTING_S = 0.003
-"""Standard error that is the same in all drives: tilt and low-pass of the accelerometer."""
+SYSTEMATIC_STD_S = 0.003
+"""Standard error that drives do not average out: tilt and low-pass of the accelerometer."""
 TINY = 1e-9
-"""Share of the sum of squares that a drive's bend has at least: it may tell nothing."""
-FEWEST_DRIVES = 3
-"""Of fewer the uncertainty is that of a usual drive of other cars."""
-WILD = 100.0
-"""Variances of half of the cars that a car's drives may differ by."""
+"""Minimum curvature of the sum of squares of a drive, relative to the sum."""
+MIN_DRIVES = 3
+"""With fewer drives the uncertainty is that of the drives of other cars."""
+OUTLIER_RATIO = 100.0
+"""Scatter of the drives of a car over that of the median car, beyond which it is an outlier."""
 
 
 @dataclass(frozen=True)
@@ -81,14 +81,14 @@ NO_RECEIVERS = ReceiverDelays({}, {})
 
 
 def delay_columns() -> tuple[str, ...]:
-    """Return the columns of Gram rows that tell a delay: speeds, then sums of acceleration."""
+    """Return the columns that determine a delay: speeds, then sums of acceleration."""
     lags = range(0, STEP * STEPS + 1, STEP)
     ticks = sorted({*lags[1:], *(SPAN + lag for lag in lags)})
     return (*SPEEDS, *(f"ax_sum_{n}" for n in ticks))
 
 
 def _weights() -> FloatArray:
-    """Return what the change of speed, and its integrals that are late, are of the columns."""
+    """Return the weights of the columns in the change of speed and in its delayed integrals."""
     columns = delay_columns()
     weights = np.zeros((2 + STEPS, len(columns)))
     weights[0, :2] = 1, -1
@@ -100,32 +100,32 @@ def _weights() -> FloatArray:
 
 
 def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
-    """Return the delays of cars and of types that Gram rows of the feature set `delay` tell."""
+    """Estimate the delays of cars and of receiver types from Gram rows of the set `delay`."""
     columns = delay_columns()
     products: dict[str, dict[tuple[str, str], FloatArray]] = defaultdict(dict)
     receivers = defaultdict[str, set[str]](set)
     counts = Counter[str]()
     for batch in rows_of_delay:
-        for names, some, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
+        for names, rows, _ in by_signals(batch.filter(batch["vehicle_id"].is_valid())):
             if not set(columns) <= set(names.split(",")):
                 continue
-            table = gram_table(names, some).restrict(columns)
-            names_of = ("vehicle_id", "day", "drive_id", RECEIVER)
-            keys = (some[name].to_pylist() for name in names_of)
+            table = gram_table(names, rows).restrict(columns)
+            key_columns = ("vehicle_id", "day", "drive_id", RECEIVER)
+            keys = (rows[name].to_pylist() for name in key_columns)
             for (car, day, drive, receiver), about, n in zip(
                 zip(*keys, strict=True), _about_means(table), table.n.tolist(), strict=True
             ):
-                own = products[car]
-                own[str(day), drive] = own.get((str(day), drive), 0.0) + about
+                drives = products[car]
+                drives[str(day), drive] = drives.get((str(day), drive), 0.0) + about
                 receivers[car] |= {receiver} - {None}
                 counts[car] += n
-    found = {}
-    for car, own in sorted(products.items()):
-        one = _delay(np.array([own[drive] for drive in sorted(own)]), counts[car])
-        if one is not None:
-            kind = receivers[car].pop() if len(receivers[car]) == 1 else None
-            found[car] = replace(one, receiver=kind)
-    return with_types(with_pooled(found))
+    delays = {}
+    for car, drives in sorted(products.items()):
+        delay = _delay(np.array([drives[drive] for drive in sorted(drives)]), counts[car])
+        if delay is not None:
+            receiver = receivers[car].pop() if len(receivers[car]) == 1 else None
+            delays[car] = replace(delay, receiver=receiver)
+    return with_types(with_pooled(delays))
 
 
 def _about_means(table: GramTable) -> FloatArray:
@@ -141,13 +141,13 @@ def _about_means(table: GramTable) -> FloatArray:
 
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:
-    """Add the spread of other cars' drives to cars with few; None if all have too few."""
-    noise, found = _noise(delays.values()), dict(delays)
-    for car, one in delays.items():
-        if one.drives < FEWEST_DRIVES or one.uncertainty is None:
-            usual = noise and math.sqrt(noise / one.information + LASTING_S**2)
-            found[car] = replace(one, uncertainty=usual)
-    return found
+    """Complete the uncertainty of cars with few drives from other cars; None if all have few."""
+    noise, completed = _noise(delays.values()), dict(delays)
+    for car, delay in delays.items():
+        if delay.drives < MIN_DRIVES or delay.uncertainty is None:
+            usual = noise and math.sqrt(noise / delay.information + SYSTEMATIC_STD_S**2)
+            completed[car] = replace(delay, uncertainty=usual)
+    return completed
 
 
 def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
@@ -157,17 +157,19 @@ def with_types(delays: dict[str, ReceiverDelay]) -> ReceiverDelays:
     of a car is no part of what drawing makes smaller.
     """
     cars, types = dict(delays), {}
-    for name in sorted({one.receiver for one in delays.values() if one.receiver is not None}):
-        of_type = {car: one for car, one in delays.items() if one.receiver == name}
+    for name in sorted({d.receiver for d in delays.values() if d.receiver is not None}):
+        of_type = {car: delay for car, delay in delays.items() if delay.receiver == name}
         noise = _noise(of_type.values())
-        own = np.array([(one.value, one.information) for one in of_type.values()])
-        pooled = pool(own[:, 0], noise / own[:, 1]) if noise else None
+        figures = np.array([(delay.value, delay.information) for delay in of_type.values()])
+        pooled = pool(figures[:, 0], noise / figures[:, 1]) if noise else None
         if pooled is not None:
             types[name] = pooled
-            for (car, one), value, error in zip(
+            for (car, delay), value, error in zip(
                 of_type.items(), pooled.values.tolist(), pooled.errors.tolist(), strict=True
             ):
-                cars[car] = replace(one, value=value, uncertainty=math.hypot(error, LASTING_S))
+                cars[car] = replace(
+                    delay, value=value, uncertainty=math.hypot(error, SYSTEMATIC_STD_S)
+                )
     return ReceiverDelays(cars, types)
 
 
@@ -177,28 +179,30 @@ def _noise(delays: Iterable[ReceiverDelay]) -> float | None:
     Without cars whose drives differ wildly more than those of half of the cars: their receivers or
     logs are faulty, and one of them would make the delays of all others uncertain.
     """
-    known = [one for one in delays if one.drives > 1]
-    usual = statistics.median([one.differing / (one.drives - 1) for one in known] or [0.0])
-    known = [one for one in known if one.differing <= WILD * usual * (one.drives - 1)]
-    free = sum(one.drives - 1 for one in known)
-    return math.fsum(one.differing for one in known) / free if free >= FEWEST_DRIVES - 1 else None
+    several = [delay for delay in delays if delay.drives > 1]
+    usual = statistics.median([d.differing / (d.drives - 1) for d in several] or [0.0])
+    usable = [d for d in several if d.differing <= OUTLIER_RATIO * usual * (d.drives - 1)]
+    degrees = sum(d.drives - 1 for d in usable)
+    if degrees < MIN_DRIVES - 1:
+        return None
+    return math.fsum(d.differing for d in usable) / degrees
 
 
 def _delay(products: FloatArray, rows: int) -> ReceiverDelay | None:
     drives, total = len(products), products.sum(axis=0)
-    lag = _best_lag(total)
-    if lag is None:
+    best = _best_lag(total)
+    if best is None:
         return None
     slope, bend = _parabolas(products)
-    without = [found for one in products if (found := _best_lag(total - one)) is not None]
+    without = [lag for drive in products if (lag := _best_lag(total - drive)) is not None]
     uncertainty = None
     if len(without) == drives > 1:
         mean = math.fsum(without) / drives
-        square = math.fsum((one - mean) ** 2 for one in without)
+        square = math.fsum((lag - mean) ** 2 for lag in without)
         scatter = math.sqrt(square * (drives - 1) / drives) * float(SAMPLE_TIME_S)
-        uncertainty = math.hypot(scatter, LASTING_S)
+        uncertainty = math.hypot(scatter, SYSTEMATIC_STD_S)
     return ReceiverDelay(
-        value=lag * float(SAMPLE_TIME_S),
+        value=best * float(SAMPLE_TIME_S),
         uncertainty=uncertainty,
         drives=drives,
         rows=rows,
@@ -214,9 +218,9 @@ def _parabolas(products: FloatArray) -> tuple[FloatArray, FloatArray]:
     at = np.arange(middle, middle + 3)  # the first is of the speed
     ratio = total[0, middle + 1] / total[middle + 1, middle + 1]
     squares = ratio**2 * products[:, at, at] - 2 * ratio * products[:, 0, at]
-    before, here, after = squares.T
+    before, center, after = squares.T
     step = STEP * float(SAMPLE_TIME_S)
-    bend = np.maximum(after - 2 * here + before, TINY * abs(total[0, 0]))
+    bend = np.maximum(after - 2 * center + before, TINY * abs(total[0, 0]))
     return (after - before) / (2 * step), bend / step**2
 
 
@@ -233,8 +237,8 @@ def _best_lag(products: FloatArray) -> float | None:
         return None
     explained = products[0, 1:] ** 2 / sizes
     middle = _middle(products)
-    before, here, after = explained[middle - 1 : middle + 2]
-    bend = 2 * here - before - after
+    before, center, after = explained[middle - 1 : middle + 2]
+    bend = 2 * center - before - after
     if bend <= 0:
         return None
     # A sum of ticks is the integral up to half a tick after the last one.
@@ -247,7 +251,7 @@ def _best_lag(products: FloatArray) -> float | None:
 # `delay`: the same drives in any order give the same rows, and forgotten ones leave nothing.
 
 GRAIN_S = float(SAMPLE_TIME_S) / LATE_PARTS
-"""What a delay is a whole number of, s."""
+"""Unit of integer delays, s."""
 
 
 def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str]) -> dict[str, int]:
@@ -268,8 +272,8 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
                 counts = pc.and_(counts, pc.invert(returned))
             yield from rows.filter(counts).to_batches()
 
-    least, most = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
+    earliest, latest = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
     return {
-        car: min(max(round(one.value / GRAIN_S), least), most)
-        for car, one in receiver_delays(batches()).cars.items()
+        car: min(max(round(delay.value / GRAIN_S), earliest), latest)
+        for car, delay in receiver_delays(batches()).cars.items()
     }

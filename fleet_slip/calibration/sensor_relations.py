@@ -1,4 +1,4 @@
-"""From the sums of a car's drives to its numbers: two relations between its sensors.
+"""Relations between the sensors of a car, and the calibration parameters that follow from sums.
 
 A car without side-slip of its own accord turns as fast as its velocity does, and a road that is
 banked in bends takes a part of the lateral acceleration that grows with their curvature:
@@ -36,15 +36,15 @@ NO_TYRE = (
     "signal has a wrong unit or sign. See: fleet-slip quality"
 )
 TIGHT_BENDS = "its bends are too tight to separate their banking: map satellite_speed"
-"""Why a number is missing."""
+"""Reasons for a missing parameter."""
 
 
 @dataclass(frozen=True)
 class CarEstimate:
-    """A number of a relation, its gradient by the unknowns, and by others that it depends on.
+    """Estimate of a parameter, its gradient by the unknowns, and by other parameters (`also`).
 
-    `noise` is the variance of the gyroscope's noise that was taken out; `by_lean` is how much a
-    lean of the road adds to the number.
+    `noise` is the variance of the gyroscope's noise that was subtracted; `by_lean` is the derivative
+    by the camber of the road.
     """
 
     kind: str
@@ -58,7 +58,7 @@ class CarEstimate:
 
 
 Estimates = dict[CalibrationParameterName, "CarEstimate | str"]
-"""The numbers that sums determine; in the place of one that they do not determine: why."""
+"""Estimates of the parameters that sums determine, or the reasons for missing ones."""
 
 LEAST_TURNING_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
@@ -79,12 +79,12 @@ OF_STEERING: tuple[CalibrationParameterName, ...] = (
     "understeer",
 )
 OF_SLIP: tuple[CalibrationParameterName, ...] = ("slip_lever", "slip_compliance")
-"""The numbers of each relation."""
+"""Parameters of each relation."""
 
 LEAST_CURVATURE_1PM = Fraction(1, 1000)
 SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
-"""What tyres there are; on roads as they are, also what bodies that roll make of ay. A ratio beyond
-it says that noise, not driving, made the fit."""
+"""Range of the wheel radii of tyres, and on banked roads of the roll of bodies. A ratio outside it
+means that noise, not driving, determined the fit."""
 
 FLAT = Relation.least_squares("yaw_rate", (ONE, "course_rate", "slowness"))
 """The yaw rate by 1, ay/v and 1/v: the unknowns b, 1/rho and -d/rho. Least squares."""
@@ -122,8 +122,8 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     STANDSTILL: ("yaw_rate", *WHEEL_SPEEDS),
 }
 """The columns of each kind of sums."""
-LACKING = {STANDSTILL: "slowness"}
-"""Column whose rows are not of a kind."""
+EXCLUDED = {STANDSTILL: "slowness"}
+"""Column whose rows do not belong to a kind."""
 
 
 @dataclass(frozen=True)
@@ -158,13 +158,13 @@ class CarTerms:
         }
 
 
-def estimate_numbers(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> Estimates:
-    """Return the numbers that the sums of a car's drives determine, by kind; exactly.
+def estimate_parameters(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> Estimates:
+    """Estimate the parameters of a car from the sums of its drives by kind, exactly.
 
-    `banked`: whether bends are, on the fleet's roads (`road_lean`). A number is missing where its
-    columns are, where the sums do not determine it, or where the car drove too straight or too
-    evenly to separate it from noise. What satellites determine replaces what its own sensors do,
-    and the bias at standstill both.
+    `banked` selects the relation of banked roads. A parameter is missing if its columns are, if the
+    sums do not determine it, or if the car drove too straight or too evenly to separate it from
+    noise. Estimates by satellite replace those by the car's sensors; the bias at standstill
+    replaces both.
     """
     estimates = _by_own_sensors(terms, sums, banked)
     satellite = _speed_ratio(terms, sums) | _slip(terms, sums)
@@ -173,19 +173,19 @@ def estimate_numbers(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) ->
 
 def _by_own_sensors(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> Estimates:
     course, steering = sums.get("course"), sums.get("steering")
-    every = (*OF_COURSE, *OF_STEERING)
+    names = (*OF_COURSE, *OF_STEERING)
     if course is None or course.n == 0:
-        return dict.fromkeys(every, NO_COURSE)
+        return dict.fromkeys(names, NO_COURSE)
     of_course = ExactSums(course, terms.course)
     noise = gyroscope_noise(terms, course, steering)
     if of_course.variance("course_rate") < LEAST_TURNING_RAD_S**2 or noise is None:
-        return dict.fromkeys(every, STRAIGHT)
+        return dict.fromkeys(names, STRAIGHT)
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
-        return dict.fromkeys(every, EVEN)
+        return dict.fromkeys(names, EVEN)
     of_plane = _estimate_course(terms, of_course, noise if banked else None)
     if isinstance(of_plane, str):
-        return dict.fromkeys(every, of_plane)
+        return dict.fromkeys(names, of_plane)
     estimates: Estimates = {**of_plane}
     if steering is None or steering.n == 0:
         estimates |= dict.fromkeys(OF_STEERING, NO_STEERING)
@@ -198,7 +198,7 @@ def _by_own_sensors(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> 
 
 
 def bank_of_bends(terms: CarTerms, sums: Mapping[str, Gram]) -> Fraction | None:
-    """Return s, what of ay grows with curvature, m^2/s^2; None if undetermined."""
+    """Return s, the derivative of ay by curvature in m^2/s^2; None if undetermined."""
     course = sums.get("course")
     if course is None or (noise := gyroscope_noise(terms, course, sums.get("steering"))) is None:
         return None
@@ -207,7 +207,7 @@ def bank_of_bends(terms: CarTerms, sums: Mapping[str, Gram]) -> Fraction | None:
 
 
 def gyroscope_noise(terms: CarTerms, course: Gram, steering: Gram | None) -> Fraction | None:
-    """Return what no other sensor says of the yaw rate: the variance of the gyroscope's noise."""
+    """Return the variance of the yaw rate that no other sensor explains: the gyroscope's noise."""
     inputs = ("wheels", "speed", "course_rate")
     if steering is None:
         return ExactSums(course, terms.course).residual_variance("yaw_rate", inputs)
@@ -218,7 +218,7 @@ def gyroscope_noise(terms: CarTerms, course: Gram, steering: Gram | None) -> Fra
 def _estimate_course(
     terms: CarTerms, sums: ExactSums, noise: Fraction | None
 ) -> dict[CalibrationParameterName, CarEstimate] | str:
-    """Tell by the relation of flat roads, or with a noise by that of banked ones."""
+    """Estimate by the relation of flat roads, or with a noise by that of banked roads."""
     relation, noise = (FLAT, Fraction(0)) if noise is None else (COURSE, noise)
     solution = solve_rational(relation.system(sums, noise))
     if solution is None or not solution[1]:
@@ -240,13 +240,13 @@ def _estimate_course(
             "ay_offset": (1.0, 0.0, 0.0, 0.0),
             "speed_ratio": (0.0, 1.0, 0.0, 0.0),
         }
-    least, most = SPEED_RATIOS[relation is COURSE]
-    if not least <= ratio <= most:
+    lowest, highest = SPEED_RATIOS[relation is COURSE]
+    if not lowest <= ratio <= highest:
         return NO_TYRE
     values = (yaw_rate_offset, ay_offset, ratio)
-    of = ("course", relation, terms.course, noise)
+    common = ("course", relation, terms.course, noise)
     return {
-        name: CarEstimate(*of, value, gradient, by_lean=Fraction(name == "ay_offset"))
+        name: CarEstimate(*common, value, gradient, by_lean=Fraction(name == "ay_offset"))
         for (name, gradient), value in zip(gradients.items(), values, strict=True)
     }
 
@@ -279,21 +279,22 @@ def _estimate_steering(
     }
 
 
-# What a car determines that stands still: the bias of its gyroscope, by itself.
+# Bias of the gyroscope at standstill.
 #
-# Rows below 3 m/s have no quotients by speed, and a Gram row of their own. What the wheels turn by
-# in them is taken off.
+# Rows below 3 m/s lack the quotients by speed, and have a Gram row of their own. The turning that the
+# wheels measure is subtracted.
 
 LONGEST_ROLL_MPS, FEWEST_STILL = Fraction(1, 2), 1000
-"""Mean speed of slow rows that are mostly at standstill, and how many they are at least."""
+"""Maximum mean speed of slow rows that are mostly at standstill, and minimum number of them."""
 STILL = Relation.least_squares("yaw_rate", (ONE, "wheels"))
 """The yaw rate by 1 and the wheels' differences: b, and one over the tracks. Least squares."""
 
 
 def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
-    """Return the bias of the gyroscope of a car that stood still, in place of what driving tells.
+    """Estimate the bias of the gyroscope of a standing car, which replaces that from driving.
 
-    Also in place of the course: of a car that turns to one side alone that has a part of its scale.
+    It replaces that from the course, too, which contains a part of the scale error if a car turns
+    to one side only.
     """
     gram = sums.get(STANDSTILL)
     if gram is None or gram.n < FEWEST_STILL:
@@ -307,7 +308,7 @@ def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     return {"yaw_rate_offset": bias}
 
 
-# What a satellite receiver determines of a car beyond its own sensors: its speed, and how it slips.
+# Speed ratio and slip of a car from a satellite receiver.
 #
 # The satellite's speed over that of the wheels is the speed ratio, whatever a body that rolls or a
 # bank adds to the accelerometer. And the course changes by more than the yaw rate's integral as
@@ -320,13 +321,13 @@ SATELLITE = "satellite_speed"
 SLIP = "slip"
 """The kind of sums that determines how a car slips: changes over some seconds."""
 
-LASTING_BY_SATELLITE: Mapping[str, Mapping[CalibrationParameterName, float]] = {
+SYSTEMATIC_STD_BY_SATELLITE: Mapping[str, Mapping[CalibrationParameterName, float]] = {
     STANDSTILL: {"yaw_rate_offset": 0.0003},
     SATELLITE: {"speed_ratio": 0.0012},
     SLIP: {"yaw_rate_offset": 0.0001, "slip_lever": 0.1, "slip_compliance": 0.0003},
 }
-"""Standard errors that no drive takes away, by kind: a gyroscope warms up; tyres slip and wear; a
-receiver of which we know to 5 ms how late it is moves l by the way of that time."""
+"""Standard errors that drives do not average out, by kind. A gyroscope warms up, tyres slip and
+wear, and 5 ms of error in the delay of a receiver shift l by the distance driven in that time."""
 
 NO_RECEIVER = (
     "no course by satellite: none is logged, or its Gram rows are missing (fleet-slip gram "
@@ -334,7 +335,7 @@ NO_RECEIVER = (
 )
 FEW_TURNS = "its course by satellite has too few turns"
 NO_CAR = "its satellite course is implausible: check the receiver and the antenna's position"
-"""Why a number is missing."""
+"""Reasons for a missing parameter."""
 
 SPEED = Relation(
     instruments=(ONE,), products=((("speed", ONE),),), response_products=((SATELLITE, ONE),)
@@ -347,7 +348,7 @@ Least squares."""
 
 
 def kinds_by_set(label: str) -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return the columns of each kind of sums, by the feature set that has them."""
+    """Return the columns of each kind of sums by feature set."""
     return {
         BY_SATELLITE: {SATELLITE: (*WHEEL_SPEEDS, "slowness", SATELLITE)},
         BY_COURSE: {SLIP: ("curvature", "ay", TURNED, label)},
@@ -360,8 +361,8 @@ def _speed_ratio(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
         return {}
     columns = {"speed": terms.course["speed"], SATELLITE: terms.si(**{SATELLITE: 1})}
     solution = solve_rational(SPEED.system(ExactSums(gram, columns), 0))
-    least, most = SPEED_RATIOS[True]
-    if solution is None or not least <= solution[0] <= most:
+    lowest, highest = SPEED_RATIOS[True]
+    if solution is None or not lowest <= solution[0] <= highest:
         return {}
     ratio = CarEstimate(SATELLITE, SPEED, columns, Fraction(0), solution[0], (1.0,))
     return {"speed_ratio": ratio}
@@ -383,12 +384,12 @@ def _slip(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     solution = solve_rational(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:
         return dict.fromkeys(OF_SLIP, NO_CAR)
-    of = (SLIP, CHANGE, columns, Fraction(0))
-    # Over so much time the heading changes by the bias too much, and the label by as little.
+    common = (SLIP, CHANGE, columns, Fraction(0))
+    # The bias times the duration adds to the heading, and is missing in the label.
     by_bias = -1 / Fraction(catalog.feature_set(BY_COURSE).change_s[0])
     of_bias = (float(by_bias), 0.0, 0.0, 0.0)
     return {
-        "yaw_rate_offset": CarEstimate(*of, by_bias * solution[0], of_bias),
-        "slip_lever": CarEstimate(*of, solution[1], (0.0, 1.0, 0.0, 0.0)),
-        "slip_compliance": CarEstimate(*of, solution[2], (0.0, 0.0, 1.0, 0.0)),
+        "yaw_rate_offset": CarEstimate(*common, by_bias * solution[0], of_bias),
+        "slip_lever": CarEstimate(*common, solution[1], (0.0, 1.0, 0.0, 0.0)),
+        "slip_compliance": CarEstimate(*common, solution[2], (0.0, 0.0, 1.0, 0.0)),
     }

@@ -12,25 +12,25 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.calibration.car_calibration import (
-    CalibratedNumber,
+    CalibratedParameter,
     CarEvidence,
     DriveSums,
     calibrate,
     collect_sums,
-    roads_of,
+    estimate_roads,
 )
 from fleet_slip.calibration.sensor_relations import (
     EVEN,
+    EXCLUDED,
     FLAT,
     KINDS,
-    LACKING,
     NO_CAR,
     NO_COURSE,
     NO_RECEIVER,
     NO_TYRE,
     STRAIGHT,
     CarTerms,
-    estimate_numbers,
+    estimate_parameters,
     kinds_by_set,
 )
 from fleet_slip.catalog.calibration_parameters import (
@@ -94,15 +94,17 @@ def row_of(columns: Sequence[str], counts: Any, drive: str, car: str = "car") ->
 
 def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
-    return CarEvidence(CATALOG, collect_sums(batches, KINDS, lacking=LACKING))
+    return CarEvidence(CATALOG, collect_sums(batches, KINDS, excluded=EXCLUDED))
 
 
-def calibrated(found: CarEvidence, car: str) -> dict[str, CalibratedNumber]:
-    return {k: one for k, one in found.stated(car).items() if isinstance(one, CalibratedNumber)}
+def calibrated(found: CarEvidence, car: str) -> dict[str, CalibratedParameter]:
+    return {
+        k: one for k, one in found.parameters(car).items() if isinstance(one, CalibratedParameter)
+    }
 
 
 def refusals(found: CarEvidence, car: str) -> dict[str, str]:
-    return {name: one for name, one in found.stated(car).items() if isinstance(one, str)}
+    return {name: one for name, one in found.parameters(car).items() if isinstance(one, str)}
 
 
 @pytest.fixture(scope="module")
@@ -265,14 +267,14 @@ def test_bends_too_tight_for_their_bank_tell_no_speed() -> None:
 
 def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
     offsets = [Fraction(i - 10, 100) for i in range(21)]
-    assert roads_of(True, offsets).lean == 0
-    leaning = roads_of(True, [offset + Fraction(1, 4) for offset in offsets])
+    assert estimate_roads(True, offsets).lean == 0
+    leaning = estimate_roads(True, [offset + Fraction(1, 4) for offset in offsets])
     assert leaning.lean is not None
     assert 0.2 < leaning.lean < 0.25
     assert leaning.uncertainty == pytest.approx(
         hypot(31**0.5 / 3 * 0.05 / 21**0.5, 0.25 - float(leaning.lean))
     )
-    assert roads_of(True, offsets[:9]).lean is roads_of(False, offsets).lean is None
+    assert estimate_roads(True, offsets[:9]).lean is estimate_roads(False, offsets).lean is None
 
 
 def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
@@ -331,7 +333,7 @@ def test_one_drive_of_one_car_has_no_uncertainty() -> None:
 def test_no_gram_rows_tell_nothing() -> None:
     for banked in (False, True):
         for sums in ({}, {kind: Gram.zero(c) for kind, c in KINDS.items()}):
-            told = estimate_numbers(CarTerms(CATALOG), sums, banked)
+            told = estimate_parameters(CarTerms(CATALOG), sums, banked)
             assert {*told.values()} == {NO_COURSE, NO_RECEIVER}
             assert told.keys() == CALIBRATION_PARAMETERS.keys()
 
@@ -437,7 +439,7 @@ def stacked(columns: Sequence[str], counts: dict[str, Any]) -> Any:
 
 
 @pytest.fixture(scope="module")
-def told() -> dict[str, CalibratedNumber]:
+def told() -> dict[str, CalibratedParameter]:
     rng = np.random.default_rng(5)
     sums: dict[str, DriveSums] = {}
     for name, make in ((BY_SATELLITE, levels), (BY_COURSE, changes)):
@@ -446,8 +448,8 @@ def told() -> dict[str, CalibratedNumber]:
             for drive in range(4)
         ]
         sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set(SIGNALS.label)[name])
-    stated = CarEvidence(CATALOG, sums).stated("car")
-    return {name: one for name, one in stated.items() if isinstance(one, CalibratedNumber)}
+    stated = CarEvidence(CATALOG, sums).parameters("car")
+    return {name: one for name, one in stated.items() if isinstance(one, CalibratedParameter)}
 
 
 def test_the_sets_have_the_columns() -> None:
@@ -455,14 +457,14 @@ def test_the_sets_have_the_columns() -> None:
         assert set(columns) <= set(CATALOG.feature_set(name).columns)
 
 
-def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedNumber]) -> None:
+def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedParameter]) -> None:
     one = told["speed_ratio"]
     assert one.value == pytest.approx(RATIO, abs=1e-3)
     assert one.uncertainty is not None
     assert 0.0012 <= one.uncertainty < 0.003
 
 
-def test_the_course_tells_how_a_car_slips(told: dict[str, CalibratedNumber]) -> None:
+def test_the_course_tells_how_a_car_slips(told: dict[str, CalibratedParameter]) -> None:
     assert told["slip_lever"].value == pytest.approx(LEVER_M, abs=0.01)
     assert told["slip_compliance"].value == pytest.approx(COMPLIANCE, abs=1e-4)
     bias = told["yaw_rate_offset"]  # over 4 s the heading gains that much, and the label lacks it
@@ -477,7 +479,7 @@ def test_what_is_no_course_of_a_car_tells_nothing(times: int) -> None:
     counts[SIGNALS.label] = times * counts[SIGNALS.label]
     columns = BY_SET[BY_COURSE]
     table = stacked(columns, counts).astype(np.int64)
-    told = estimate_numbers(
+    told = estimate_parameters(
         CarTerms(CATALOG), {"slip": Gram.from_counts(columns, table)}, banked=False
     )
     assert {*told.values()} == {NO_COURSE, NO_CAR}
