@@ -43,8 +43,8 @@ TIGHT_BENDS = "its bends are too tight to separate their banking: map satellite_
 class CarEstimate:
     """Estimate of a parameter, its gradient by the unknowns, and by other parameters (`also`).
 
-    `noise` is the variance of the gyroscope's noise that was subtracted; `by_lean` is the derivative
-    by the camber of the road.
+    `noise` is the variance of the gyroscope's noise that was subtracted, and `by_lean` the
+    derivative by the camber of the road.
     """
 
     kind: str
@@ -281,8 +281,8 @@ def _estimate_steering(
 
 # Bias of the gyroscope at standstill.
 #
-# Rows below 3 m/s lack the quotients by speed, and have a Gram row of their own. The turning that the
-# wheels measure is subtracted.
+# Rows below 3 m/s lack the quotients by speed, and have a Gram row of their own. The turning that
+# the wheels measure is subtracted.
 
 LONGEST_ROLL_MPS, FEWEST_STILL = Fraction(1, 2), 1000
 """Maximum mean speed of slow rows that are mostly at standstill, and minimum number of them."""
