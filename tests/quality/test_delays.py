@@ -6,32 +6,10 @@ import pytest
 from fleet_slip.arrays import FloatArray
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.delays import estimate_delay
+from fleet_slip.quality.drive_signals import WHEELS
 from fleet_slip.quality.plausibility import check_plausibility
 from tests.support.catalog import SIGNALS
-from tests.support.textbook_car import Car
-
-WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
-
-
-def winding(seed: int = 1, seconds: float = 90.0) -> Car:
-    """Return a car on a road without a period, as signals with noise."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(round(100 * seconds)) / 100
-    waves = zip((0.3, 0.7, 1.1, 1.9), rng.uniform(0, 6, 4), strict=True)
-    curvature = sum(0.006 * np.sin(rate * time_s + phase) for rate, phase in waves)
-    speed = 14 + 4 * np.sin(0.11 * time_s)
-    ay, yaw_rate = curvature * speed**2, curvature * speed
-    car = {
-        "ay": ay,
-        "yaw_rate": yaw_rate,
-        "steering_wheel": 15 * (2.7 * curvature + 0.003 * ay),
-        "wheel_fl": (speed - 0.775 * yaw_rate) / 0.31,
-        "wheel_fr": (speed + 0.775 * yaw_rate) / 0.31,
-        "wheel_rl": (speed - 0.775 * yaw_rate) / 0.31,
-        "wheel_rr": (speed + 0.775 * yaw_rate) / 0.31,
-        "sideslip": 1.4 * curvature - 0.004 * ay,
-    }
-    return {name: v + 0.03 * v.std() * rng.normal(size=v.size) for name, v in car.items()}
+from tests.support.textbook_car import Car, winding_car
 
 
 def late(values: FloatArray, ticks: int) -> FloatArray:
@@ -44,7 +22,7 @@ def delays_of(car: Car) -> list[Fault]:
 
 @pytest.mark.parametrize(("name", "ticks"), [("sideslip", 100), ("yaw_rate", 40), ("ay", 40)])
 def test_a_signal_that_is_late_in_its_drive_is_named_with_its_delay(name: str, ticks: int) -> None:
-    car = winding()
+    car = winding_car()
     (fault,) = check_plausibility(SIGNALS, {**car, name: late(car[name], ticks)})
     assert (fault.kind, fault.signals) == ("late", (name,))
     assert f"it is +{ticks / 100:.2f} s late" in fault.figure
@@ -53,19 +31,19 @@ def test_a_signal_that_is_late_in_its_drive_is_named_with_its_delay(name: str, t
 
 @pytest.mark.parametrize("name", ["sideslip", "yaw_rate", "steering_wheel"])
 def test_delays_of_buses_are_no_fault(name: str) -> None:
-    car = winding()
+    car = winding_car()
     assert delays_of({**car, name: late(car[name], 12)}) == []
 
 
 def test_two_signals_without_a_witness_are_both_named() -> None:
-    car = {name: values for name, values in winding().items() if name in {"ay", "yaw_rate"}}
+    car = {name: values for name, values in winding_car().items() if name in {"ay", "yaw_rate"}}
     (fault,) = delays_of({**car, "ay": late(car["ay"], 50)})
     assert fault.signals == ("ay", "yaw_rate")
     assert "the first is +0.50 s later" in fault.figure
 
 
 def test_steering_that_leads_is_no_fault() -> None:
-    car = winding()
+    car = winding_car()
     rest = {name: late(values, 35) for name, values in car.items() if name != "steering_wheel"}
     assert delays_of({**car, **rest}) == []
 
@@ -73,7 +51,7 @@ def test_steering_that_leads_is_no_fault() -> None:
 def test_a_delay_has_a_standard_error_that_covers_it() -> None:
     errors = []
     for seed in range(12):
-        car = winding(seed, seconds=60)
+        car = winding_car(seed, seconds=60)
         delay = estimate_delay(
             late(car["sideslip"], 40),
             np.array([car["yaw_rate"], car["ay"]]),
@@ -93,7 +71,7 @@ def test_a_short_or_unrelated_signal_has_no_delay() -> None:
 
 @pytest.mark.parametrize("name", ["ay", "yaw_rate"])
 def test_the_label_decides_between_two_signals_that_contradict_each_other(name: str) -> None:
-    car = winding()
+    car = winding_car()
     car = {"vx": 0.31 * np.mean([car[w] for w in WHEELS], axis=0)} | {
         name: car[name] for name in ("ay", "yaw_rate", "sideslip")
     }
@@ -108,7 +86,7 @@ def test_the_label_decides_between_two_signals_that_contradict_each_other(name: 
 
 def test_wheels_in_a_wrong_unit_are_compared_with_another_speed() -> None:
     """In rad/s taken for rpm they are below 2 m/s, where nothing seems to move."""
-    car = winding()
+    car = winding_car()
     speed = 0.31 * np.mean([car[wheel] for wheel in WHEELS], axis=0)
     slow = {**car, "vx": speed} | {wheel: car[wheel] / 9.55 for wheel in WHEELS}
     (fault,) = check_plausibility(SIGNALS, slow)

@@ -31,3 +31,25 @@ def a_car(least_mps: float = 8.0) -> Car:
         "wheel_rr": speed * right / RADIUS_M,
         "sideslip": 1.4 * yaw_rate / speed - 0.004 * ay,
     }
+
+
+def winding_car(seed: int = 1, seconds: float = 90.0) -> Car:
+    """Return a car on a road without a period, as signals with noise."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(round(100 * seconds)) / 100
+    waves = zip((0.3, 0.7, 1.1, 1.9), rng.uniform(0, 6, 4), strict=True)
+    curvature = sum(0.006 * np.sin(rate * time_s + phase) for rate, phase in waves)
+    speed = 14 + 4 * np.sin(0.11 * time_s)
+    ay, yaw_rate = curvature * speed**2, curvature * speed
+    car = {
+        "ax": np.gradient(speed, 0.01),
+        "ay": ay,
+        "yaw_rate": yaw_rate,
+        "steering_wheel": 15 * (2.7 * curvature + 0.003 * ay),
+        "wheel_fl": (speed - 0.775 * yaw_rate) / 0.31,
+        "wheel_fr": (speed + 0.775 * yaw_rate) / 0.31,
+        "wheel_rl": (speed - 0.775 * yaw_rate) / 0.31,
+        "wheel_rr": (speed + 0.775 * yaw_rate) / 0.31,
+        "sideslip": 1.4 * curvature - 0.004 * ay,
+    }
+    return {name: v + 0.03 * v.std() * rng.normal(size=v.size) for name, v in car.items()}
