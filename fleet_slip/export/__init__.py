@@ -1,1 +1,1 @@
-"""A published version as an integer program, and that program in other languages."""
+"""Exports of published versions: an integer program, and that program in other languages."""

@@ -14,7 +14,7 @@ typedef struct {
     uint32_t blocks;
     uint32_t first_block;
     uint32_t first_number;
-    uint32_t most_rows;
+    uint32_t max_rows;
     uint64_t definition;
     bool complete; /* rows with some, but not all columns are not counted */
 } counted_set;
@@ -69,7 +69,7 @@ static void count_row(${prefix}_gram *gram, uint32_t set, uint32_t over, int32_t
         }
         gram->used[set]++;
     }
-    if ((index == spec->blocks) || (gram->blocks[spec->first_block + index].rows == spec->most_rows)) {
+    if ((index == spec->blocks) || (gram->blocks[spec->first_block + index].rows == spec->max_rows)) {
         gram->lost[set] += (gram->lost[set] < ${max_rows}U) ? 1U : 0U;
     } else {
         uint32_t at = spec->first_number + (index * size);
