@@ -15,7 +15,7 @@ from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
-from fleet_slip.storage.table import TableFile, on_newest
+from fleet_slip.storage.table import TableFile, retry_if_stale
 from fleet_slip.warehouse.gram_rows import find_backlog, is_onboard, is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -54,7 +54,7 @@ def check_grams(
     Raises `StorageError` naming the first drive that differs, and `DataError` for nothing to check.
     """
     look = partial(_check, warehouse, count, progress, begin)
-    return on_newest((warehouse.logs, warehouse.grams), look)
+    return retry_if_stale((warehouse.logs, warehouse.grams), look)
 
 
 def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> CheckReport:
@@ -75,7 +75,7 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         name
         for name in warehouse.feature_sets()
         if catalog.feature_set(name).windows
-        and grams.landed(transaction_name(catalog.identity(name))) is not None
+        and grams.transaction_version(transaction_name(catalog.identity(name))) is not None
     )
     for name in wide:
         missing = find_backlog(logs, grams, catalog.identity(name)).missing

@@ -310,7 +310,7 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
     digest = hashlib.sha256(content).hexdigest()
     transaction = AppTransaction(f"receive/{digest}", 1)
     drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py()
-    new = warehouse.grams.snapshot().landed(transaction.name) is None
+    new = warehouse.grams.snapshot().transaction_version(transaction.name) is None
     report = OnboardImport(str(file), new, len(table), drives, rows or 0)
     if not new:
         return report
@@ -322,7 +322,7 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
-        if grams.landed(transaction.name) is not None:  # meanwhile, by another process
+        if grams.transaction_version(transaction.name) is not None:  # meanwhile, by another process
             return
         # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
         _require_allowed(file, warehouse, numbered)

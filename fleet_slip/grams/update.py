@@ -145,7 +145,7 @@ def reconcile(warehouse: Warehouse, *, unreadable: Collection[str] = ()) -> list
     computed = {
         name: identity
         for name, identity in identities.items()
-        if grams.landed(transaction_name(identity)) is not None
+        if grams.transaction_version(transaction_name(identity)) is not None
     }
     drives = {
         name: _distinct(grams, identity, "drive_id")
@@ -216,7 +216,7 @@ def _update_set(
         _commit(work.grams, work.logs, work.identity, added, replaced)
         # Who removed a log file may have found no Gram row of its drives, and so changed none: the
         # next attempt drops the rows that were committed here.
-        require_active(work.logs.renewed(), work.files)
+        require_active(work.logs.refresh(), work.files)
         grams = warehouse.grams.snapshot()
     return GramReport(
         feature_set=work.identity,

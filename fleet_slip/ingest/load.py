@@ -372,7 +372,7 @@ class _Writer:
         """Read the current state of the tables; return a snapshot of the logs."""
         snapshots = {name: table.snapshot() for name, table in tables_of(self.warehouse).items()}
         self._landed = {
-            name: written.landed_among(self._number) for name, written in snapshots.items()
+            name: written.transaction_lookup(self._number) for name, written in snapshots.items()
         }
         return snapshots["logs"]
 
@@ -628,7 +628,7 @@ def commit_batch(
         # After the snapshot: an erasure that begins from now on makes this commit a conflict.
         if ErasureLog(warehouse.root).begun() != written.forgotten:
             return True
-        landed = snapshot.landed_among(len(written.new[name].transactions))
+        landed = snapshot.transaction_lookup(len(written.new[name].transactions))
         if any(landed(transaction.name) for transaction in written.new[name].transactions):
             return True
         new = [file for file in written.files if file.fingerprints] if name == "logs" else []

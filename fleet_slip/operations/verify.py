@@ -50,7 +50,7 @@ from fleet_slip.storage.encoding import read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
-from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, on_newest, retrying
+from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, retry_if_stale, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
 from fleet_slip.warehouse.gram_rows import is_onboard, is_onboard_file, named_files
@@ -395,7 +395,7 @@ def verify(
     """
     warehouse.require()
     look = partial(_verify, warehouse, full, progress, executor)
-    return on_newest(warehouse.tables, look, lambda report: bool(report.damage))
+    return retry_if_stale(warehouse.tables, look, lambda report: bool(report.damage))
 
 
 def _verify(

@@ -237,7 +237,7 @@ def day_name(campaign: str, day: date) -> str:
 
 def has_landed(snapshot: Snapshot, transaction: AppTransaction) -> bool:
     """Return True if a transaction is in the logs. Raises `RefusedError` for another version."""
-    landed = snapshot.landed(transaction.name)
+    landed = snapshot.transaction_version(transaction.name)
     if landed not in (None, transaction.version):
         _, campaign, day, *_ = transaction.name.split("/")
         raise RefusedError(
@@ -315,7 +315,7 @@ def simulate_campaign(
     days = tuple(days)
     open_days = _open_days(snapshot, campaign, days)
     for day in open_days:  # before anything is written, so that a changed campaign is refused
-        if snapshot.landed(f"{day_name(campaign.name, day)}/0") is not None:
+        if snapshot.transaction_version(f"{day_name(campaign.name, day)}/0") is not None:
             for batch in campaign.batches(day):
                 has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)

@@ -1,9 +1,9 @@
-"""Checksums in the names of data files, and whether a file is still what its name says.
+"""Checksums in the names of data files, and their verification.
 
     NAME-x0123456789abcdef-0123456789abcdef0123456789abcdef.parquet
 
-The last is of its SHA-256, which `verify` computes; that with an x of its XXH3, so fast that every
-job looks at every byte.
+The last is the SHA-256, which `verify` computes. The one after the x is the XXH3, so fast that
+every job checks every byte.
 """
 
 import functools
@@ -32,7 +32,7 @@ FAST_DIGITS = 16
 
 CHUNK_BYTES = 2**20
 
-REMEMBERED_FILES = 2**17
+MAX_CACHED_FILES = 2**17
 
 _CHECKSUM = re.compile(rf"-([0-9a-f]{{{CHECKSUM_DIGITS}}})\.parquet$")
 
@@ -40,28 +40,28 @@ _FAST = re.compile(rf"-x([0-9a-f]{{{FAST_DIGITS}}})-[0-9a-f]{{{CHECKSUM_DIGITS}}
 
 
 def checksum_of(content: "pa.Buffer | bytes") -> str:
-    """Return the checksum of a file's bytes as it stands at the end of the file's name."""
+    """Return the checksum of a content for the end of the file's name."""
     return hashlib.sha256(content).hexdigest()[:CHECKSUM_DIGITS]
 
 
 def fast_checksum_of(content: "pa.Buffer | bytes") -> str:
-    """Return the fast checksum of a file's bytes as it stands in the file's name."""
+    """Return the fast checksum of a content for the file's name."""
     return xxhash.xxh3_64_hexdigest(memoryview(content))
 
 
 def checksum_in(path: str) -> str | None:
-    """Return the checksum in a data file's name; None in other names."""
+    """Return the checksum in a data file's name; None for other names."""
     match = _CHECKSUM.search(path)
     return match[1] if match else None
 
 
 def require_content(path: str, content: "pa.Buffer | bytes", where: object) -> None:
-    """Raise `StorageError` if bytes are not those that the name of their file tells."""
+    """Raise `StorageError` if a content does not match the checksum in the name."""
     _require(path, (content,), where)
 
 
 def check_local_files(paths: Iterable[str]) -> None:
-    """Raise `StorageError` for a data file that is not what its name says; each is read once."""
+    """Raise `StorageError` for a data file that does not match its name. Reads each once."""
     named = [path for path in paths if _FAST.search(path)]
     if len(named) == 1:
         _check_local(named[0])
@@ -71,7 +71,7 @@ def check_local_files(paths: Iterable[str]) -> None:
 
 
 def missing_file_error(path: str) -> StorageError:
-    """Return the error of a data file that was there when its table was opened."""
+    """Return the error of a data file that disappeared after its table was opened."""
     return StorageError(
         f"{path} is gone. If forget --now or compact deleted it meanwhile, run the same command "
         "again; otherwise restore it from a backup."
@@ -89,7 +89,7 @@ def _check_local(path: str) -> None:
     _check_once(path, status.st_size, status.st_mtime_ns, status.st_ino)
 
 
-@functools.lru_cache(maxsize=REMEMBERED_FILES)
+@functools.lru_cache(maxsize=MAX_CACHED_FILES)
 def _check_once(path: str, _size: int, _modified_ns: int, _inode: int) -> None:
     with storage_errors(path), Path(path).open("rb", buffering=0) as file:
         buffer = memoryview(bytearray(CHUNK_BYTES))
@@ -98,7 +98,7 @@ def _check_once(path: str, _size: int, _modified_ns: int, _inode: int) -> None:
 
 def _require(path: str, chunks: "Iterable[Any]", where: object) -> None:
     hashed, named = xxhash.xxh3_64(), _FAST.search(path)
-    if named is None:  # a file of a person's own
+    if named is None:  # not a data file
         return
     for chunk in chunks:
         hashed.update(chunk)

@@ -1,4 +1,4 @@
-"""The commits of a table's Delta log, each with a checksum of what it does to the table.
+"""The commits of a table's Delta log, each with a checksum of its actions.
 
 Each note states the SHA-256 of itself and of the actions beside it, however their JSON is written.
 It lands with the commit, in any order; `verify` compares.
@@ -26,7 +26,7 @@ NOTE = "fleet_slip"
 CHECKSUM_KEY = "sha256"
 
 Action = Mapping[str, Any]
-"""One action as the log has it: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
+"""One action of the log: `{"add": {...}}`, `{"remove": {...}}`, `{"txn": {...}}`."""
 
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
 _COMMIT = re.compile(r"\d{20}\.json")
@@ -46,7 +46,7 @@ def checked_note(
 
 
 def checksum_of_actions(note: Mapping[str, Any], actions: Sequence[Action]) -> str:
-    """Return the checksum of a note and of actions as the log has them, in any order."""
+    """Return the checksum of a note and of actions of the log, in any order."""
     unchecked = {key: value for key, value in note.items() if key != CHECKSUM_KEY}
     texts = [canonical_json({k: _stated(k, v) for k, v in action.items()}) for action in actions]
     text = "\n".join([canonical_json(unchecked), *sorted(texts)])
@@ -57,7 +57,7 @@ _FIELDS = {
     "add": ("path", "partition_values", "size", "modification_time", "data_change", "stats"),
     "remove": ("path", "partition_values", "size", "deletion_timestamp", "data_change"),
 }
-"""Of each kind of action what the log has of it, there in camel case."""
+"""Fields in the log of each kind of action, there in camel case."""
 
 
 def _as_logged(action: "AddAction | RemoveAction") -> Action:
@@ -73,7 +73,7 @@ def _as_logged(action: "AddAction | RemoveAction") -> Action:
 
 
 def _stated(kind: str, content: Any) -> Any:
-    """Return what an action states, without what the Delta library adds to it."""
+    """Return an action without the fields that the Delta library adds."""
     if not isinstance(content, Mapping):
         return content
     added = {"extendedFileMetadata"} if kind == "remove" else set()
@@ -89,22 +89,22 @@ class Commit:
 
     @property
     def info(self) -> Mapping[str, Any]:
-        """What the Delta library says of it."""
+        """The commit info of the Delta library."""
         return next((action["commitInfo"] for action in self.actions if "commitInfo" in action), {})
 
     @property
     def note(self) -> Mapping[str, Any]:
-        """What this program says of it."""
+        """The note of this program."""
         return _object(self.info.get(NOTE, "{}"))
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """What the Delta library was asked to do."""
+        """The operation parameters of the Delta library."""
         parameters = self.info.get("operationParameters")
         return parameters if isinstance(parameters, Mapping) else {}
 
     def problem(self) -> str | None:
-        """Return what is wrong with it, or None."""
+        """Return the problem of the commit; None without one."""
         # Overwriting, Delta removes files by itself.
         unchecked = {"remove"} if self.parameters.get("mode") == "Overwrite" else set()
         checked = [a for a in self.actions if (_CHECKED_KINDS - unchecked) & a.keys()]
@@ -128,7 +128,7 @@ def _has_checksum(note: Mapping[str, Any], actions: Sequence[Action], stated: An
 
 
 def _object(text: Any) -> Mapping[str, Any]:
-    """Return a JSON object from its text; an empty one if it is none."""
+    """Parse a JSON object; return an empty one for any other text."""
     try:
         value = json.loads(text)
     except (TypeError, ValueError, RecursionError):
@@ -205,9 +205,9 @@ def find_commit_faults(snapshot: "Snapshot") -> Iterator[tuple[str, str]]:
 
 
 def read_transactions(table: Folder, version: int) -> dict[str, int]:
-    """Return the numbers of all transactions that have landed in a version. Raises `StorageError`.
+    """Return the versions of all transactions committed up to a table version.
 
-    Delta answers for one transaction at a time, and reads its log for each.
+    The Delta library reads the log for each transaction. Raises `StorageError`.
     """
     return dict(_logged(table, version, "txn", "appId", "version"))
 

@@ -1,4 +1,4 @@
-"""Rows as the bytes of a Parquet file, and its checksum."""
+"""Encoding of rows as Parquet files, with checksums and statistics."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 DAY = "day"
-"""The one column of which the Delta log tells the least and the largest value."""
+"""The column whose minimum and maximum are in the Delta log."""
 
 ROW_GROUP_ROWS = 2**17
 WRITE_BATCH_ROWS = 2**14
-"""Rows that the encoder takes at once: 16 times its default is a sixth faster."""
+"""Rows per call of the encoder: 16 times its default is a sixth faster."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class Encoded:
     statistics: str
 
     def path(self, name: str, day: date | None) -> str:
-        """Return where a table has this content: in the folder of a day, if it has one."""
+        """Return the path below the table: in the folder of the day, if given."""
         folder = f"day={day.isoformat()}/" if day else ""
         return f"{folder}{name}-x{self.fast_checksum}-{self.checksum}.parquet"
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How the columns of a table become Parquet."""
+    """Parquet encoding of the columns of a table."""
 
     dictionary: tuple[str, ...] = ()
     delta_packed: tuple[str, ...] = ()
@@ -53,16 +53,15 @@ class Encoding:
         }
 
     def encode(self, rows: pa.Table, omitted: Sequence[str] = ()) -> Encoded:
-        """Return a file of these rows, with dictionaries of what occurs."""
+        """Encode rows, without the `omitted` columns."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
         stored_rows = rows.drop_columns([name for name in omitted if name in rows.schema.names])
-        # A dictionary that is shared with rows of another file, or of a drive that was forgotten,
-        # would bring their names along: Parquet stores one as it is given.
+        # Parquet stores a dictionary unchanged: one shared with another file, or with rows of an
+        # erased drive, would write their names too.
         columns = [_only_used_values(column) for column in stored_rows.columns]
-        # Declared so, a column without a null has no list of which values are null, which takes an
-        # eighth of the time to write.
+        # Columns declared without nulls have no validity levels, an eighth of the writing time.
         fields = [f.with_nullable(stored_rows[f.name].null_count > 0) for f in stored_rows.schema]
         stored = pa.Table.from_arrays(columns, schema=pa.schema(fields))
         sink = pa.BufferOutputStream()
@@ -89,7 +88,7 @@ def _statistics(rows: pa.Table, stored: Sequence[str]) -> dict[str, Any]:
 
 
 def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return a column whose dictionary has only values that occur, in the order they occur in."""
+    """Return a column whose dictionary contains only used values, in order of appearance."""
     import pyarrow as pa
 
     if not pa.types.is_dictionary(column.type):
@@ -104,7 +103,7 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
 
 
 def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, frozenset[str]]:
-    """Return the names that rows of a Parquet file have, by column with a dictionary."""
+    """Return the used names in a Parquet file, by column with a dictionary."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,7 +1,7 @@
-"""A folder of files below a data root: the few operations that the rest of the program needs.
+"""The protocol of folders below a data root.
 
-Files are written whole, once: no locks, no directories. `fleet_slip.storage.local` is one of a file
-system, `fleet_slip.storage.objects` one of an object store.
+Files are written whole: no directories, no partial writes. `fleet_slip.storage.local` implements it
+for file systems, `fleet_slip.storage.objects` for object stores.
 """
 
 import tempfile
@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TEMPORARY_PREFIX = ".tmp-"
-"""Beginning of the name of a file that is not whole yet."""
+"""Prefix of an unfinished file."""
 
 SPILL_PREFIX = ".spill-"
-"""Beginning of the name of a folder for the rows of a query that exceed its memory."""
+"""Prefix of a folder for the rows of a query that exceed its memory."""
 
 Content: TypeAlias = "bytes | pa.Buffer"
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file as a listing of `folder` found it; another in its place has another `identity`."""
+    """A listed file of `folder`. A file that replaces it has another `identity`."""
 
     folder: "Folder"
     path: str
@@ -50,10 +50,9 @@ class StoredFile:
 
 
 class Folder(Protocol):
-    """A folder below a data root; it need not exist. As text it is its path.
+    """A folder below a data root; it need not exist. `str` returns its path.
 
-    It is a value, and touches nothing by itself. All methods raise `StorageError`. `path` is a
-    file's below the folder, with slashes.
+    All methods raise `StorageError`. `path` is relative to the folder, with slashes.
     """
 
     @property
@@ -63,7 +62,7 @@ class Folder(Protocol):
 
     @property
     def uri(self) -> str:
-        """The folder as DuckDB and the Delta library know it."""
+        """Location of the folder for DuckDB and the Delta library."""
         return str(self)
 
     @property
@@ -73,17 +72,17 @@ class Folder(Protocol):
 
     @property
     def spill(self) -> Path:
-        """A folder of this machine for what a query cannot hold in memory."""
+        """A local folder for rows of queries that exceed the memory."""
         return Path(tempfile.gettempdir())
 
     is_local: bool = False
-    """Whether its files are in a file system of this machine: read twice, they are the same."""
+    """True for a file system of this machine."""
 
     def __truediv__(self, name: str) -> Self:
         """Return a folder below this one."""
 
     def exists(self) -> bool:
-        """Whether there is such a folder."""
+        """Return True if the folder exists."""
 
     def names(self) -> list[str]:
         """Return the names of files and folders directly below, sorted."""
@@ -92,49 +91,49 @@ class Folder(Protocol):
         """Return all files below, at any depth, sorted by path."""
 
     def stamp(self, path: str) -> object:
-        """Return what another file in its place differs in; None without one, and of a store."""
-        return None  # where to look costs what opening costs
+        """Return a value that changes when the file is replaced; None without a file or support."""
+        return None
 
     def read(self, path: str) -> bytes:
         """Return the content of a file."""
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
-        """Return the content of files; None for one that is gone, nothing of a link."""
+        """Return the contents of files: None for a missing file, empty for a link."""
 
     def check(self, path: str) -> None:
-        """Raise `StorageError` for a changed data file, if `open` would not."""
+        """Raise `StorageError` for a damaged data file, unless `open` does."""
         return
 
     def open(self, path: str) -> "pa.NativeFile":
         """Open a file for reading anywhere in it."""
 
     def put(self, path: str, content: Content) -> None:
-        """Write a file as a whole, durably. A file of that name is replaced."""
+        """Write a file atomically and durably; replace an existing one."""
 
     def create(self, path: str, content: Content) -> bool:
-        """Write a file as a whole, durably; False, and no change, if there is one of that name."""
+        """Write a new file atomically and durably; return False if it exists."""
 
     def append(self, path: str, content: bytes) -> None:
-        """Add to a history in one write, durably. Its parts are files whose names begin so."""
+        """Append durably in one write; an object store writes an object with this prefix instead."""
 
     def remove(self, file: StoredFile) -> bool:
-        """Delete the very file that a listing found; False if it is gone or was replaced."""
+        """Delete exactly the listed file; return False if it is gone or was replaced."""
 
     def delete(self, path: str) -> None:
-        """Delete a file of a name that no other process writes; nothing if it is gone."""
+        """Delete a file that no other process writes; do nothing if it is gone."""
 
     def settle_commits(self, before: int | None) -> None:
         """Make the commits after a version durable, if the folder is a Delta table."""
         return
 
     def free_bytes(self) -> tuple[int, int] | None:
-        """Return how much is free and how much there is in all; None where that has no meaning."""
+        """Return free and total bytes; None for an object store."""
         return None
 
     def exclusive(self, name: str, waiting: Callable[[], None]) -> AbstractContextManager[None]:
-        """Hold a lock among the processes of this machine, where a killed one releases it."""
+        """Hold a lock among the processes of this machine; a killed process releases it."""
         return nullcontext()
 
-    def let_read(self, database: "duckdb.DuckDBPyConnection") -> None:
-        """Enable a connection to read files below this folder."""
+    def enable_reading(self, database: "duckdb.DuckDBPyConnection") -> None:
+        """Prepare a DuckDB connection for files below this folder."""
         return

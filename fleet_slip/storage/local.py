@@ -1,6 +1,6 @@
-"""Folders of a file system, where no reader sees half a file and files survive a power cut.
+"""Folders of a file system: atomic, durable writes.
 
-Files are flushed under a temporary name, then renamed; numbers are taken by hard links.
+Files are flushed under a temporary name, then renamed. Hard links create files exclusively.
 """
 
 import contextlib
@@ -52,9 +52,9 @@ class LocalFolder(Folder):
 
     def files(self) -> list[StoredFile]:
         with storage_errors(self):
-            walked = os.walk(self.path, onerror=_pass_over)
+            walked = os.walk(self.path, onerror=_ignore_unreadable)
             paths = sorted(Path(folder) / name for folder, _, names in walked for name in names)
-            return [file for file in map(self._judge, filter(Path.is_file, paths)) if file]
+            return [file for file in map(self._stored_file, filter(Path.is_file, paths)) if file]
 
     def stamp(self, path: str) -> object:
         try:
@@ -80,7 +80,7 @@ class LocalFolder(Folder):
         import pyarrow as pa
 
         with storage_errors(self.path / path):
-            if not (self.path / path).is_file():  # a pipe would be waited for
+            if not (self.path / path).is_file():  # opening a pipe would wait
                 raise FileNotFoundError(errno.ENOENT, "there is no such file")
             return pa.OSFile(str(self.path / path), "rb")
 
@@ -107,12 +107,12 @@ class LocalFolder(Folder):
             os.fsync(descriptor)
 
     def remove(self, file: StoredFile) -> bool:
-        """Delete the very file that a listing found; False if it is gone or was replaced.
+        """Delete exactly the listed file; return False if it is gone or was replaced.
 
-        It is compared before and after it is moved aside, and put back if a repair replaced it.
+        Compares it before and after moving it aside; puts it back if a repair replaced it.
         """
         path = self.path / file.path
-        if self._judge(path) != file:
+        if self._stored_file(path) != file:
             return False
         aside = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
         with storage_errors(path):
@@ -120,7 +120,7 @@ class LocalFolder(Folder):
                 path.rename(aside)
             except FileNotFoundError:
                 return False
-            moved = self._judge(aside)
+            moved = self._stored_file(aside)
             same = moved is not None and replace(moved, path=file.path) == file
             if not same:
                 with contextlib.suppress(FileExistsError):
@@ -149,7 +149,7 @@ class LocalFolder(Folder):
     def exclusive(self, name: str, waiting: Callable[[], None]) -> Iterator[None]:
         """Hold a lock among the processes of this machine; a killed process releases it.
 
-        Calls `waiting` once if another has it. A read-only file system needs none.
+        Calls `waiting` once if another process holds it. A read-only file system needs no lock.
         """
         lock = self.path / name
         with contextlib.ExitStack() as stack:
@@ -175,7 +175,7 @@ class LocalFolder(Folder):
             return b""
         return self.read(path) if file.is_file() else None
 
-    def _judge(self, path: Path) -> StoredFile | None:
+    def _stored_file(self, path: Path) -> StoredFile | None:
         try:
             status = path.stat(follow_symlinks=False)
         except FileNotFoundError:
@@ -191,7 +191,7 @@ class LocalFolder(Folder):
 
 @contextlib.contextmanager
 def _opened(file: Path, flags: int) -> Iterator[int]:
-    """Open a file, but no link, which may lead to another's, nor a pipe; yield its descriptor."""
+    """Open a regular file, no link or pipe; yield its descriptor."""
     safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
     try:
         descriptor = os.open(file, flags | safe, 0o666)
@@ -209,7 +209,7 @@ def _opened(file: Path, flags: int) -> Iterator[int]:
 
 @contextlib.contextmanager
 def _regular_file(file: Path, flags: int) -> Iterator[int]:
-    """Do the same; what fails is a `StorageError`."""
+    """Open a regular file. Raises `StorageError`."""
     with storage_errors(file), _opened(file, flags) as descriptor:
         yield descriptor
 
@@ -223,7 +223,7 @@ def _no_file(path: Path) -> StorageError:
 
 @contextlib.contextmanager
 def _written_aside(target: Path, content: Content) -> Iterator[Path]:
-    """Write a temporary sibling of a file, and make durable what is done with it."""
+    """Write a temporary sibling of a file; make durable what the caller does with it."""
     temporary = target.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
     with storage_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -238,8 +238,8 @@ def _written_aside(target: Path, content: Content) -> Iterator[Path]:
         _flush(target.parent)
 
 
-def _pass_over(error: OSError) -> None:
-    """Go on where a folder is gone, or not ours to see, or none; raise any other error."""
+def _ignore_unreadable(error: OSError) -> None:
+    """Ignore folders that are missing or unreadable; raise any other error."""
     if not isinstance(error, FileNotFoundError | NotADirectoryError | PermissionError):
         raise error
 

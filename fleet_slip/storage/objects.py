@@ -240,7 +240,7 @@ class ObjectFolder(Folder):
         with object_errors(f"{self}/{path}"), contextlib.suppress(FileNotFoundError):
             obstore.delete(self._store, self._key(path))
 
-    def let_read(self, database: duckdb.DuckDBPyConnection) -> None:
+    def enable_reading(self, database: duckdb.DuckDBPyConnection) -> None:
         database.register_filesystem(ObjectFilesystem(self.bucket, lambda: self._store))
 
     @property

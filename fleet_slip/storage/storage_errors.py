@@ -1,4 +1,4 @@
-"""What went wrong with a file or an object, in words and as the errors of this package."""
+"""Translation of failures of files, object stores, Delta and Parquet to `StorageError`."""
 
 import contextlib
 import errno
@@ -67,24 +67,24 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def known_meaning(error: BaseException) -> str | None:
-    """Return what a failure of an object store means, in one line; None if it is not known."""
+    """Return the meaning of a failure of an object store; None if unknown."""
     text = str(error)
     return next((meaning for pattern, meaning in _MEANINGS if re.search(pattern, text)), None)
 
 
 def meaning_of(error: BaseException) -> str:
-    """Return what a failure of an object store means, in one line."""
+    """Return the meaning of a failure of an object store, in one line."""
     unknown = f"the store cannot be used ({type(error).__name__}). Run the same command again."
     return known_meaning(error) or unknown
 
 
 class NoSuchObjectError(StorageError):
-    """An object is not there, or is gone."""
+    """An object does not exist."""
 
 
 @contextlib.contextmanager
 def object_errors(where: str) -> Iterator[None]:
-    """Turn the failures of an object store into `StorageError`."""
+    """Translate the failures of an object store to `StorageError`."""
     from obstore.exceptions import BaseError
 
     try:
@@ -97,7 +97,7 @@ def object_errors(where: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def storage_errors(path: object) -> Iterator[None]:
-    """Turn failures of files, object stores and Delta into `StorageError`; `path` says where."""
+    """Translate failures of files, object stores, Delta and Parquet; `path` begins the message."""
     try:
         yield
     except OSError as error:
@@ -139,7 +139,7 @@ def _reason(error: OSError) -> str:
         errno.EIO: "the disk cannot be read or written (I/O error). Have it examined, then restore "
         "what is damaged from a backup: fleet-slip verify",
     }
-    # The Delta library tells the number in its text only.
+    # The Delta library has the number in its message only.
     stated = re.search(r"\(os error (\d+)\)", str(error))
     number = error.errno or (int(stated[1]) if stated else 0)
     return advice.get(number, _on_one_line(error))

@@ -1,4 +1,4 @@
-"""A Delta table of a data root: its files, and what it takes to open and make it."""
+"""Delta tables of a data root: snapshots, atomic commits, data files."""
 
 from __future__ import annotations
 
@@ -38,16 +38,15 @@ if TYPE_CHECKING:
     from deltalake.transaction import AddAction, RemoveAction
 
 _DATA_FILE = re.compile(r"[\w.=-][\w.=/-]*-x[0-9a-f]{16}-[0-9a-f]{32}\.parquet", re.ASCII)
-"""Path of a data file below its table: relative, without characters that could be a pattern, and
-with its checksums."""
+"""Path of a data file below its table: relative, without pattern characters, with checksums."""
 
 _NULLS = "null_count."
-"""Before a column's name: how many nulls a file has in it. Null, if it has no such column."""
+"""Prefix of a column's null count in the log; null if the file lacks the column."""
 
 
 @dataclass(frozen=True)
 class TableFile:
-    """An active file of a table, as the Delta log has it, and the first and last of its days."""
+    """An active file of a table, from the Delta log; `days` are its first and last day."""
 
     path: str
     rows: int
@@ -58,7 +57,7 @@ class TableFile:
 
 
 def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns that none of the files has: they came to the table later."""
+    """Return the columns that no file has, as they were added to the table later."""
     absent = dict.fromkeys(names)
     for file in files:
         if not absent:
@@ -69,7 +68,7 @@ def absent_columns(files: Iterable[TableFile], names: Iterable[str]) -> tuple[st
 
 
 class _NullCounts(Mapping[str, int]):
-    """Null counts of a file, looked up when asked for: of 100,000 files few jobs need many."""
+    """Null counts of a file, read on access: few jobs need those of 100,000 files."""
 
     def __init__(self, columns: Mapping[str, pa.ChunkedArray], row: int) -> None:
         self._columns = columns
@@ -88,7 +87,7 @@ class _NullCounts(Mapping[str, int]):
         return sum(1 for _ in self)
 
     def __reduce__(self) -> tuple[type[dict[str, int]], tuple[dict[str, int]]]:
-        """Send another process what is of this file only."""
+        """Pickle the counts of this file only."""
         return dict, (dict(self),)
 
 
@@ -132,7 +131,10 @@ class AppTransaction:
 
 @dataclass(frozen=True)
 class Change:
-    """What a commit does; files added and removed stay. `data_change` is false if rows move."""
+    """Content of a commit. A file that is added and removed stays.
+
+    `data_change` is False if rows only move between files.
+    """
 
     add: Sequence[AddAction] = ()
     remove: Sequence[TableFile] = ()
@@ -141,7 +143,7 @@ class Change:
     data_change: bool = True
 
     def actions(self) -> list[AddAction | RemoveAction]:
-        """Return what the commit says to the Delta log, as of now."""
+        """Return the actions for the Delta log, with the current time."""
         from deltalake.transaction import RemoveAction
 
         both = {action.path for action in self.add} & {file.path for file in self.remove}
@@ -181,30 +183,31 @@ def _now_ms() -> int:
 ATTEMPTS = 12
 FIRST_WAIT_S = 0.02
 LONGEST_WAIT_S = 5.0
-LOOKS = 8
-"""So often tables are looked at again that do not rest."""
+MAX_STALE_READS = 8
+"""Attempts to read tables that keep changing."""
 
 _CONFLICT = re.compile(
     r"concurrent|changed since last commit|existing table version|already exists|"
     r"exceeded maximum commit attempts|^Failed to commit transaction: \d+$",
     re.IGNORECASE,
 )
-"""What the Delta library says when another commit was faster; anything else is a fault."""
+"""Messages of the Delta library about a concurrent commit; others are faults."""
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
-def on_newest(
+def retry_if_stale(
     tables: Sequence[Table],
     look: Callable[[], Result],
     is_damage: Callable[[Result], bool] = lambda _: False,
 ) -> Result:
-    """Look at tables, and again if what is found may be of files that a newer version removed.
+    """Return the result of `look`; repeat it if the tables changed and it reports damage.
 
-    Damage, or a `StorageError`, is reported only if the tables rested meanwhile, or never rest.
+    The files may have been removed by a newer version. Damage or a `StorageError` counts only if
+    the tables did not change meanwhile, or after `MAX_STALE_READS` attempts.
     """
-    for _ in range(LOOKS):
+    for _ in range(MAX_STALE_READS):
         before = _versions(tables)
         try:
             result = look()
@@ -228,7 +231,7 @@ def _versions(tables: Sequence[Table]) -> list[int | None]:
 
 
 def retry_conflicts(attempt: Callable[[], Result]) -> Result:
-    """Call until it raises no `ConflictError`, waiting ever longer, at random, between."""
+    """Call until it raises no `ConflictError`, with random, growing waits."""
     for number in range(ATTEMPTS - 1):
         try:
             return attempt()
@@ -239,7 +242,7 @@ def retry_conflicts(attempt: Callable[[], Result]) -> Result:
 
 
 def retrying(commit: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a function that commits to a table, to be called as `retry_conflicts` does."""
+    """Decorate a committing function: repeat it after conflicts, as `retry_conflicts` does."""
 
     @functools.wraps(commit)
     def retried(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:
@@ -248,19 +251,22 @@ def retrying(commit: Callable[Parameters, Result]) -> Callable[Parameters, Resul
     return retried
 
 
-# A count means nothing without its scale, so the schema in the Delta log records each.
+# The schema in the Delta log records the scale of each column of counts.
 
 SCALE = "scale"
-"""Key of a field's metadata: the physical value of one count, as in the catalog."""
+"""Key of a field's metadata: the physical value of one count."""
 
 
 @dataclass(frozen=True)
 class Evolution:
-    """How a stored table and the catalog differ.
+    """Difference between the schemas of a stored table and the catalog.
 
-    Attributes:
-        added, retired: columns of the catalog alone, and of the table alone.
-        rescaled: old and new scale of the signals whose counts mean something else.
+    Attributes
+    ----------
+    added, retired
+        Columns of the catalog alone, and of the table alone.
+    rescaled
+        Old and new scale, by column.
     """
 
     added: tuple[str, ...]
@@ -269,7 +275,7 @@ class Evolution:
 
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
-    """Compare the schema of the catalog with that of a stored table."""
+    """Compare the catalog's schema with the stored table's."""
     from deltalake.exceptions import DeltaError
 
     try:
@@ -299,7 +305,7 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
 
 
 MANY_TRANSACTIONS = 8
-"""From so many names on, all transactions are read at once."""
+"""Number of names from which all transactions are read at once."""
 
 WITHDRAWN = -1
 """Version of a transaction whose rows were removed: it may be committed again."""
@@ -307,12 +313,12 @@ WITHDRAWN = -1
 
 @dataclass(frozen=True)
 class Snapshot:
-    """One version of a table. Reading it is not disturbed by later commits."""
+    """One version of a table. Later commits do not affect it."""
 
     table: Table
     delta: DeltaTable | None
     without: frozenset[str] = frozenset()
-    """Paths of files that are left out."""
+    """Paths of files to ignore."""
 
     @property
     def version(self) -> int | None:
@@ -330,7 +336,7 @@ class Snapshot:
 
     @property
     def has_same_columns(self) -> bool:
-        """Whether all active files have the same ones of the table's columns."""
+        """True if all active files have the same columns."""
         with storage_errors(self.table.folder):
             names = {f"{_NULLS}{name}" for name in self.table.schema.names}
             counts = [self._actions[name] for name in names & {*self._actions.column_names}]
@@ -338,7 +344,7 @@ class Snapshot:
 
     @cached_property
     def _actions(self) -> pa.Table:
-        """What the log says of each active file, a row a file."""
+        """The add actions of the log, one row per active file."""
         import pyarrow as pa
 
         if self.delta is None:
@@ -349,7 +355,7 @@ class Snapshot:
 
     @property
     def paths(self) -> list[str]:
-        """Where the active files are, as DuckDB knows it, sorted."""
+        """Paths of the active files for DuckDB, sorted."""
         return [self.table.uri(file.path) for file in self.files]
 
     @property
@@ -362,8 +368,8 @@ class Snapshot:
         """Size of all active files."""
         return sum(file.size_bytes for file in self.files)
 
-    def renewed(self) -> Snapshot:
-        """Return the newest version: this snapshot, or another, which takes its place."""
+    def refresh(self) -> Snapshot:
+        """Return the newest version: this snapshot if nobody committed."""
         version = self.version
         if self.delta is not None and not self.table.folder.is_local:
             with storage_errors(self.table.folder):
@@ -374,40 +380,40 @@ class Snapshot:
 
     @cached_property
     def removals(self) -> Mapping[str, int]:
-        """Removed files of a week at least, with the time of removal in ms since 1970."""
+        """Files removed in at least the last week, with the removal time in ms since 1970."""
         if self.version is None:
             return {}
         with storage_errors(self.table.folder):
             return read_removals(self.table.folder, self.version)
 
     def removed_before(self, hours: float) -> set[str]:
-        """Return the files that were removed so many hours ago or earlier, by this clock."""
+        """Return the files that were removed at least `hours` ago, by this clock."""
         newest = _now_ms() - hours * 3.6e6
         return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
 
-    def landed(self, transaction_name: str) -> int | None:
-        """Return the version of a transaction that has landed, or None."""
+    def transaction_version(self, transaction_name: str) -> int | None:
+        """Return the version of a committed transaction; None without one."""
         if self.delta is None:
             return None
         with storage_errors(self.table.folder):
             return self.delta.transaction_version(transaction_name)
 
-    def landed_among(self, number: int) -> Callable[[str], bool]:
+    def transaction_lookup(self, number: int) -> Callable[[str], bool]:
         """Return a lookup `name -> committed?`. Reads the log once if `number` is large."""
         if self.version is None or number < MANY_TRANSACTIONS:
-            return lambda name: self.landed(name) not in {None, WITHDRAWN}
+            return lambda name: self.transaction_version(name) not in {None, WITHDRAWN}
         return lambda name: self.transactions.get(name, WITHDRAWN) != WITHDRAWN
 
     @cached_property
     def transactions(self) -> Mapping[str, int]:
-        """The numbers of all transactions that have landed, `WITHDRAWN` ones among them."""
+        """Versions of all committed transactions by name, including `WITHDRAWN` ones."""
         if self.version is None:
             return {}
         with storage_errors(self.table.folder):
             return read_transactions(self.table.folder, self.version)
 
     def commit_or_discard(self, change: Change) -> None:
-        """Apply a change like `commit`; after a conflict delete the files that it was to add."""
+        """Apply a change like `commit`; after a conflict delete the files that it adds."""
         try:
             self.commit(change)
         except ConflictError:
@@ -437,10 +443,10 @@ class Snapshot:
 
 
 FENCE = "fleet_slip.fence"
-"""Property of a table that is changed so that commits under way are in conflict."""
+"""Table property whose change makes pending commits conflict."""
 
 ALL_STATISTICS = {"delta.dataSkippingNumIndexedCols": "-1"}
-"""Property of a table of which all columns have statistics: as a rule Delta reads those of 32."""
+"""Table property: statistics of all columns. By default Delta reads those of 32."""
 
 
 @dataclass(frozen=True)
@@ -453,7 +459,7 @@ class Table:
     partition_by: tuple[str, ...] = ()
     description: str = ""
     optional: tuple[str, ...] = ()
-    """Columns that a file has only where it has values of them."""
+    """Columns that a file has only if they have values."""
 
     @property
     def usual_schema(self) -> pa.Schema:
@@ -463,22 +469,22 @@ class Table:
         return pa.schema([field for field in self.schema if field.name not in self.optional])
 
     def snapshot(self, version: int | None = None, *, anew: bool = False) -> Snapshot:
-        """Return the table as it is, or at a version; empty if unwritten. Raises `StorageError`.
+        """Return the newest version, or a given one; empty if unwritten. Raises `StorageError`.
 
-        What this process opened before is the result as long as nobody commits, unless `anew`: then
-        the whole log is read, and what was damaged meanwhile is seen.
+        Returns a cached snapshot while nobody commits. `anew` reads the whole log instead, which
+        detects later damage.
         """
         if version is not None:
             return Snapshot(self, self.open_delta(version))
-        if not anew and (opened := _still_newest(self)):
+        if not anew and (opened := _cached_if_newest(self)):
             return opened
         delta = self.open_delta()
         if delta is not None:
             self.require_readable(delta)
-        return _remembered(Snapshot(self, delta))
+        return _cache_snapshot(Snapshot(self, delta))
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
-        """Return the Delta table as it is now, or was; None if nobody has written it yet."""
+        """Return the newest Delta table, or a version; None if unwritten."""
         from deltalake import DeltaTable
         from deltalake.exceptions import TableNotFoundError
 
@@ -491,11 +497,11 @@ class Table:
                 return None
 
     def uri(self, path: str) -> str:
-        """Return where one of the table's files is, as DuckDB knows it."""
+        """Return the path of a file for DuckDB."""
         return f"{self.folder.uri}/{path}"
 
     def read(self, path: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return the rows of a file, or some columns. Raises `StorageError` if it is damaged."""
+        """Return the rows of a file, or some columns. Raises `StorageError` for a damaged file."""
         import pyarrow.parquet as pq
 
         self.folder.check(path)
@@ -509,9 +515,9 @@ class Table:
         return rows
 
     def read_combinations(self, path: str, columns: Sequence[str]) -> pa.Table:
-        """Return each combination of the texts of some columns in a file, once, from dictionaries.
+        """Return the distinct combinations of text columns in a file, from their dictionaries.
 
-        That takes a third of the time of reading the columns. Raises `StorageError` as `read`.
+        Takes a third of the time of reading the columns. Raises `StorageError` as `read`.
         """
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -542,14 +548,14 @@ class Table:
             return read_names(file, self.encoding.dictionary)
 
     def write_file(self, name: str, rows: pa.Table, day: date | None = None) -> AddAction:
-        """Write rows to the file NAME-CHECKSUMS.parquet, durably; see `put`."""
+        """Write rows durably to the file NAME-CHECKSUMS.parquet; see `put`."""
         return self.put(name, self.encode(rows), day)
 
     def put(self, name: str, encoded: Encoded, day: date | None = None) -> AddAction:
-        """Write a content to the file NAME-CHECKSUMS.parquet, durably; return its add action.
+        """Write a content durably to the file NAME-CHECKSUMS.parquet; return its add action.
 
-        It is in the table once committed. Where that name is taken, the new file gets a longer one:
-        what is not committed is its writer's alone, to delete.
+        The file is part of the table after the commit. If the name exists, the new file gets a
+        longer one, so that its writer can delete it after a conflict.
         """
         from deltalake.transaction import AddAction
 
@@ -566,9 +572,9 @@ class Table:
         )
 
     def discard(self, actions: Iterable[AddAction]) -> None:
-        """Delete files that this process wrote and its conflict left uncommitted.
+        """Delete files that this process wrote and could not commit.
 
-        The log is asked first: a commit whose answer was lost conflicts with itself.
+        Reads the log first: a commit whose answer was lost conflicts with itself.
         """
         landed = {file.path for file in Snapshot(self, self.open_delta()).files}
         for action in actions:
@@ -580,35 +586,32 @@ class Table:
         return self.encoding.encode(rows, self.partition_by)
 
     def require_readable(self, delta: DeltaTable) -> Evolution:
-        """Return how the table and the catalog differ.
-
-        Raises `RefusedError` if the counts are in other scales.
-        """
+        """Return the differences to the catalog. Raises `RefusedError` for other scales."""
         evolution = compare_schemas(self.schema, delta)
         if evolution.rescaled:
             changes = ", ".join(
                 f"{n} {old} -> {new}" for n, (old, new) in evolution.rescaled.items()
             )
             raise RefusedError(
-                f"{self.folder}: the counts are in other scales than those of the signal catalog "
+                f"{self.folder}: the stored counts have other scales than the signal catalog "
                 f"({changes}). Use the catalog that the data was written with, or ingest the "
                 "logs into another data root."
             )
         return evolution
 
     def require_writable(self, columns: Iterable[str], delta: DeltaTable | None = None) -> None:
-        """Raise `RefusedError` if rows with some of the optional columns cannot be committed."""
+        """Raise `RefusedError` if the table lacks one of these columns."""
         delta = delta or self.open_delta()
         added = compare_schemas(self.schema, delta).added if delta else ()
         unneeded = frozenset(self.optional).difference(columns)
         if needed := [name for name in added if name not in unneeded]:
             raise RefusedError(
-                f"{self.folder}: the signal catalog has columns that the table has not: "
+                f"{self.folder}: the table lacks columns of the signal catalog: "
                 f"{', '.join(needed)}. Add them with: fleet-slip migrate"
             )
 
     def fence(self) -> None:
-        """Make a conflict of every commit that began before now and has not landed.
+        """Make every pending commit conflict.
 
         Delta refuses commits that began before a change of metadata, here of a property. Raises
         `ConflictError` if others keep changing the table.
@@ -629,7 +632,7 @@ class Table:
 
     @contextlib.contextmanager
     def committing(self) -> Iterator[None]:
-        """Turn a commit's failures into `ConflictError`, or `StorageError` for a fault."""
+        """Translate a commit's failures to `ConflictError` or `StorageError`."""
         from deltalake.exceptions import CommitFailedError
 
         with storage_errors(self.folder):
@@ -644,7 +647,7 @@ class Table:
                 ) from None
 
     def create(self) -> DeltaTable:
-        """Make the table, and return it as made, so that a commit on it meets those of others."""
+        """Create the table; return version 0, so that a commit on it conflicts with others'."""
         from deltalake import CommitProperties, DeltaTable
 
         delta = DeltaTable.create(
@@ -661,29 +664,29 @@ class Table:
         return (self.open_delta(version=0) if delta.version() else delta) or delta
 
 
-# The newest snapshots: to open a table costs milliseconds, to see that nobody committed a look.
+# A cache of the newest snapshots: opening a table takes milliseconds, a look for commits does not.
 
-REMEMBERED_TABLES = 16
+MAX_CACHED_SNAPSHOTS = 16
 
-_remembered_tables: dict[str, tuple[Snapshot, object]] = {}
-"""By table the snapshot opened last, and its stamp."""
+_snapshot_cache: dict[str, tuple[Snapshot, object]] = {}
+"""The last snapshot of each table, with its stamp."""
 
 
-def _remembered(snapshot: Snapshot) -> Snapshot:
-    """Return a snapshot, and remember it where the commit after it can be looked for at once."""
+def _cache_snapshot(snapshot: Snapshot) -> Snapshot:
+    """Cache a snapshot if the folder can detect later commits; return it."""
     stamp = _stamp(snapshot)
     if stamp is not None:
         uri = snapshot.table.folder.uri
-        _remembered_tables.pop(uri, None)
-        _remembered_tables[uri] = snapshot, stamp
-        for oldest in list(_remembered_tables)[:-REMEMBERED_TABLES]:
-            _remembered_tables.pop(oldest, None)
+        _snapshot_cache.pop(uri, None)
+        _snapshot_cache[uri] = snapshot, stamp
+        for oldest in list(_snapshot_cache)[:-MAX_CACHED_SNAPSHOTS]:
+            _snapshot_cache.pop(oldest, None)
     return snapshot
 
 
-def _still_newest(table: Table) -> Snapshot | None:
-    """Return the snapshot of a table that was opened last, if it is the newest one."""
-    snapshot, stamp = _remembered_tables.get(table.folder.uri, (None, None))
+def _cached_if_newest(table: Table) -> Snapshot | None:
+    """Return the cached snapshot of a table if nobody committed since; otherwise None."""
+    snapshot, stamp = _snapshot_cache.get(table.folder.uri, (None, None))
     if snapshot is None or snapshot.table != table or _stamp(snapshot) != stamp:
         return None
     same = snapshot.table.schema.equals(table.schema, check_metadata=True)  # the scales of counts
@@ -691,7 +694,7 @@ def _still_newest(table: Table) -> Snapshot | None:
 
 
 def _stamp(snapshot: Snapshot) -> object:
-    """Return what another log in its place differs in; None if there is a newer commit."""
+    """Return a value that identifies the log up to a snapshot; None after a newer commit."""
     log, version = snapshot.table.folder / LOG, snapshot.version
     if version is None or log.stamp(f"{version + 1:020}.json") is not None:
         return None

@@ -74,7 +74,7 @@ def open_database(
     with contextlib.suppress(duckdb.InvalidInputException):
         database.execute("SET enable_progress_bar = false")
     if reading:
-        reading.let_read(database)
+        reading.enable_reading(database)
         database.execute("CALL enable_logging('FileSystem')")  # see `reading_files`
     return database
 

@@ -69,10 +69,10 @@ def gram_snapshots(
     Earlier snapshots of them are the result if nobody has committed since. Raises `ConflictError`
     if the Gram rows change faster than they are looked at.
     """
-    grams = grams.renewed() if grams else warehouse.grams.snapshot()
+    grams = grams.refresh() if grams else warehouse.grams.snapshot()
     for _ in range(SNAPSHOTS):
-        logs = logs.renewed() if logs else warehouse.logs.snapshot()
-        again = grams.renewed()
+        logs = logs.refresh() if logs else warehouse.logs.snapshot()
+        again = grams.refresh()
         if again is grams or again.version == grams.version:
             return grams, logs
         grams = again

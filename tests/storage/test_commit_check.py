@@ -145,7 +145,7 @@ def damage(warehouse: Warehouse) -> set[str]:
 
 
 def test_a_checkpoint_is_written_again_from_the_commits(later: Warehouse) -> None:
-    assert later.logs.snapshot().landed("test/one") is None
+    assert later.logs.snapshot().transaction_version("test/one") is None
     (finding,) = verify(later).damage
     assert finding.path == LATEST
     assert finding.problem == "does not know what has landed: test/one"
@@ -153,7 +153,7 @@ def test_a_checkpoint_is_written_again_from_the_commits(later: Warehouse) -> Non
     assert not damage(later)
     for commit in commits(later):
         commit.unlink()  # as Delta does after 30 days
-    assert later.logs.snapshot().landed("test/one") is not None
+    assert later.logs.snapshot().transaction_version("test/one") is not None
 
 
 def test_a_checkpoint_that_cannot_be_read_is_written_again(later: Warehouse) -> None:

@@ -103,7 +103,7 @@ def test_units_land_once_where_answers_are_lost(root: Folder, server: Server) ->
 
         def attempt() -> None:
             snapshot = logs.snapshot()
-            if snapshot.landed(f"transaction-{number}") is None:
+            if snapshot.transaction_version(f"transaction-{number}") is None:
                 snapshot.commit(
                     Change(add=[action], transactions=[AppTransaction(f"transaction-{number}", 1)])
                 )

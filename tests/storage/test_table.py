@@ -47,7 +47,7 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
     (file,) = snapshot.files
     assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
     assert file.null_counts["ax"] == 0
-    assert (snapshot.landed("u"), snapshot.landed("other")) == (7, None)
+    assert (snapshot.transaction_version("u"), snapshot.landed("other")) == (7, None)
 
 
 def test_the_same_rows_make_the_same_bytes_by_which_their_file_is_named(
@@ -112,10 +112,12 @@ def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Ware
     commits[1].unlink()  # what the checkpoint sums up, Delta removes in time
     earlier, now = warehouse.logs.snapshot(3), warehouse.logs.snapshot()
     for snapshot, number in ((earlier, 9), (now, 12)):
-        landed = snapshot.landed_among(len(names))
-        assert [landed(n) for n in names] == [snapshot.landed(n) is not None for n in names]
+        landed = snapshot.transaction_lookup(len(names))
+        assert [landed(n) for n in names] == [
+            snapshot.transaction_version(n) is not None for n in names
+        ]
         assert sum(map(landed, names)) == number
-    assert not any(map(warehouse.quarantine.snapshot().landed_among(99), names))
+    assert not any(map(warehouse.quarantine.snapshot().transaction_lookup(99), names))
 
 
 def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
@@ -212,7 +214,7 @@ def test_what_the_delta_library_cannot_tell_of_a_unit_is_a_storage_error(
 
     monkeypatch.setattr(DeltaTable, "transaction_version", fail)
     with pytest.raises(StorageError, match="a commit is damaged"):
-        snapshot.landed("test/one")
+        snapshot.transaction_version("test/one")
 
 
 COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
@@ -233,12 +235,12 @@ def test_a_table_is_opened_again_after_a_commit_of_anybody(
     assert len(first.files) == 1
     opened.clear()
     again = Warehouse(warehouse.root).logs.snapshot()
-    assert (again is first, first.renewed() is first, opened) == (True, True, [])
+    assert (again is first, first.refresh() is first, opened) == (True, True, [])
     delta = DeltaTable(first.table.uri("")[:-1])  # as another process does
     delta.alter.set_table_properties({"by": "another"}, raise_if_not_exists=False)
     newer = warehouse.logs.snapshot()
     assert (newer.version, first.version) == (delta.version(), delta.version() - 1)
-    assert first.renewed() is newer
+    assert first.refresh() is newer
     land(warehouse, "two", log_rows("two", COUNTS))
     assert len(warehouse.logs.snapshot().files) == 2
     assert len(newer.files) == len(first.files) == 1

@@ -201,7 +201,7 @@ def write(root: Path, writer: int) -> None:
 
         def land(change: Change = change) -> None:
             snapshot = logs.snapshot()
-            if snapshot.landed(change.transactions[0].name) is None:
+            if snapshot.transaction_version(change.transactions[0].name) is None:
                 snapshot.commit(change)
 
         retry_conflicts(land)
