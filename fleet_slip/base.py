@@ -1,4 +1,4 @@
-"""What every module may use: results and their JSON, canonical JSON, days, extras, words."""
+"""Basics of all modules: JSON of results, canonical JSON, dates, extras, names."""
 
 import hashlib
 import json
@@ -13,21 +13,21 @@ from typing import Any, overload
 
 from fleet_slip.errors import ExtraError, UsageError
 
-# What results are as JSON documents: one encoder for all of them.
+# JSON documents of results.
 
 
 class Record:
-    """A dataclass of results, whose class says what is in its JSON document, key by key.
+    """A dataclass whose `DOCUMENT` declares the keys of its JSON document, separated by spaces.
 
-    `DOCUMENT` has words: `...` is every field; `name` is a field or a property; `key=a.b` is
-    attribute `b` of attribute `a` under another name, null where `a` is None; `*name` is all keys
-    of a record or mapping in its place; a `?` behind any leaves out what is None or empty.
+    `...`: every field. `name`: a field or property. `key=a.b`: attribute `b` of attribute `a` as
+    `key`, null if `a` is None. `*name`: all keys of a record or mapping. A trailing `?` omits None
+    and empty values.
     """
 
     DOCUMENT = "..."
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the JSON document, which `--json` prints."""
         document: dict[str, Any] = {}
         for word in self.DOCUMENT.split():
             if word == "...":
@@ -46,10 +46,9 @@ class Record:
 
 
 def document_of(value: Any) -> Any:
-    """Return records, other dataclasses, mappings and sequences as a JSON document has them.
+    """Convert records, dataclasses, mappings and sequences to JSON values.
 
-    Numbers that JSON does not know (NaN, infinity) become null. pydantic would write decimal
-    numbers as texts.
+    NaN and infinity become null. Decimal numbers become numbers, which pydantic writes as text.
     """
     if isinstance(value, Mapping):
         return {key: document_of(item) for key, item in value.items()}
@@ -68,7 +67,7 @@ def _fields_of(record: Any) -> dict[str, Any]:
     return {field.name: document_of(getattr(record, field.name)) for field in fields(record)}
 
 
-# The one text of JSON content, whatever its order and layout, and the checksum of a text.
+# Canonical JSON, which does not depend on order and layout, and checksums.
 
 _TEXT = json.JSONEncoder(sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 _ASCII = json.JSONEncoder(sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -90,11 +89,11 @@ def sha256_of(text: str) -> str:
 
 
 def hash_fold(key: str, count: int) -> int:
-    """Return the fold 0..count-1 of a key: its SHA-256 modulo the number of folds, for ever."""
+    """Return the fold 0..count-1 of a key: the first 8 bytes of its SHA-256, modulo `count`."""
     return int.from_bytes(hashlib.sha256(key.encode("utf-8")).digest()[:8], "big") % count
 
 
-# Days as people write them, in options and in calls.
+# Dates in options and arguments.
 
 EXAMPLE = "2024-05-01"
 
@@ -106,10 +105,7 @@ def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date |
 
 
 def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date | None:
-    """Return the day that an option or argument names; of a time, its day.
-
-    Raises `UsageError` for anything but a date.
-    """
+    """Parse a date; return the day of a time. Raises `UsageError` for anything else."""
     if isinstance(day, datetime):
         return day.date()
     if day is None or isinstance(day, date):
@@ -121,16 +117,16 @@ def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date |
 
 
 def last_day(through: date | str | None, name: str = "--through") -> date | None:
-    """Return the last day that is named. Raises `UsageError` for anything but a date or today."""
+    """Parse a date or "today". Raises `UsageError` for anything else."""
     return date.today() if through == "today" else date_of(through, name, f"{EXAMPLE}, or today")
 
 
-# The optional parts of the package: what says which one to install, where one is missing.
+# Extras of the package.
 
 
 @contextmanager
 def require_extra(extra: str, purpose: str) -> Iterator[None]:
-    """Import what an extra brings; raises `ExtraError` that says how to install it and what for."""
+    """Translate failed imports of an extra's packages to `ExtraError` with the install command."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -143,24 +139,24 @@ def require_extra(extra: str, purpose: str) -> Iterator[None]:
         ) from None
 
 
-# How long work tells of its progress.
+# Progress of long work.
 
 Progress = Callable[[int, int], None]
-"""Called with the units done since the last call, and the units to do in all: rows or bytes."""
+"""Called with the work since the last call and the total work, in rows or bytes."""
 
 
 def no_progress(_more: int, _all: int) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
-# Names of cars, drives and places, as logs, Gram rows and people write them.
+# Names of cars, drives and places.
 
 MAX_NAME_CHARACTERS = 200
 """Longest name of a car, drive or place."""
 
 
 def normalize_name(text: str) -> str:
-    """Return the form in which a name is stored: Unicode NFC, without spaces around it."""
+    """Return the stored form of a name: Unicode NFC, without surrounding spaces."""
     return unicodedata.normalize("NFC", text).strip()
 
 
@@ -180,15 +176,15 @@ def name_key(name: str) -> str:
     return normalize_name(unicodedata.normalize("NFD", name).casefold())
 
 
-# How messages say numbers with their nouns, and names from strangers.
+# Words of messages.
 
 
 def pluralize(number: int, noun: str) -> str:
-    """Return a number of things, such as `1 drive` or `1,500 Gram rows`."""
+    """Return a number with its noun, such as `1 drive` or `1,500 Gram rows`."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 def quote_name(text: object) -> str:
-    """Return a name as it can stand in a one-line message, whatever characters it has."""
+    """Return a name for a one-line message: quoted if it has unprintable characters."""
     plain = str(text)
     return plain if plain.isprintable() else repr(plain)

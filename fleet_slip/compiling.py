@@ -1,6 +1,6 @@
-"""How the functions of this package are compiled: to the same bits on every machine.
+"""Compilation by numba, with the same bits on every machine.
 
-Compiled code is kept in a folder of this user alone, since whoever reads it executes it.
+The cache of compiled code must be writable by this user alone: its files are executed.
 """
 
 import atexit
@@ -29,8 +29,8 @@ PACKAGE = Path(__file__).parent
 CHECKSUMS = "checksums.json"
 LEAST_FREE_BYTES = 2**25
 PREFIX = "fleet-slip-"
-KEPT = 128
-"""So many folders stay, those used last first. There are some 20 of one state of the sources."""
+MAX_FOLDERS = 128
+"""Folders of compiled code to retain, last used first. One state of the sources needs about 20."""
 
 _IMPORT = re.compile(
     rb"^\s*(?:from|import) +fleet_slip\b([\w.]*)(?: +import +(\w+) *$)?", re.MULTILINE
@@ -47,26 +47,26 @@ def _compiler(**options: Any) -> Callable[[Function], Function]:
 
 
 equation = _compiler(error_model="numpy", forceinline=True)
-"""Compiles a pure function that is inlined where it is called, so that loops over lanes vectorise.
+"""Compiles a pure function that is inlined into its callers, so that loops over lanes vectorise.
 
-Without `fastmath` nothing is reordered or fused, and IEEE 754 rounds what is used in one way:
-additions, multiplications, divisions, roots, comparisons. Divisions by zero do not branch.
+Without `fastmath` nothing is reordered or fused, and IEEE 754 determines the result of additions,
+multiplications, divisions, roots and comparisons. Divisions by zero do not branch.
 """
 
 inner_loop = _compiler(nogil=True, error_model="numpy")
-"""Compiles a loop that compiled code calls, to the same bits as an equation."""
+"""Compiles a loop for callers that are compiled, with the same arithmetic as `equation`."""
 
 _kept_loop = _compiler(nogil=True, error_model="numpy", cache=True)
 
 
 def kernel(function: Function) -> Function:
-    """Compile a function that is called from Python, without the GIL.
+    """Compile a function for callers in Python; it releases the GIL.
 
-    numba keeps the code in a folder that this user alone can write, if there is one.
+    numba caches the code if there is a folder that only this user can write.
     """
     file = Path(cast(Any, function).__code__.co_filename)
     folder = code_folder(digest_sources(file)) if file.is_file() else None
-    if folder is None:  # such as of a function that is typed
+    if folder is None:  # such as for a function typed at a prompt
         return inner_loop(function)
     config: Any = numba.config
     usual = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
@@ -79,12 +79,13 @@ def kernel(function: Function) -> Function:
 
 @functools.cache
 def code_folder(digest: str) -> Path | None:
-    """Return where code of the sources of a digest is kept.
+    """Return the folder of compiled code for sources with a digest, without damaged files.
 
-    None, and a remark, if there is no such folder or others can write it: what is kept is pickled
-    machine code. Files that are not as the process left them that wrote them are deleted.
+    Returns None and logs a warning if there is none that only this user can write.
     """
-    chosen = os.environ.get("NUMBA_CACHE_DIR")  # numba's own; needed when a module is imported
+    chosen = os.environ.get(
+        "NUMBA_CACHE_DIR"
+    )  # numba's own variable; read when a module is imported
     try:
         base = Path(chosen or cache_folder("compiled")).resolve()
         folder = base / f"{PREFIX}{digest}"
@@ -100,20 +101,16 @@ def code_folder(digest: str) -> Path | None:
             error,
         )
         return None
-    os.utime(folder)  # in use: others' go first
+    os.utime(folder)  # used now: older ones are deleted first
     sums = _delete_damaged(folder)
     atexit.register(_write_checksums, folder, sums)
-    for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-KEPT] if new else ():
+    for old in sorted(base.glob(f"{PREFIX}*"), key=os.path.getmtime)[:-MAX_FOLDERS] if new else ():
         shutil.rmtree(old, ignore_errors=True)
     return folder
 
 
 def digest_sources(file: Path) -> str:
-    """Return a digest of all that code of a file can have constants and functions of.
-
-    That is its own source, those of the modules that it imports, of those that these import, and so
-    on, and the compiler.
-    """
+    """Return a digest of the compiler, a file and, recursively, the modules that it imports."""
     sources: set[Path] = set()
     waiting = [file]
     while waiting:
@@ -129,7 +126,7 @@ def digest_sources(file: Path) -> str:
 
 @functools.cache
 def _imported(file: Path) -> list[Path]:
-    """Return the modules of this package that a file imports; all of one of which it is a part."""
+    """Return the modules of this package that a file imports; all of an imported folder."""
     sources: list[Path] = []
     for package, name in _IMPORT.findall(file.read_bytes()):
         place = PACKAGE.joinpath(*package.decode().split("."))
@@ -139,12 +136,12 @@ def _imported(file: Path) -> list[Path]:
 
 
 def _require_own(folder: Path) -> None:
-    """Raise `OSError` if others can write a folder or put another in its place; if it is full."""
+    """Raise `OSError` if other users can write or replace a folder, or if its disk is full."""
     for parent in (folder, *folder.parents):
         status = parent.stat(follow_symlinks=False)
         if parent == folder:
             safe = status.st_uid == os.getuid() and not status.st_mode & 0o022
-        else:  # where only owners may rename, as in /tmp, this one's folder stays
+        else:  # in a sticky folder such as /tmp, only owners can rename
             by_others = status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX
             safe = status.st_uid in (os.getuid(), 0) and not by_others
         if not safe:
@@ -155,9 +152,9 @@ def _require_own(folder: Path) -> None:
 
 
 def _delete_damaged(folder: Path) -> dict[str, str]:
-    """Delete what a power cut or a disk damaged; return the checksums of the rest.
+    """Delete damaged files; return the checksums of the others.
 
-    numba renames files without flushing them, and executes what it reads.
+    numba renames files without flushing them, so a power cut can damage them.
     """
     checksums = {}
     with suppress(OSError, ValueError):

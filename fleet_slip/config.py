@@ -1,4 +1,4 @@
-"""Read configuration: TOML that a person names, and the files that ship with the package."""
+"""Reading and validation of TOML files."""
 
 import os
 import re
@@ -22,11 +22,9 @@ from pydantic_core import ErrorDetails
 
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 
-# Reads a TOML file into a pydantic model; says what is wrong with it by file, key and reason.
-
 
 class Config(BaseModel):
-    """Base of all config models: immutable, and no key that is not declared."""
+    """Base of all config models: immutable, without undeclared keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
@@ -36,7 +34,7 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 _TRIED = re.compile(r"[\[(]|^constrained-|^([A-Z][a-z]+){2,}$|^(str|int|float|decimal|bool)$")
-"""Matches what pydantic puts among the keys for a type that it tried."""
+"""Matches the names of types that pydantic inserts between keys."""
 
 _SAID = {
     "missing": "is missing",
@@ -65,7 +63,7 @@ _SAID = {
     "finite_number": "must be a finite number",
     "too_long": "has more than {max_length} entries",
 }
-"""What is said of a fault, by its type in pydantic; what is not listed keeps pydantic's words."""
+"""Our text of a fault, by pydantic's type of the fault; other types keep pydantic's text."""
 
 
 def _printable(text: str) -> str:
@@ -75,12 +73,12 @@ def _printable(text: str) -> str:
 
 
 def added(default: object, **bounds: Any) -> Any:
-    """Return a field that came later: at its default it is in no dump, and changes no digest."""
+    """Return a field that dumps omit at its default, so that it does not change older digests."""
     return Field(default=default, exclude_if=lambda value: value == default, **bounds)
 
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_printable)]
-"""Text that names a column, a car or a file."""
+"""Name of a column, a car or a file."""
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -88,7 +86,7 @@ LONGEST_FILE_BYTES = 2**20
 LARGEST_EXPONENT = 400
 FAULTS_SHOWN = 10
 LONGEST_FAULT = 300
-"""Characters of one fault that are shown; what was given may stand in it."""
+"""Characters of one fault in a message, which may quote the input."""
 
 
 def read_named_file(
@@ -96,13 +94,13 @@ def read_named_file(
     most_bytes: int = LONGEST_FILE_BYTES,
     error: type[FleetSlipError] = ConfigError,
 ) -> bytes:
-    """Return the content of a file that a person, a variable or another config names.
+    """Return the content of a regular file. Raises `error`.
 
-    It must be regular: devices do not end, and pipes may never begin. No error may quote a line of
-    what may be `/etc/shadow`. Raises the `error` that is given.
+    Devices do not end and pipes may never begin. Messages quote no content: the path may be
+    `/etc/shadow`.
     """
     try:
-        if not isinstance(file, Path):  # of an installation that is an archive
+        if not isinstance(file, Path):  # within an archive
             return file.read_bytes()
         # Without this flag, opening a pipe waits for someone to write into it.
         descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
@@ -131,7 +129,7 @@ def load_toml(file: Traversable) -> dict[str, Any]:
         raise ConfigError(f"{file}: not UTF-8 text, from byte {error.start:,} on.") from None
     except RecursionError:
         raise ConfigError(f"{file}: nested too deeply.") from None
-    except (ValueError, ArithmeticError) as error:  # of TOML, of a date, of a number's size
+    except (ValueError, ArithmeticError) as error:  # TOML, a date, or the size of a number
         raise ConfigError(f"{file}: not valid TOML: {error}") from None
 
 
@@ -179,7 +177,7 @@ def parse_document(
 
 
 def faults_of(error: ValidationError) -> str:
-    """Return what is wrong, key by key, on one line; of many faults the first."""
+    """Return the first faults on one line: key and reason."""
     wrong: dict[str, list[str]] = {}
     for fault in error.errors(include_input=False, include_url=False):
         reasons = wrong.setdefault(_key_of(fault), [])
@@ -195,7 +193,7 @@ def faults_of(error: ValidationError) -> str:
 
 
 def _key_of(fault: ErrorDetails) -> str:
-    """Return the key at fault, without what pydantic adds for a type that it tried."""
+    """Return the key at fault, without the types that pydantic tried."""
     place = fault["loc"]
     unknown = len(place) - 1 if fault["type"] == "extra_forbidden" else None
     keys = [
@@ -207,7 +205,7 @@ def _key_of(fault: ErrorDetails) -> str:
 
 
 def _said(fault: ErrorDetails) -> str:
-    """Return what is wrong, in words of our own; what a validator of ours says, as it is."""
+    """Return the reason of a fault: our text, or the message of a validator."""
     words = _SAID.get(fault["type"])
     if words is None:
         return fault["msg"].replace("Value error, ", "").replace("Input should be", "must be")

@@ -1,4 +1,4 @@
-"""Every error that a user can meet, each with its exit code. The CLI maps them in one place."""
+"""All expected errors, with their exit codes."""
 
 import re
 
@@ -13,7 +13,7 @@ _LACK = re.compile(
 
 
 def is_lack_of_memory(error: BaseException) -> bool:
-    """Whether an error is a want of memory, as Python, the loader and libraries tell it."""
+    """Return True for a lack of memory, reported by Python, the loader or a library."""
     return isinstance(error, MemoryError) or _LACK.search(str(error)) is not None
 
 
@@ -26,7 +26,7 @@ _SECRET = re.compile(
 
 
 def hide_passwords(text: str, *, to_end: bool = False) -> str:
-    """Return text without users and queries of URLs; with `to_end`, a URL goes on to the end."""
+    """Replace secrets in URLs by asterisks; with `to_end`, a URL extends to the end of the text."""
     if "://" not in text:
         return text
     url = _WHOLE_URL if to_end else _URL
@@ -40,9 +40,9 @@ def _without_user(match: re.Match[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text on one line, for a terminal or a log: the unprintable as escapes like `\x1b`.
+    """Return text on one line for a terminal or log, with escapes such as `\x1b`.
 
-    A name from outside may hold line breaks, which forge lines, or escape sequences.
+    Names from outside may contain line breaks, which forge lines, or escape sequences.
     """
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text
@@ -50,52 +50,52 @@ def printable(text: str) -> str:
 
 
 class FleetSlipError(Exception):
-    """Base of all expected errors: the message says what, where, and what to do next."""
+    """Base of all expected errors. Messages state what happened, where, and what to do next."""
 
     exit_code = 1
     headline = ""
-    """What a command ends with instead, where it has printed the rest before."""
+    """Last line of a command that has printed the message before; empty for the message itself."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(hide_passwords(message)))
 
 
 class UsageError(FleetSlipError):
-    """What is asked for means nothing: a value out of range, options that exclude each other."""
+    """Invalid arguments: a value out of range, options that exclude each other."""
 
     exit_code = 2
 
 
 class ConfigError(FleetSlipError):
-    """A file in `configs/`, or one given by the user, does not say what it must."""
+    """An invalid configuration file."""
 
     exit_code = 3
 
 
 class InputError(FleetSlipError):
-    """Data from outside is missing, unreadable or not what its mapping says."""
+    """A log file is missing, unreadable, or does not match its mapping."""
 
     exit_code = 4
 
 
 class RepeatedError(InputError):
-    """A recording that is in the logs already: a second time it would count twice."""
+    """A recording that the logs already contain."""
 
     exit_code = 15
 
 
 class DataError(FleetSlipError):
-    """The data cannot answer: an empty cohort, an absent signal, a rank-deficient model."""
+    """The data do not suffice: an empty cohort, an absent signal, a rank-deficient model."""
 
     exit_code = 5
 
 
 class NotComputedError(DataError):
-    """A cohort has drives, and none has the Gram rows of a feature set, or not all have them."""
+    """Drives of a cohort lack the Gram rows of a feature set."""
 
 
 class QuestionError(FleetSlipError):
-    """The question has no answer: bad SQL, an unknown model, signal, feature set or ranking."""
+    """An invalid query: bad SQL, an unknown model, signal, feature set or ranking."""
 
     exit_code = 5
 
@@ -107,7 +107,7 @@ class StorageError(FleetSlipError):
 
 
 class RefusedError(FleetSlipError):
-    """The request is understood and would do harm: a worse model, a changed campaign."""
+    """A valid request that would do harm: a worse model, a changed campaign."""
 
     exit_code = 7
 
@@ -119,31 +119,31 @@ class ConflictError(FleetSlipError):
 
 
 class DamageError(FleetSlipError):
-    """`verify` found damage, and did not or could not repair all of it."""
+    """`verify` found damage that is not repaired."""
 
     exit_code = 9
 
 
 class AlarmError(FleetSlipError):
-    """The answer calls for attention: stale data, a failed run, a faulty sensor, drift."""
+    """The result requires attention: stale data, a failed run, a faulty sensor, drift."""
 
     exit_code = 10
 
 
 class PendingError(FleetSlipError):
-    """What was asked for is not all done yet; what is left has to wait for other jobs to end."""
+    """A part of the work must wait until other jobs end."""
 
     exit_code = 12
 
 
 class ClusterError(FleetSlipError):
-    """The cluster cannot be reached or used, or its workers died of a task."""
+    """The cluster cannot be reached or used, or a task killed its workers."""
 
     exit_code = 11
 
 
 class NotScreenedError(FleetSlipError):
-    """What is to train a model could not be examined first."""
+    """Training drives could not be screened for faulty sensors."""
 
     exit_code = 16
 
@@ -155,4 +155,4 @@ class ExtraError(FleetSlipError):
 
 
 class QueryGoesOnError(KeyboardInterrupt):
-    """Ctrl-C was pressed in the middle of what DuckDB cannot stop: it goes on in a thread."""
+    """Ctrl-C during a query that DuckDB cannot stop; it continues in a thread."""

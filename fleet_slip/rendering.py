@@ -1,4 +1,4 @@
-"""Results as people are shown them: texts and tables, and remarks beside these."""
+"""Display of results: texts, tables and remarks."""
 
 import string
 import textwrap
@@ -12,13 +12,13 @@ from fleet_slip.base import Record
 from fleet_slip.errors import FleetSlipError, printable
 
 GAPS = (2, 1)
-"""Spaces between two columns: usually, and where a terminal is narrow."""
+"""Spaces between two columns: by default, and on a narrow terminal."""
 FILE_WIDTH = 200
-"""Characters of a line that goes to a file or into a pipe."""
+"""Line width in characters for files and pipes."""
 
 
 class Remark(str):
-    """What is said beside a result: a command says it on stderr."""
+    """A remark beside a result, which commands print on stderr."""
 
     __slots__ = ()
 
@@ -38,10 +38,10 @@ class TextTable:
     text_columns: int = 1
 
     def text(self, width: int = FILE_WIDTH, *, bold: bool = False) -> str:
-        """Return the table, no wider than a terminal; words and numbers are never broken.
+        """Return the table within `width`; words and numbers are not broken.
 
-        Where there is too little room, columns move closer; where that is not enough, every row
-        becomes a paragraph with a line for each column.
+        If it does not fit, columns move closer; if that is not enough, each row becomes a paragraph
+        with a line per column.
         """
         header = self.header.split("|")
         rows = [[printable(text) for text in self._cells(record)] for record in self.records]
@@ -76,7 +76,7 @@ class TextTable:
 
 
 class _Formatter(string.Formatter):
-    """Formats by the fields of the one argument."""
+    """Formats the fields of one record."""
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Any) -> Any:  # noqa: ARG002
         """Return a field of the record."""
@@ -86,12 +86,12 @@ class _Formatter(string.Formatter):
         return getattr(record, key)
 
     def format_field(self, value: Any, format_spec: str) -> str:
-        """Return a field as a table shows it."""
+        """Return the text of a field."""
         return self.text(value, format_spec)
 
     @staticmethod
     def text(value: Any, form: str = "") -> str:
-        """Return a value as a table shows it."""
+        """Return the text of a value."""
         if isinstance(value, tuple | list):
             return " ".join(map(str, value))
         return "" if value is None else format(value, form)
@@ -104,15 +104,15 @@ Part = str | TextTable
 
 
 class Answer(Record):
-    """A result that people are shown, by commands and by `str`."""
+    """A result that commands, `str` and notebooks display."""
 
     def parts(self) -> Iterable[Part]:
-        """Return what is shown; some take `everything` where a screen is usual."""
+        """Return the displayed parts; some classes accept `everything` for a full display."""
         raise NotImplementedError
 
     @property
     def problem(self) -> FleetSlipError | None:
-        """What a command fails with that has shown it."""
+        """The error with which a command fails after displaying the result."""
         return None
 
     def __str__(self) -> str:
@@ -123,12 +123,12 @@ class Answer(Record):
         return "\n".join(text for block in texts for text in block if text)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: the same."""
+        """Return the display of a notebook."""
         return f"<pre>{escape(str(self))}</pre>"
 
 
 def wrap_lines(text: str, width: int) -> str:
-    """Return text whose lines break between words; a line that is indented is kept to be copied."""
+    """Wrap lines between words, except indented ones, which users copy."""
     return "\n".join(
         line if len(line) <= width or line.startswith("  ") else "\n".join(_wrap(line, width))
         for line in text.split("\n")
@@ -142,7 +142,7 @@ def _wrap(text: str, width: int) -> list[str]:
 
 
 def _cells_of(text: str) -> int:
-    """Return how many columns of a terminal a text takes: letters of East Asia take two."""
+    """Return the number of terminal cells of a text: East Asian letters take two."""
     if text.isascii():
         return len(text)
     from rich.cells import cell_len  # noqa: PLC0415 - names of most fleets need none
@@ -153,7 +153,7 @@ def _cells_of(text: str) -> int:
 def _fit_columns(
     header: Sequence[str], rows: Sequence[Sequence[str]], width: int, gap: int
 ) -> list[int] | None:
-    """Return how wide each column is, none less than its longest word; None if they do not fit."""
+    """Return the column widths, at least the longest word each; None if they do not fit."""
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(_cells_of, cells)) for cells in columns]
     widths = [max((_cells_of(w) for c in cells for w in c.split()), default=0) for cells in columns]
@@ -168,7 +168,7 @@ def _fit_columns(
 
 
 def _paragraphs(header: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> str:
-    """Return rows as paragraphs, whose lines have what a figure is called, and the figure."""
+    """Return rows as paragraphs: one line per column, with its name and value."""
     wide = max(map(len, header))
     lines = []
     for row in rows:

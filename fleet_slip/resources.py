@@ -1,4 +1,4 @@
-"""Find `configs/`, `jobs/` and `warehouse/`, installed or not, and folders of this user."""
+"""Locations of the shipped files and of the user's configs and cache."""
 
 import json
 import os
@@ -51,7 +51,7 @@ class Configs:
     Raises
     ------
     ConfigError
-        If the folder does not exist, cannot be read, or holds a file that is no configuration.
+        If the folder does not exist, cannot be read, or contains a file that is no configuration.
     """
 
     folder: Path | None = None
@@ -129,7 +129,7 @@ def _require_kind(name: str, file: Path) -> None:
 
 
 def _is_file(path: Traversable) -> bool:
-    """Return True if the file exists; no file has a name that the system does not allow."""
+    """Return True if the file exists, False for names that the system does not allow."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -137,10 +137,10 @@ def _is_file(path: Traversable) -> bool:
 
 
 def cache_folder(name: str) -> Path:
-    """Return a folder of this user for what can be lost.
+    """Return a cache folder of this user.
 
-    The system's variables are read here: modules need the folder for compiled code when they are
-    imported, before anybody opens a data root.
+    Reads the system's variables, as modules need the folder for compiled code when they are
+    imported.
     """
     service = os.environ.get("CACHE_DIRECTORY", "").partition(":")[0]
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
@@ -148,7 +148,7 @@ def cache_folder(name: str) -> Path:
 
 
 def keep_json(file: Path, content: Any) -> None:
-    """Write JSON to a file of a cache, whole; what cannot be written is not kept."""
+    """Write JSON atomically to a file of a cache; ignore errors."""
     with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
         draft = file.with_suffix(f".{os.getpid()}")

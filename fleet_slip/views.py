@@ -1,4 +1,4 @@
-"""Everything that SQL can ask of a data root: its tables, the models and the history of runs."""
+"""SQL views of a data root: its tables, the models and the history of runs."""
 
 import re
 from pathlib import Path
@@ -46,8 +46,8 @@ def connect(
     it names, which is faster. Drives that models are tested on are there if it names the column
     `source`.
 
-    It opens the files of the snapshot and no others, and its settings cannot be changed. DuckDB
-    knows no right to read without the right to write: ask SQL of others through `Fleet.sql`.
+    It opens the files of the snapshot only, and its settings are locked. DuckDB has no read-only
+    access to files: run untrusted SQL through `Fleet.sql`.
     """
     return open_views(open_warehouse(root, config), query, threads)
 

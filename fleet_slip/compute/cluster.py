@@ -1,8 +1,7 @@
-"""An executor whose tasks run on the workers of a Dask cluster.
+"""An executor on the workers of a Dask cluster.
 
-Dask runs a task again where its worker died. Added here: a task makes sure that its worker has the
-sender's versions, before it is unpickled, and sees the data root of the command; and nobody waits
-for ever.
+Dask repeats a task whose worker died. In addition, a worker compares its versions with the sender's
+before unpickling a task, and checks that it sees the data root; and all waits are bounded.
 """
 
 import contextlib
@@ -56,20 +55,20 @@ SOURCES = "files of fleet-slip"
 SHIPPED = (".py", ".sql", ".toml")
 
 IN_FLIGHT_MIN = 8
-"""Tasks that may be under way however few workers there are: more of them may be on their way."""
+"""Minimum number of concurrent tasks: more workers may be starting."""
 
 POLL_S = 1.0
 PATIENCE_S = 120.0
-"""How long a cluster may be without workers: so long may a container take to start."""
+"""Maximum time without workers, in s: a container may take that long to start."""
 
 CONNECT_ATTEMPTS = 5
 FIRST_S = 10.0
-"""How long a scheduler may take to answer, or as long as Dask's own settings allow, if shorter."""
+"""Maximum time to connect to a scheduler, in s; Dask's own setting if shorter."""
 
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
 MARKER_AGE_MAX_H = 7 * 24
-"""A marker that is older was left by a killed command."""
+"""Older markers were left by killed commands."""
 
 
 @contextlib.contextmanager
@@ -99,7 +98,7 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
 
 
 class _Client(Client):
-    """A client that leaves no thread behind where it cannot begin."""
+    """A client that leaves no thread behind if it cannot start."""
 
     def start(self, **options: Any) -> None:
         """Connect."""
@@ -111,7 +110,7 @@ class _Client(Client):
 
 
 def _connect(address: str) -> Client:
-    """Connect, again if Dask takes two first messages that came together for a fault."""
+    """Connect; retry if Dask rejects two initial messages that arrive together."""
     usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
     connect: Callable[[], Client] = partial(
         _Client,
@@ -128,13 +127,13 @@ def _connect(address: str) -> Client:
 
 @dataclass(frozen=True)
 class Marker:
-    """A file by which a worker knows that it sees the data root that the command sees."""
+    """A file in the data root by which a worker checks that it sees the same root."""
 
     folder: Folder
     name: str
 
     def require_seen(self, where: str) -> None:
-        """Raise `StorageError` if the file is not there."""
+        """Raise `StorageError` if the file does not exist."""
         try:
             self.folder.read(self.name)
         except StorageError as error:
@@ -147,7 +146,7 @@ class Marker:
 
 @contextlib.contextmanager
 def _marker(root: Folder) -> Iterator[Marker]:
-    """Make a file in the data root by which a worker knows that it sees the same root."""
+    """Create a marker, and delete it at the end, with old ones."""
     marker = Marker(root / MARKER_FOLDER, uuid.uuid4().hex)
     marker.folder.create(marker.name, b"")
     try:
@@ -179,7 +178,7 @@ class ClusterExecutor(Executor):
 
     @property
     def in_flight(self) -> int:
-        """How many tasks keep the workers busy."""
+        """Number of concurrent tasks that keeps the workers busy."""
         return max(IN_FLIGHT_MIN, 2 * self._threads)
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -196,7 +195,7 @@ class ClusterExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
-        """Forget what is under way: whoever leaves without waiting for it has failed."""
+        """Cancel all tasks: a caller that leaves before their end has failed."""
         self._closing.set()
         self._watcher.join()
         for future in list(self._futures):
@@ -250,14 +249,14 @@ class ClusterExecutor(Executor):
 
 
 def pickled(marker: Marker, function: Callable[[Any], Any], item: Any) -> bytes:
-    """Return a marker, a function of this package and its argument, as `work` takes them."""
+    """Return the argument of `work`: a pickled marker, function and item."""
     return pickle.dumps((marker, function, item), protocol=5)
 
 
 def work(expected: Mapping[str, str], task: bytes) -> Any:
-    """Do a task and return its result; expected errors get the worker's name.
+    """Run a task and return its result; add the worker's name to expected errors.
 
-    Raises `RefusedError` for other versions, `StorageError` where the marker is not seen.
+    Raises `RefusedError` for other versions and `StorageError` for an invisible marker.
     """
     this_worker = f"worker {socket.gethostname()}:{os.getpid()}"
     _require_same(this_worker, expected, environment())
@@ -285,7 +284,7 @@ def _require_same(where: str, expected: Mapping[str, str], actual: Mapping[str, 
 
 @cache
 def environment() -> dict[str, str]:
-    """Return what the result of a task may depend on: versions, and the sources' checksum."""
+    """Return the versions of packages and the checksum of the sources."""
     versions = {name: _version(name) for name in PACKAGES}
     return {"python": platform.python_version(), **versions, SOURCES: _sources_digest()}
 
@@ -298,9 +297,9 @@ def _version(package: str) -> str:
 
 
 def _sources_digest() -> str:
-    """Return a checksum of programs, statements and shipped configs: a checkout may be edited.
+    """Return a checksum of the package, SQL and shipped configs: a checkout may be edited.
 
-    Tasks carry the catalog of their warehouse, so that a worker needs no folder of configs.
+    Tasks contain the catalog of their warehouse, so workers need no folder of configs.
     """
     digest = sha256()
     package: Traversable = Path(__file__).parent.parent
@@ -322,7 +321,7 @@ def _shipped(entry: Traversable) -> Iterator[Traversable]:
 
 
 def _hush_logs() -> None:
-    """Undo what Dask does to the logging of the process when it is imported."""
+    """Undo the changes to logging that importing Dask makes."""
     for name in ("distributed", "tornado", "asyncio"):
         logger = logging.getLogger(name)
         logger.handlers[:] = [logging.NullHandler()]
@@ -333,5 +332,5 @@ def _hush_logs() -> None:
             logger.handlers.clear()
             logger.propagate = True
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
-    # A client that could not even begin to connect complains of itself when it is collected.
+    # A client that could not start to connect warns when it is collected.
     warnings.filterwarnings("ignore", r"coroutine '(Client\._close|wait_for)' was never awaited")

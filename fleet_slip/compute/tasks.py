@@ -1,6 +1,7 @@
-"""Calls functions on many items: on threads, in order or as they are done, or in an executor.
+"""Execution of tasks on threads or in an executor.
 
-One of other machines may tell `in_flight`, the tasks it takes, and raise `LostTaskError`.
+An executor on other machines may define `in_flight`, its number of concurrent tasks, and raise
+`LostTaskError`.
 """
 
 from collections import deque
@@ -20,7 +21,7 @@ from fleet_slip.errors import ClusterError
 from fleet_slip.storage.runs import LOGGER
 
 IN_FLIGHT = 4
-"""Tasks that may be under way, or done and not yet looked at, where the executor does not say."""
+"""Maximum number of unprocessed tasks of an executor without `in_flight`."""
 
 NAMED_MAX = 5
 
@@ -28,11 +29,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 AHEAD = 2
-"""Items that are read before they are asked for."""
+"""Items to read in advance."""
 
 
 class LostTaskError(BrokenExecutor):
-    """The processes that a task ran in died, again and again."""
+    """Every process that ran the task died."""
 
 
 class LocalThreads(ThreadPoolExecutor):
@@ -44,7 +45,7 @@ class LocalThreads(ThreadPoolExecutor):
 
 
 def in_flight(executor: Executor) -> int:
-    """Return how many tasks may be under way, which bounds memory and what a kill costs."""
+    """Return the maximum number of concurrent tasks, which bounds memory and the loss by a kill."""
     return int(getattr(executor, "in_flight", IN_FLIGHT))
 
 
@@ -54,11 +55,11 @@ def run_tasks(
     items: Iterable[Item],
     name_of: Callable[[Item], str],
 ) -> Iterator[tuple[Item, Result]]:
-    """Call a function on items, and yield each with its result when it is done, in any order.
+    """Call a function on items; yield each item with its result on completion, in any order.
 
-    Without an executor: here and now. Tasks whose worker died are tried again alone at the end,
-    since any of a worker's tasks is suspect; `ClusterError` names those that failed again. Any
-    other error ends the whole at once.
+    Without an executor, calls run in this thread. Tasks whose worker died are retried one at a time
+    at the end, since any task of a worker may have killed it. Raises `ClusterError` with the tasks
+    that failed again; any other error ends the iteration.
     """
     if executor is None:
         for item in items:
@@ -108,9 +109,9 @@ def _completed(
 
 
 def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
-    """Yield items in order while a thread takes the next; errors come in their place.
+    """Yield items in order while a thread reads the next ones; re-raise errors in order.
 
-    Closing it waits for the one being taken.
+    Closing the generator waits for the item being read.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
         taken = deque(thread.submit(_take, items) for _ in range(AHEAD))

@@ -85,7 +85,7 @@ STYLE: Any = {
 
 
 def colour(name: str) -> str:
-    """Return a colour of the palette as figures are drawn with it."""
+    """Return a colour of the palette for figures."""
     return PALETTE[name].light
 
 
@@ -93,12 +93,16 @@ def colour(name: str) -> str:
 class Picture:
     """One figure of the report.
 
-    Attributes:
-        key: name of its files, and of its place on the page.
-        title: what it shows.
-        caption: what it tells, in numbers.
-        seen: what is drawn, for those who cannot see it.
-        draw: makes it.
+    Attributes
+    ----------
+    key
+        Name of its files and of its anchor on the page.
+    title, caption
+        Subject, and result in numbers.
+    seen
+        Description for readers who cannot see it.
+    draw
+        Returns the figure.
     """
 
     key: str
@@ -119,7 +123,7 @@ PIXELS_PER_POINT = 4 / 3
 
 @dataclass(frozen=True)
 class Drawn:
-    """A picture for the page, and as files of its own, on a light ground."""
+    """A rendered picture: for the page, and as separate files on a light ground."""
 
     picture: Picture
     svg: Markup
@@ -128,7 +132,7 @@ class Drawn:
 
 
 def draw(picture: Picture) -> Drawn:
-    """Draw a picture."""
+    """Render a picture."""
     png, stream = io.BytesIO(), io.StringIO()
     with mpl.rc_context({**STYLE, "svg.hashsalt": picture.key}):
         figure = picture.draw()
@@ -144,7 +148,7 @@ def draw(picture: Picture) -> Drawn:
 
 
 def _lean(svg: str) -> str:
-    """Drop comments and metadata, and keep a hundredth of a point of each coordinate."""
+    """Remove comments and metadata, and round coordinates to 0.01 points."""
     svg = re.sub(r"<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = re.sub(r' d="([^"]*)"', lambda match: f' d="{_short(match[1])}"', svg)
     return re.sub(r"\n\s*\n+", "\n", svg)
@@ -160,8 +164,8 @@ def _short(path: str) -> str:
 def inline(svg: str, prefix: str, alternative: str) -> str:
     """Return an SVG document as part of a page.
 
-    Its names get a prefix, so that they differ from those of other figures; its colours become
-    variables of the page, and so does its type; its ground becomes the page's.
+    Prefixes its ids, so that they differ from other figures'; replaces its colours and font by
+    variables of the page, and its ground by none.
     """
     body = re.sub(
         r"<defs>\s*<style.*?</style>\s*</defs>", "", svg[svg.index("<svg") :], flags=re.DOTALL

@@ -1,4 +1,4 @@
-"""What pages are made of: numbers as people read them, tables, and templates that are filled in."""
+"""Components of HTML pages: formatted numbers, tables, templates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from fleet_slip.pages.drawing import PALETTE
 
 
 def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
-    """Return a number with so many decimals and a true minus sign; a dash for None."""
+    """Format a number with a true minus sign; a dash for None."""
     if value is None:
         return "\N{EN DASH}"
     text = f"{value:+.{digits}f}" if sign else f"{value:.{digits}f}"
@@ -20,22 +20,22 @@ def number(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
 
 
 def degrees(value: float | None, digits: int = 3, *, sign: bool = False) -> str:
-    """Return an angle in degrees with its sign °; a dash for None."""
+    """Format an angle in degrees; a dash for None."""
     return number(value, digits, sign=sign) + ("" if value is None else "\N{DEGREE SIGN}")
 
 
 def percent(share: float, digits: int = 0) -> str:
-    """Return a share as a percentage."""
+    """Format a fraction as a percentage."""
     return f"{number(100 * share, digits)} %"
 
 
 def count(value: int) -> str:
-    """Return a whole number with its thousands apart."""
+    """Format an integer with thousands separators."""
     return f"{value:,}"
 
 
 def scientific(value: float, digits: int = 2) -> str:
-    """Return a number with so many digits after the first, as 1.23 × 10⁻⁴ where it is small."""
+    """Format a number, as 1.23 × 10⁻⁴ if it is very small or large."""
     if value == 0 or 1e-3 <= abs(value) < 1e5:
         return f"{value:.{digits + 1}g}".replace("-", "\N{MINUS SIGN}")
     mantissa, _, exponent = f"{value:.{digits}e}".partition("e")
@@ -47,14 +47,14 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def join_words(words: list[str]) -> str:
-    """Return words as a list in a sentence: a, b and c."""
+    """Join words as in a sentence: a, b and c."""
     if len(words) < 2:
         return "".join(words)
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 class Cell(str):
-    """A text of a table that is marked as good or as a miss."""
+    """A table cell, marked as good or as a miss."""
 
     mark: Literal["", "good", "miss"] = ""
 
@@ -83,7 +83,7 @@ TEMPLATES = files("fleet_slip.pages") / "templates"
 
 
 def fill_in(template: str, **values: Any) -> str:
-    """Return a page: a template with values, and the style sheet and colours of all pages."""
+    """Render a template with values, the style sheet and the colours of all pages."""
     environment = Environment(
         loader=FunctionLoader(lambda name: (TEMPLATES / name).read_text(encoding="utf-8")),
         autoescape=True,

@@ -114,7 +114,7 @@ class Folder(Protocol):
         """Write a new file atomically and durably; return False if it exists."""
 
     def append(self, path: str, content: bytes) -> None:
-        """Append durably in one write; an object store writes an object with this prefix instead."""
+        """Append durably in one write. An object store writes an object with this prefix."""
 
     def remove(self, file: StoredFile) -> bool:
         """Delete exactly the listed file; return False if it is gone or was replaced."""

@@ -47,7 +47,7 @@ def test_a_written_file_is_not_part_of_the_table_before_its_commit(warehouse: Wa
     (file,) = snapshot.files
     assert (file.rows, file.day, file.path) == (1000, DAY, action.path)
     assert file.null_counts["ax"] == 0
-    assert (snapshot.transaction_version("u"), snapshot.landed("other")) == (7, None)
+    assert (snapshot.transaction_version("u"), snapshot.transaction_version("other")) == (7, None)
 
 
 def test_the_same_rows_make_the_same_bytes_by_which_their_file_is_named(
