@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.quality.checks import MUTUAL_DELAY, SIGNAL_DELAY, Fault
 from fleet_slip.quality.drive_signals import TICKS_PER_S, Signals
-from fleet_slip.quality.turning import WITNESSES
+from fleet_slip.quality.turning import MIN_WITNESSES, WITNESSES
 
 STEP = 5
 """Ticks between lags. Signals are averaged over as many: none of a car is faster."""
@@ -30,8 +30,9 @@ MIN_ROWS = 400
 """Twenty seconds: a shorter manoeuvre fits at many lags."""
 MIN_EXPLAINED = 0.5
 """Share of the variance that must be explained at the best lag, else the signals are unrelated."""
-MIN_IMPROVEMENT = 1.5
-"""Unexplained variance without a lag over that at the best lag. A late signal has 10 and more."""
+MIN_IMPROVEMENT, SMALL_S = 1.5, 0.15
+"""Unexplained variance without a lag over that at the best lag, if that is not small. Less shows
+nothing: the drive turns too slowly."""
 PERIODIC_TOLERANCE = 0.1
 """Share of the variance by which minima may differ: on a sine every period has one."""
 MAX_STANDARD_ERRORS = 4.0
@@ -72,10 +73,11 @@ def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> D
     if best is None or total[:, 0, 0].min() < MIN_ROWS:
         return None
     at_best = unexplained[round(best) + MAX_LAG]
+    is_far = abs(best) * STEP_S > SMALL_S
     if at_best > 1 - MIN_EXPLAINED:
         return None
-    if unexplained[MAX_LAG] < MIN_IMPROVEMENT * at_best:
-        return NO_DELAY
+    if is_far and unexplained[MAX_LAG] < MIN_IMPROVEMENT * at_best:
+        return None
     without = [_lowest(_unexplained(total - block)) for block in moments]
     if None in without:
         return None
@@ -159,7 +161,12 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
             names = [signal for name in pair for signal in WITNESSES[name]]
             yield MUTUAL_DELAY.fault(*names, delay_s=abs(late.value_s), error_s=late.error_s)
         return
-    middle = float(np.median([delay.value_s for delay in delays.values()]))
+    # All angles of the steering are one witness: its first.
+    steering = [name for name in delays if name in STEERING]
+    values = [delay.value_s for name, delay in delays.items() if name not in steering[1:]]
+    if len(values) < MIN_WITNESSES:
+        return
+    middle = float(np.median(values))
     errors = sorted(delay.error_s for delay in delays.values())
     for name, delay in delays.items():
         # The reference itself has no error; that of the others' median stands for it.
