@@ -176,7 +176,7 @@ def parameters(version: ModelVersion) -> dict[str, str]:
         "model_list": chosen.model_list,
         "model": chosen.model,
         "signals": ",".join(version.manifest.signals),
-        **(chosen.asked or {}),
+        **(chosen.options or {}),
     }
     return {key: str(value)[:MAX_PARAMETER_CHARACTERS] for key, value in values.items()}
 

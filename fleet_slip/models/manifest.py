@@ -1,6 +1,6 @@
-"""What a model version says of itself: its terms, figures, data and why it was chosen, checked.
+"""Manifest of a model version: terms, figures, training data and selection, validated.
 
-It may come from anywhere: texts and numbers are bounded, and what becomes SQL is arithmetic.
+A manifest may come from anywhere: texts and numbers are bounded, and SQL in it is arithmetic only.
 """
 
 import math
@@ -14,6 +14,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import (
     AfterValidator,
+    AliasChoices,
+    ConfigDict,
     Field,
     FiniteFloat,
     PlainSerializer,
@@ -39,12 +41,12 @@ from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.regression.least_squares import LinearModel
 
-MOST_DIGITS = 4000
-"""Most decimal digits of a number that stands in decimal; Python refuses longer ones as text."""
+MAX_DIGITS = 4000
+"""Maximum number of decimal digits of a number in decimal: Python refuses longer texts."""
 
 _FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
 _LONG_FRACTION = re.compile(r"-?0x[0-9a-f]{1,30000}/0x[0-9a-f]{1,30000}")
-"""In hexadecimal, as models of hundreds of inputs need it."""
+"""In hexadecimal: models of hundreds of inputs need it."""
 
 
 def _exact_fraction(value: Any) -> Fraction:
@@ -66,7 +68,7 @@ def _exact_fraction(value: Any) -> Fraction:
 def _fraction_text(value: Fraction) -> str:
     """Return the text of a fraction, such as "3/4"; "0x3/0x4" if it were too long in decimal."""
     numerator, denominator = value.numerator, value.denominator
-    if max(abs(numerator), denominator) < 10**MOST_DIGITS:
+    if max(abs(numerator), denominator) < 10**MAX_DIGITS:
         return f"{numerator}/{denominator}"
     return f"{numerator:#x}/{denominator:#x}"
 
@@ -84,11 +86,11 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 Correlation = Annotated[FiniteFloat, Field(ge=-1 - 1e-9, le=1 + 1e-9)]
-"""A little more than there can be: rounding may take it there."""
+"""Rounding may exceed 1 a little."""
 
 
-_LEFT_OUT = Field(exclude_if=lambda one: one is None)
-"""Where there is none, so that a manifest is what it was before there was any."""
+_OPTIONAL = Field(exclude_if=lambda value: value is None)
+"""Omits None, so that manifests of earlier releases keep their content."""
 
 
 def _require_rounded(value: float, exact: Fraction) -> None:
@@ -114,8 +116,8 @@ class ModelTerm(Config):
     unit: str
     scale: Scale
     sql: Annotated[str, AfterValidator(integer_arithmetic)] = ""
-    definition: Annotated[Definition | None, _LEFT_OUT] = None
-    signal_scales: Annotated[dict[Identifier, Scale] | None, _LEFT_OUT] = None
+    definition: Annotated[Definition | None, _OPTIONAL] = None
+    signal_scales: Annotated[dict[Identifier, Scale] | None, _OPTIONAL] = None
     coefficient: FiniteFloat
     coefficient_exact: ExactFraction
 
@@ -128,12 +130,12 @@ class ModelTerm(Config):
 
     @property
     def logged(self) -> bool:
-        """Whether it is a logged signal, rather than computed."""
+        """True if it is a logged signal, not a computed one."""
         return not self.sql and self.definition is None
 
     @property
     def alone(self) -> bool:
-        """Whether it is a number of the car, the same all the time."""
+        """True if it is a calibration parameter of the car, constant in time."""
         number = self.definition.number if self.definition else None
         return number is not None and number.alone
 
@@ -144,12 +146,12 @@ class ModelTerm(Config):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The logged signals that it is computed from: itself, or what its SQL names."""
+        """Logged signals that it is computed from: itself, or those in its SQL."""
         return (self.definition or plain_column(self.signal, self.sql)).signals
 
 
 class ModelLabel(Config):
-    """What a model estimates."""
+    """The quantity that a model estimates."""
 
     signal: Identifier
     column: Identifier
@@ -168,8 +170,8 @@ class CrossValidated(Config):
     error_mean_deg: FiniteFloat
     error_std_deg: NotNegative
     condition_number: NotNegative
-    label_noise_deg: Annotated[NotNegative | None, _LEFT_OUT] = None
-    """White noise of the label, which all errors here have in them; None where it is not known."""
+    label_noise_deg: Annotated[NotNegative | None, _OPTIONAL] = None
+    """White noise of the label, a part of all errors; None if unknown."""
 
     @property
     def beyond_label_noise_deg(self) -> float:
@@ -184,13 +186,13 @@ class CrossValidated(Config):
 
 
 class TrainedOn(Config):
-    """The data that made a model; `drives_without_log` sent Gram rows (`TrainedDrives`)."""
+    """Training data of a model; `drives_without_log` are drives whose cars sent Gram rows."""
 
     cohort: str
     feature_set: str = "signals"
     drives: Count
     vehicles: Count
-    drives_without_log: Annotated[Count | None, _LEFT_OUT] = None
+    drives_without_log: Annotated[Count | None, _OPTIONAL] = None
     rows: Count
     logs_version: Count
     grams_version: Count
@@ -207,10 +209,10 @@ Seconds = Annotated[FiniteFloat, Field(gt=0)]
 
 
 class LearnedFrom(Config):
-    """What stood for a label: changes of the course over `change_s`.
+    """The label of a model without a reference sensor: changes of the course over `change_s`.
 
-    The intercept is that of `cars` going straight, with its uncertainty, None if untold, and the
-    spread between them.
+    The intercept is estimated from `cars` that drive straight, with its uncertainty (None if
+    unknown) and the standard deviation between cars.
     """
 
     label: Literal["course"]
@@ -221,7 +223,7 @@ class LearnedFrom(Config):
 
 
 class Prior(Config):
-    """Simulated drives that a model was trained on beside its cohort: `rows` of this `weight`."""
+    """Simulated drives in the training set beside the cohort: `rows` of this `weight`."""
 
     campaign: str
     campaign_sha256: Sha256
@@ -231,21 +233,33 @@ class Prior(Config):
     weight: ExactFraction
 
 
-Asked = bool | int | Annotated[str, Field(max_length=100_000)]
+OptionValue = bool | int | Annotated[str, Field(max_length=100_000)]
 
 
 class SelectedBy(Config):
-    """The list, the name and the rule that chose a model; `asked` are other options by name."""
+    """The list, the name and the reason of a selection, and its options by name.
+
+    Documents call the options `asked`.
+    """
+
+    model_config = ConfigDict(serialize_by_alias=True)
 
     model_list: str
     model: str
     reason: str
     config_sha256: str
-    asked: Annotated[dict[Identifier, Asked] | None, _LEFT_OUT] = None
+    options: Annotated[
+        dict[Identifier, OptionValue] | None,
+        Field(
+            validation_alias=AliasChoices("asked", "options"),
+            serialization_alias="asked",
+            exclude_if=lambda options: options is None,
+        ),
+    ] = None
 
 
 class ImportedFrom(Config):
-    """The version of another data root that a version was imported from."""
+    """Version of another data root that a version was imported from."""
 
     reference: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}@[1-9][0-9]{0,8}$")]
     sha256: Sha256
@@ -255,7 +269,7 @@ _MADE: TypeAdapter[Made] = TypeAdapter(Made)
 
 
 class Manifest(Config):
-    """One model version; `trained_on` of an imported one is about another data root's tables.
+    """One model version; `trained_on` of an imported one describes another data root.
 
     A document of unknown origin is validated with the `SignalCatalog` as context.
     """
@@ -266,66 +280,69 @@ class Manifest(Config):
     intercept: FiniteFloat
     intercept_exact: ExactFraction
     through_origin: Annotated[bool, Field(exclude_if=lambda origin: not origin)] = False
-    """Whether it was fitted without an intercept, which is then zero."""
+    """True if it was fitted without an intercept."""
     terms: tuple[ModelTerm, ...] = Field(min_length=1)
     cross_validation: CrossValidated
     trained_on: TrainedOn
     selected_by: SelectedBy
     package_version: str
-    learned_from: Annotated[LearnedFrom | None, _LEFT_OUT] = None
-    """None where it was a reference sensor."""
-    prior: Annotated[Prior | None, _LEFT_OUT] = None
-    imported_from: Annotated[ImportedFrom | None, _LEFT_OUT] = None
+    learned_from: Annotated[LearnedFrom | None, _OPTIONAL] = None
+    """None if the label is a reference sensor."""
+    prior: Annotated[Prior | None, _OPTIONAL] = None
+    imported_from: Annotated[ImportedFrom | None, _OPTIONAL] = None
     assumed: Annotated[
         tuple[Annotated[str, Field(max_length=200)], ...],
         Field(max_length=100, exclude_if=lambda assumed: not assumed),
     ] = ()
-    """What the mappings of its logs leave open, and which value stands for it."""
+    """Assumptions of the mappings of its logs, with the assumed values."""
 
     @model_validator(mode="before")
     @classmethod
-    def _with_what_is_made(cls, content: Any, info: ValidationInfo) -> Any:
-        """Put what is made of columns, which stands once in `made`, where columns name it."""
+    def _expand_combinations(cls, content: Any, info: ValidationInfo) -> Any:
+        """Insert each combination of columns, stored once in `made`, where columns name it."""
         if not isinstance(content, dict) or not isinstance(content.get("made"), dict):
             return content
-        waiting, found = dict(content["made"]), dict[str, Made]()
+        pending, combinations = dict(content["made"]), dict[str, Made]()
 
-        def within(part: Any) -> Any:
-            if isinstance(part, list | tuple):
-                return [within(one) for one in part]
-            if not isinstance(part, dict):
-                return part
-            part = {key: within(one) for key, one in part.items()}
-            if isinstance(name := part.get("made"), str):
-                if name in waiting:
-                    parts = within(waiting.pop(name))
-                    found[name] = _MADE.validate_python(parts, context=info.context)
-                if name not in found:
+        def expand(node: Any) -> Any:
+            if isinstance(node, list | tuple):
+                return [expand(item) for item in node]
+            if not isinstance(node, dict):
+                return node
+            node = {key: expand(value) for key, value in node.items()}
+            if isinstance(name := node.get("made"), str):
+                if name in pending:
+                    parts = expand(pending.pop(name))
+                    combinations[name] = _MADE.validate_python(parts, context=info.context)
+                if name not in combinations:
                     raise ValueError(f"made: {name} is missing, or made of itself")
-                part["made"] = found[name]
-            return part
+                node["made"] = combinations[name]
+            return node
 
-        rest = {key: one for key, one in content.items() if key != "made"}
-        return {**rest, "terms": within(content.get("terms"))}
+        remaining = {key: value for key, value in content.items() if key != "made"}
+        return {**remaining, "terms": expand(content.get("terms"))}
 
     @model_serializer(mode="wrap")
-    def _with_what_is_made_once(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content, found = handler(self), dict[str, Any]()
+    def _collect_combinations(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Store each combination of columns once, in `made`."""
+        content, combinations = handler(self), dict[str, Any]()
 
-        def within(part: Any) -> Any:
-            if isinstance(part, list | tuple):
-                return [within(one) for one in part]
-            if not isinstance(part, dict):
-                return part
-            if isinstance(part.get("made"), dict):
-                name = part["of"]
-                if name not in found:
-                    found[name] = within(part["made"])
-                part = {**part, "made": name}
-            return {key: within(one) for key, one in part.items()}
+        def collect(node: Any) -> Any:
+            if isinstance(node, list | tuple):
+                return [collect(item) for item in node]
+            if not isinstance(node, dict):
+                return node
+            if isinstance(node.get("made"), dict):
+                name = node["of"]
+                if name not in combinations:
+                    combinations[name] = collect(node["made"])
+                node = {**node, "made": name}
+            return {key: collect(value) for key, value in node.items()}
 
-        terms = within(content["terms"])
-        return {**content, "terms": terms, "made": found} if found else content
+        terms = collect(content["terms"])
+        if not combinations:
+            return {**content, "terms": terms}
+        return {**content, "terms": terms, "made": combinations}
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":
@@ -396,13 +413,13 @@ class Manifest(Config):
 
     @property
     def line(self) -> str | None:
-        """The digest of the line whose estimate columns have; None without."""
-        made = (row.made for one in self.definitions.values() for row in one.rows())
-        lines = (one.line for one in made if isinstance(one, Combination))
-        return next((line for line in lines if line), None)
+        """Digest of the first-stage model whose estimate is an input; None without."""
+        rows = (row for definition in self.definitions.values() for row in definition.rows())
+        digests = (row.made.line for row in rows if isinstance(row.made, Combination))
+        return next(filter(None, digests), None)
 
     def same_estimator(self, other: "Manifest") -> bool:
-        """Whether both are the same numbers from the same rows."""
+        """Return True if both have the same terms from the same rows."""
         return (
             self.intercept_exact == other.intercept_exact
             and self.terms == other.terms
@@ -421,44 +438,44 @@ def require_model_name(name: str) -> str:
     return name
 
 
-# The drives that made a version, for ever, without their names: whoever knows a drive's name can
-# see whether it was among them.
+# The training set of a version without the names of drives. Who has the name of a drive can test
+# whether it is in the set.
 
 _SALT = b"fleet-slip trained drives\n"
-_AT_ONCE = 2**20
+_BATCH_DRIVES = 2**20
 
 
 @dataclass(frozen=True)
 class TrainedDrives:
-    """Hashes of the drives of a version, salted with its model's name; sorted."""
+    """Sorted hashes of the training drives of a version, salted with its model's name."""
 
     name: str
     salted: Hashes
 
     @classmethod
-    def of(cls, name: str, drives: Hashes) -> "TrainedDrives":
-        """Return those of some drives, by the hashes of their names."""
+    def from_hashes(cls, name: str, drives: Hashes) -> "TrainedDrives":
+        """Build a set from the hashes of the names of drives."""
         return cls(name, np.sort(_salt(name, drives)))
 
     @classmethod
     def unpacked(cls, name: str, content: bytes) -> "TrainedDrives":
-        """Return those of a file's content."""
+        """Read the content of a file."""
         return cls(name, np.frombuffer(content, dtype=">u8").astype(np.uint64))
 
     @property
     def content(self) -> bytes:
-        """What a file holds: 8 bytes a drive."""
+        """Content of a file: 8 bytes a drive."""
         return self.salted.astype(">u8").tobytes()
 
     def among(self, drives: Hashes) -> BoolArray:
-        """Return which of some drives, by the hashes of their names, made the version."""
-        wanted, place = np.unique(drives, return_inverse=True)
-        found: BoolArray = np.isin(_salt(self.name, wanted), self.salted)[place]
-        return found
+        """Return the mask of drives, by the hashes of their names, that are in the set."""
+        unique, place = np.unique(drives, return_inverse=True)
+        mask: BoolArray = np.isin(_salt(self.name, unique), self.salted)[place]
+        return mask
 
 
 def checksum_of_drives(content: bytes) -> str:
-    """Return the SHA-256 by which a manifest names a file of its drives."""
+    """Return the SHA-256 of a file of training drives, as a manifest stores it."""
     return sha256(content).hexdigest()
 
 
@@ -466,8 +483,8 @@ def _salt(name: str, drives: Hashes) -> Hashes:
     """Return the salted hash of each drive, in the order of the drives."""
     salt, numbers = _SALT + name.encode(), drives.astype("<u8")
     hashed = np.empty(len(drives), dtype=np.uint64)
-    for first in range(0, len(drives), _AT_ONCE):
-        some = numbers[first : first + _AT_ONCE].tobytes()
-        digests = [sha256(salt + some[at : at + 8]).digest()[:8] for at in range(0, len(some), 8)]
-        hashed[first : first + _AT_ONCE] = np.frombuffer(b"".join(digests), dtype=">u8")
+    for first in range(0, len(drives), _BATCH_DRIVES):
+        batch = numbers[first : first + _BATCH_DRIVES].tobytes()
+        digests = [sha256(salt + batch[i : i + 8]).digest()[:8] for i in range(0, len(batch), 8)]
+        hashed[first : first + _BATCH_DRIVES] = np.frombuffer(b"".join(digests), dtype=">u8")
     return hashed

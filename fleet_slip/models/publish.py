@@ -56,6 +56,8 @@ _MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "c
 _MODEL_OPTIONS |= {"all_subsets", "search", "max_features"}
 """Options that define which models are compared: with one of these, none is taken from before."""
 
+_REQUEST_FIELDS = fields(SelectionRequest)
+
 _STORED_NAMES = {
     "order": "nested",
     "ranking": "rank",
@@ -123,21 +125,19 @@ def _newest(registry: Registry, name: str) -> ModelVersion | None:
 
 
 def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
-    """Return what a version was chosen by, and on which drives. Raises `QuestionError`."""
+    """Return the selection options and the cohort of a version. Raises `QuestionError`."""
     manifest = version.manifest
-    chosen = manifest.selected_by
     cohort = with_all_drives(manifest.trained_on.cohort)
-    if chosen.asked is None:
-        return _of_list(version), cohort
-    options: dict[str, Any] = {
-        field.name: chosen.asked[stored]
-        for field in fields(SelectionRequest)
-        if (stored := _STORED_NAMES.get(field.name, field.name)) in chosen.asked
-    }
-    return SelectionRequest(**options), with_all_drives(str(chosen.asked.get(COHORT, cohort)))
+    stored = manifest.selected_by.options
+    if stored is None:
+        return _request_of_list(version), cohort
+    names = {field.name: _STORED_NAMES.get(field.name, field.name) for field in _REQUEST_FIELDS}
+    options: dict[str, Any] = {name: stored[key] for name, key in names.items() if key in stored}
+    return SelectionRequest(**options), with_all_drives(str(stored.get(COHORT, cohort)))
 
 
-def _of_list(version: ModelVersion) -> SelectionRequest:
+def _request_of_list(version: ModelVersion) -> SelectionRequest:
+    """Return the request for the model list of a version. Raises `QuestionError`."""
     manifest = version.manifest
     name = manifest.selected_by.model_list
     if name == GIVEN:
@@ -148,7 +148,7 @@ def _of_list(version: ModelVersion) -> SelectionRequest:
     except ConfigError:
         raise QuestionError(
             f"{version.reference} was chosen from {name!r}, which is no model list here. "
-            "Say what to compare, such as models = estimator."
+            "Name a model list: --models estimator"
         ) from None
     return SelectionRequest(models=name)
 
@@ -156,13 +156,13 @@ def _of_list(version: ModelVersion) -> SelectionRequest:
 def is_current(
     manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, tolerance: str | None
 ) -> bool:
-    """Return whether a selection from a model list would come to this manifest again.
+    """Return True if a selection from a model list would give this manifest again.
 
-    It is a function of table versions, cohort, list and program. Raises `ConfigError` for the list.
+    It depends on table versions, cohort, list and program. Raises `ConfigError` for the list.
     """
     model_list = load_model_list(warehouse.catalog, models)
     trained, chosen = manifest.trained_on, manifest.selected_by
-    made_from = (
+    stored = (
         trained.cohort,
         trained.feature_set,
         trained.logs_version,
@@ -171,7 +171,7 @@ def is_current(
         chosen.config_sha256,
         manifest.package_version,
     )
-    return manifest.imported_from is None and made_from == (
+    return manifest.imported_from is None and stored == (
         cohort,
         warehouse.catalog.identity(model_list.features),
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
@@ -191,22 +191,22 @@ def build_challenger(
     force: bool,
     candidate: bool,
 ) -> Manifest:
-    """Return the winner of a selection as the manifest that `publish_challenger` takes.
+    """Return the manifest of a selection's winner, for `publish_challenger`.
 
-    Unless forced, raises `RefusedError` for a late or false course and, unless it is to be a
-    candidate, for first measured drives that contradict any car.
+    Unless forced, raises `RefusedError` for a delayed or wrong course and, except for candidates,
+    for first measured drives that contradict any car.
     """
     manifest = with_straight_intercept(warehouse, manifest_of(selection, name))
     manifest = with_assumptions(warehouse, manifest, selection)
     if manifest.learned_from and not force:
         delays_s = require_in_time(warehouse, manifest)
         require_sound_course(warehouse, manifest, delays_s)
-    simulated = selection.label_noise_deg is not None  # nobody states the noise of others
-    if not (force or candidate or simulated):
+    is_simulated = selection.label_noise_deg is not None  # only campaigns state it
+    if not (force or candidate or is_simulated):
         champion = registry.champion(name)
-        made = registry.trained_drives(champion.manifest) if champion else None
-        settled = len(champion.manifest.terms) if champion else 0
-        require_sound_drives(warehouse, manifest, made, settled)
+        champion_drives = registry.trained_drives(champion.manifest) if champion else None
+        champion_columns = len(champion.manifest.terms) if champion else 0
+        require_sound_drives(warehouse, manifest, champion_drives, champion_columns)
     return manifest
 
 
@@ -216,7 +216,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     signals = catalog.signals
     winner = selection.winner.model
     label = signals[signals.label]
-    wanted = (*winner.signals, signals.label)
+    needed = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
     definitions = catalog.definitions(selection.cohort.feature_set)
     return Manifest(
@@ -236,8 +236,8 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             cohort=selection.cohort.predicate.text,
             feature_set=catalog.identity(selection.cohort.feature_set),
             drives=winner.drives,
-            vehicles=selection.cohort.count_vehicles_with(wanted),
-            drives_without_log=selection.cohort.count_onboard_with(wanted) or None,
+            vehicles=selection.cohort.count_vehicles_with(needed),
+            drives_without_log=selection.cohort.count_onboard_with(needed) or None,
             rows=selection.trained_rows,
             logs_version=selection.cohort.logs_version,
             grams_version=selection.cohort.grams_version,
@@ -248,7 +248,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             model=winner.name,
             reason=selection.winner.reason,
             config_sha256=selection.config_sha256,
-            asked=stored_options(selection),
+            options=stored_options(selection),
         ),
         package_version=package_version("fleet-slip"),
         prior=_prior_of(selection),
@@ -256,6 +256,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
 
 
 def _prior_of(selection: Selection) -> Prior | None:
+    """Describe the prior of a selection; None without one."""
     prior, name = selection.cohort.prior, selection.request.prior
     if prior is None or name is None:
         return None
@@ -273,9 +274,9 @@ def _prior_of(selection: Selection) -> Prior | None:
 
 
 def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifest:
-    """Return a manifest with the intercept that changes do not tell, if changes taught its model.
+    """Return a manifest with an estimated intercept if its model was trained on changes.
 
-    One through the origin keeps 0, of no cars. Raises `DataError` if no drive tells the intercept.
+    A model through the origin keeps 0. Raises `DataError` if no drive determines the intercept.
     """
     catalog = warehouse.catalog
     name = catalog.name_of(manifest.trained_on.feature_set)
@@ -306,13 +307,18 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
         _term(catalog, column, slope / scales[column], {})
         for column, slope in estimate.slopes.items()
     )
-    own = {"intercept": float(estimate.intercept), "intercept_exact": estimate.intercept}
-    origin = {"learned_from": learned, "terms": (*manifest.terms, *terms)}
-    return manifest.model_copy(update={**own, **origin})
+    return manifest.model_copy(
+        update={
+            "intercept": float(estimate.intercept),
+            "intercept_exact": estimate.intercept,
+            "learned_from": learned,
+            "terms": (*manifest.terms, *terms),
+        }
+    )
 
 
 def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
-    """Return a manifest with what the mappings of its drives leave open."""
+    """Return a manifest with the assumptions of the mappings of its drives."""
     from fleet_slip.ingest.mapping import ASSUMPTIONS, kept_assumptions  # noqa: PLC0415 - units
 
     if not (warehouse.root / ASSUMPTIONS).names():
@@ -330,13 +336,13 @@ def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Select
 def drives_of(selection: Selection, name: str) -> bytes:
     """Return the salted hashes of the drives that a selection's winner was trained on, packed."""
     signals = (*selection.winner.model.signals, selection.cohort.catalog.signals.label)
-    return TrainedDrives.of(name, selection.cohort.hash_drives_with(signals)).content
+    return TrainedDrives.from_hashes(name, selection.cohort.hash_drives_with(signals)).content
 
 
 def _term(
     catalog: Catalog, name: str, coefficient: Fraction, definitions: Mapping[str, Definition]
 ) -> ModelTerm:
-    """Return a term; `definitions` are those of the set's columns, which a line may have made."""
+    """Return a term; `definitions` are those of the feature set's columns."""
     column, features = catalog.input(name), catalog.features
     definition = definitions.get(name) or catalog.definition(name)
     return ModelTerm(
@@ -357,6 +363,7 @@ def _term(
 
 
 def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossValidated:
+    """Return the figures of a winner as a manifest stores them."""
     figures = winner.pooled
     return CrossValidated(
         folds_by=selection.folds.by,
@@ -373,7 +380,14 @@ def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossVali
 
 @dataclass(frozen=True)
 class Publication(Answer):
-    """What publishing came to."""
+    """Result of publishing.
+
+    Attributes:
+        version: the new version, or the champion if nothing changed.
+        new: True if there is a new version.
+        reason: the comparison, as a sentence.
+        candidate: True if the version waits for `promote`.
+    """
 
     DOCUMENT = (
         "model=version.manifest.name version=version.version new candidate reason "
@@ -384,12 +398,11 @@ class Publication(Answer):
     new: bool
     reason: str
     candidate: bool = False
-    """Whether it waits for somebody to promote it."""
 
     def parts(self) -> Iterator[Part]:
         """Return what was published, and why."""
-        done = "published" if self.new else "nothing to publish:"
-        yield Remark(f"{done} {self.version.reference}. {self.reason}")
+        verb = "published" if self.new else "nothing to publish:"
+        yield Remark(f"{verb} {self.version.reference}. {self.reason}")
 
 
 def publish_challenger(
@@ -400,50 +413,48 @@ def publish_challenger(
     force: bool = False,
     candidate: bool = False,
 ) -> Publication:
-    """Make the winner the next version of its model, and its champion.
+    """Publish a challenger as the next version of its model, and its champion.
 
-    It must be above the floor, and no worse than the champion and the best of the champions so far
-    (`champion_rules`), else it is refused (`RefusedError`) unless forced. A `candidate` waits for
-    somebody to promote it, and so does whatever is published while the champion is held by
-    `rollback` or `pin`. A challenger that is the same estimator from the same rows changes nothing.
-    If the champion changes meanwhile, all is decided again.
+    Raises `RefusedError` if the review finds problems (`review_challenger`), unless forced. A
+    `candidate` waits for `promote`; so does any version while the champion is held by `rollback` or
+    `pin`. The same estimator from the same rows changes nothing. Decides again if the champion
+    changes meanwhile.
     """
     history = registry.history(manifest.name)
 
     @functools.cache
-    def added() -> ModelVersion:
+    def add_version() -> ModelVersion:
         return registry.add(manifest, drives_of(selection, manifest.name))
 
-    def publication(newest_move: int) -> Publication | None:
-        found = _decide(registry, manifest, selection, force=force, candidate=candidate)
-        if found.stays:
-            return Publication(found.stays, False, found.reason)
-        version = added()
-        alias, best = (CANDIDATE, None) if found.waits else (CHAMPION, found.best)
+    def publish(newest_move: int) -> Publication | None:
+        decision = _decide(registry, manifest, selection, force=force, candidate=candidate)
+        if decision.champion:
+            return Publication(decision.champion, False, decision.reason)
+        version = add_version()
         number = version.version
-        there = history.pointed_at(alias) == number
-        moved = there or history.move(alias, number, "publish", after=newest_move, best=best)
-        if not moved:
+        alias, best = (CANDIDATE, None) if decision.waits else (CHAMPION, decision.best)
+        is_there = history.pointed_at(alias) == number
+        if not (is_there or history.move(alias, number, "publish", after=newest_move, best=best)):
             return None
-        if not found.waits:
-            return Publication(version, True, found.reason)
+        if not decision.waits:
+            return Publication(version, True, decision.reason)
         until = f"until: fleet-slip promote {version.reference}"
-        reason = f"{found.reason} {_why(manifest.name, found.held)}, {until}"
-        return Publication(version, not there, reason, candidate=True)
+        reason = f"{decision.reason} {_why_waiting(manifest.name, decision.held)}, {until}"
+        return Publication(version, not is_there, reason, candidate=True)
 
-    return history.decide(publication)
+    return history.decide(publish)
 
 
 @dataclass(frozen=True)
 class DryRun(Answer):
-    """What publishing would come to.
+    """Result that publishing would have.
 
     Attributes:
-        model: its name.
-        publishes: whether there would be a new version, as champion or as candidate.
-        reason: what was compared, else why nothing would be published.
-        candidate: whether it would wait for somebody to promote it.
-        refused: whether `publish_challenger` would raise `RefusedError`.
+        model: name of the model.
+        publishes: True if there would be a new version, as champion or as candidate.
+        reason: the comparison, or why nothing would be published.
+        candidate: True if the version would wait for `promote`.
+        refused: True if `publish_challenger` would raise `RefusedError`.
     """
 
     model: str
@@ -455,13 +466,13 @@ class DryRun(Answer):
     def parts(self) -> Iterator[Part]:
         """Return what would be published, unless it is refused."""
         if not self.refused:
-            would = "would be published" if self.publishes else "would not be published"
-            would += " as a candidate" if self.publishes and self.candidate else ""
-            yield Remark(f"{self.model} {would}. {self.reason}")
+            verb = "would be published" if self.publishes else "would not be published"
+            verb += " as a candidate" if self.publishes and self.candidate else ""
+            yield Remark(f"{self.model} {verb}. {self.reason}")
 
     @property
     def problem(self) -> RefusedError | None:
-        """That it would be refused."""
+        """The refusal that publishing would raise."""
         return RefusedError(self.reason) if self.refused else None
 
 
@@ -473,37 +484,37 @@ def would_publish(
     force: bool = False,
     candidate: bool = False,
 ) -> DryRun:
-    """Tell what `publish_challenger` would come to, and raise as it does; nothing is written."""
-    found = _decide(registry, manifest, selection, force=force, candidate=candidate)
-    if found.stays:
-        return DryRun(manifest.name, False, found.reason)
-    if not found.waits:
-        return DryRun(manifest.name, True, found.reason)
+    """Return what `publish_challenger` would do, and raise as it does; write nothing."""
+    decision = _decide(registry, manifest, selection, force=force, candidate=candidate)
+    if decision.champion:
+        return DryRun(manifest.name, False, decision.reason)
+    if not decision.waits:
+        return DryRun(manifest.name, True, decision.reason)
     waiting = registry.history(manifest.name).pointed_at(CANDIDATE)
     newest = max(registry.versions(manifest.name), default=None)
-    there = (
+    is_there = (
         waiting is not None
         and waiting == newest
-        and (registry.load(manifest.name, waiting).manifest.same_estimator(manifest))
+        and registry.load(manifest.name, waiting).manifest.same_estimator(manifest)
     )
-    reason = f"{found.reason} {_why(manifest.name, found.held)}."
-    return DryRun(manifest.name, not there, reason, candidate=True)
+    reason = f"{decision.reason} {_why_waiting(manifest.name, decision.held)}."
+    return DryRun(manifest.name, not is_there, reason, candidate=True)
 
 
 @dataclass(frozen=True)
 class _Decision:
-    """What is to become of a challenger.
+    """Decision on a challenger.
 
     Attributes:
-        reason: what was compared, as a sentence.
-        stays: the champion, if nothing is published.
-        waits: whether it becomes the candidate.
+        reason: the comparison, as a sentence.
+        champion: the champion if it stays, and nothing is published.
+        waits: True if the challenger becomes the candidate.
         held: the move that holds the champion.
-        best: the number of the best champion so far, as `AliasHistory.move` takes it.
+        best: number of the best champion so far, for `AliasHistory.move`.
     """
 
     reason: str
-    stays: ModelVersion | None = None
+    champion: ModelVersion | None = None
     waits: bool = False
     held: AliasMove | None = None
     best: int | None = None
@@ -517,7 +528,7 @@ def _decide(
     force: bool,
     candidate: bool,
 ) -> _Decision:
-    """Decide what becomes of a challenger. Raises `RefusedError`."""
+    """Review a challenger and decide. Raises `RefusedError`."""
     champion = registry.champion(manifest.name)
     if champion and champion.manifest.same_estimator(manifest):
         return _Decision("The champion is the same model.", champion)
@@ -532,12 +543,12 @@ def _decide(
     return _Decision(review.reason, None, candidate or held is not None, held, best)
 
 
-def _why(name: str, held: AliasMove | None) -> str:
-    """Say why a version waits."""
+_VERBS = {"rollback": "rolled back to", "pin": "pinned"}
+
+
+def _why_waiting(name: str, held: AliasMove | None) -> str:
+    """Return why a version waits for `promote`."""
     if held is None:
         return "It is a candidate"
-    done = f"{_DONE[held.command]} on {held.at:%Y-%m-%d %H:%M} UTC"
-    return f"{name}@{held.version} stays champion: it was {done}"
-
-
-_DONE = {"rollback": "rolled back to", "pin": "pinned"}
+    move = f"{_VERBS[held.command]} on {held.at:%Y-%m-%d %H:%M} UTC"
+    return f"{name}@{held.version} stays champion: it was {move}"

@@ -35,7 +35,7 @@ def marked_models(warehouse: Warehouse) -> frozenset[str]:
     registry = Registry.of(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
     hashes = cache(lambda: _hashes_of_present(warehouse))
-    present = cache(lambda name: TrainedDrives.of(name, hashes()).salted)
+    present = cache(lambda name: TrainedDrives.from_hashes(name, hashes()).salted)
     for subject, numbers in judged.items():
         found |= {
             f"{name}@{number}"

@@ -291,7 +291,7 @@ def test_the_command_names_it_and_the_version_keeps_how(
     made = run_command("publish", "safe", "--models", models, "--robust", "--force")
     assert made.exit_code == 0, made.stderr
     manifest = fleet.models.get("safe").manifest
-    assert manifest.selected_by.asked is not None and manifest.selected_by.asked["robust"]
+    assert manifest.selected_by.options is not None and manifest.selected_by.options["robust"]
     assert (manifest.trained_on.drives, manifest.trained_on.rows) == (24, 2400)
     again = run_command("publish", "safe", "--json")
     assert not again.json["new"], "it is trained as it was"

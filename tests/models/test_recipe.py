@@ -90,7 +90,7 @@ def test_options_of_earlier_versions_are_read_under_their_old_names(tmp_path: Pa
     registry = Registry(LocalFolder(tmp_path), CATALOG)
     stored = {"nested": "ay,ax", "rank": "forward", "worth": "1deg", "most": 3, "by": "day"}
     chosen = SelectedBy(
-        model_list="nested", model="5", reason="best", config_sha256="0", asked=stored
+        model_list="nested", model="5", reason="best", config_sha256="0", options=stored
     )
     registry.add(manifest(name="old").model_copy(update={"selected_by": chosen}), b"")
     assert recipe_for(registry, "old", SelectionRequest()).request == SelectionRequest(

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 import fleet_slip
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.models.manifest import MOST_DIGITS, ExactFraction, ImportedFrom, TrainedDrives
+from fleet_slip.models.manifest import MAX_DIGITS, ExactFraction, ImportedFrom, TrainedDrives
 from fleet_slip.models.publish import is_current
 from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
 from fleet_slip.operations.monitor import monitor
@@ -232,7 +232,7 @@ def test_a_fraction_is_the_same_again(value: Fraction, digits: int) -> None:
 
 def test_what_was_decimal_stays_decimal() -> None:
     assert FRACTIONS.dump_python(Fraction(-3, 4)) == "-3/4"
-    largest = 10**MOST_DIGITS - 1
+    largest = 10**MAX_DIGITS - 1
     assert FRACTIONS.dump_python(Fraction(largest)) == f"{largest}/1"
     assert FRACTIONS.dump_python(-Fraction(largest + 1)).startswith("-0x")
 
@@ -247,12 +247,12 @@ def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     """Computed by the release in which they came."""
     drives = np.array([1, 2], dtype=np.uint64)
     known = [10430483359262113544, 11180994063705713938]
-    made = TrainedDrives.of("year", drives)
+    made = TrainedDrives.from_hashes("year", drives)
     assert made.salted.tolist() == known
     assert made.content == b"".join(one.to_bytes(8, "big") for one in known)
     assert TrainedDrives.unpacked("year", made.content).among(drives).all()
-    assert not len(TrainedDrives.of("year", drives[:0]).salted)
-    assert TrainedDrives.of("other", drives).salted.tolist() != known
+    assert not len(TrainedDrives.from_hashes("year", drives[:0]).salted)
+    assert TrainedDrives.from_hashes("other", drives).salted.tolist() != known
 
 
 def test_the_tables_here_are_not_those_that_made_it(smoke_root: Path, tmp_path: Path) -> None:
