@@ -118,7 +118,7 @@ def readers_findings(root: str, committed: Drives, gone: str) -> list[str]:
     found += [f"lost: rows of {name}" for name in sorted(needed - drives.keys())]
     with fleet_slip.connect(root) as database:
         seen = database.execute(
-            "SELECT drive_id, count(*), sum(n)::BIGINT FROM grams WHERE feature_set = $set "
+            "SELECT drive_id, count(*), sum(row_count)::BIGINT FROM grams WHERE feature_set = $set "
             "GROUP BY ALL",
             {"set": CATALOG.identity(PLAIN)},
         ).fetchall()

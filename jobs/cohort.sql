@@ -3,7 +3,7 @@
 SELECT
     drive_id, vehicle_id, vehicle_model, {receiver}, source, campaign, track, mass_kg, adhesion, speed_factor, saturated,
     day, started_at, duration_s,
-    part, signals, n, clipped, sums, products, coalesce(trip, drive_id) AS trip,
+    block AS part, signals, row_count AS n, clipped, sums, products, coalesce(trip, drive_id) AS trip,
     ('0x' || left(sha256(drive_id), 16))::UBIGINT AS drive_hash,
     ('0x' || left(sha256(coalesce(vehicle_id, '')), 16))::UBIGINT AS vehicle_hash,
     ('0x' || left(sha256(coalesce(trip, drive_id)), 16))::UBIGINT AS trip_hash

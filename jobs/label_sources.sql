@@ -1,8 +1,8 @@
--- Rows of a cohort that have the label, by the campaign that made them; null for measured drives.
+-- Number of rows of a cohort with the label, by source and campaign.
 SELECT
     source,
     campaign,
-    sum(n)::BIGINT AS n
+    sum(row_count)::BIGINT AS n
 FROM grams
 WHERE feature_set = '{feature_set}' AND list_contains(string_split(signals, ','), '{label}') AND (
     {predicate}

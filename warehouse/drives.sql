@@ -3,7 +3,7 @@
 -- rows has no log: its drives are told by them.
 CREATE VIEW drives AS
 WITH counted AS (
-    SELECT drive_id, sum(n)::BIGINT AS counted_rows
+    SELECT drive_id, sum(row_count)::BIGINT AS counted_rows
     FROM grams
     WHERE feature_set = 'signals' AND rows IS NULL
     GROUP BY drive_id
@@ -22,7 +22,7 @@ UNION ALL
 SELECT
     day,
     {drive_columns_but_rows},
-    sum(n)::BIGINT AS rows
+    sum(row_count)::BIGINT AS rows
 FROM grams
 WHERE feature_set = 'signals' AND starts_with(file, 'received/')
 GROUP BY ALL

@@ -5,11 +5,11 @@ SELECT
     file,
     day,
     {drive_columns},
-    part,
+    part AS block,
     signals,
-    n,
+    n AS row_count,
     clipped,
     sums,
     products,
-    course_late
+    course_late AS course_delay_quarter_ticks
 FROM {stored_grams}

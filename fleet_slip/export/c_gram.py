@@ -52,12 +52,12 @@ from fleet_slip.export.c import StepWriter, helper_texts, keep_lines, start_line
 from fleet_slip.export.program import Input, Steps
 from fleet_slip.export.templating import field_names, fill_template
 from fleet_slip.grams.on_board import (
+    MAX_COLUMNS,
     MAX_SIGNALS,
-    MOST_COLUMNS,
     ROWS_IN_A_SUM,
     OnboardFeatureSet,
     Range,
-    most_rows,
+    max_gram_rows,
     onboard_feature_sets,
 )
 from fleet_slip.models.manifest import Manifest
@@ -121,7 +121,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
     counted = counted_set.get(catalog.identity(name))
     if counted is None:
         raise RefusedError(
-            f"cars cannot count the feature set {name}: it has more than {MOST_COLUMNS} columns. "
+            f"cars cannot count the feature set {name}: it has more than {MAX_COLUMNS} columns. "
             "Export without them: fleet-slip export NAME --to c"
         )
     calibrated = catalog.calibrated
@@ -212,7 +212,7 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
     sizes = [width + packed_size(width) for width in widths]
     numbers = [count * size for count, size in zip(blocks, sizes, strict=True)]
     message_bytes = [HEADER_BYTES + 8 * size + CHECKSUM_BYTES for size in sizes]
-    message_bytes[1:] = [size + MOST_COLUMNS // 8 for size in message_bytes[1:]]
+    message_bytes[1:] = [size + MAX_COLUMNS // 8 for size in message_bytes[1:]]
     words: dict[str, Any] = {
         "prefix": prefix,
         "upper": prefix.upper(),
@@ -223,7 +223,7 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
         "rows": rows,
         "max_blocks": MAX_BLOCKS,
         "max_rows": ROWS_IN_A_SUM,
-        "row_limits": [most_rows(on_board.ranges) for on_board in sets],
+        "row_limits": [max_gram_rows(on_board.ranges) for on_board in sets],
         "blocks": blocks,
         "first_blocks": [0, *accumulate(blocks[:-1])],
         "numbers": numbers,
@@ -251,7 +251,7 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
             "history": max(on_board.history_ticks for _, on_board in changed),
             "max_times": max(len(on_board.counted.times) for _, on_board in changed),
             "max_columns": max(len(s.computed) for _, s in changed) + len(BESIDE) + 1,
-            "columns_bytes": MOST_COLUMNS // 8,
+            "columns_bytes": MAX_COLUMNS // 8,
             "places": [place for on_board in sets for place in on_board.places],
             "firsts": [0, *accumulate(widths[:-1])],
         }

@@ -1,8 +1,8 @@
-"""Loads Gram rows that cars counted on board: a Parquet table, beside rows of logs.
+"""Import of Gram rows that cars computed on board, from a Parquet table with `COLUMNS`.
 
-The table has the columns of `COLUMNS`. It is loaded whole, once, in one commit, or not at all: an
-error names the first row that cannot be, and why. The drive of a row has the source `received`, and
-instead of a log file the row names `received/` and the digest of the table's file.
+A file is imported completely, once, in one commit, or not at all: an error names the first invalid
+row and the reason. Its drives have the source `received`, and the column `file` contains
+`received/` and the digest of the Parquet file.
 """
 
 import hashlib
@@ -71,35 +71,35 @@ from fleet_slip.warehouse.gram_reader import BATCH_ROWS
 from fleet_slip.warehouse.gram_rows import by_signals, gram_table
 from fleet_slip.warehouse.warehouse import Warehouse
 
-# The feature sets that cars can count: their columns, the ranges of these, and their definition.
+# Feature sets that cars can compute, with the ranges of their columns and their definition.
 #
-# The definition of a set is the first 8 bytes of the SHA-256 of the canonical JSON of its identity
-# and of name, scale and range of each signal that it is made of.
+# The definition is the first 8 bytes of the SHA-256 of the canonical JSON of the identity and of
+# name, scale and range of each source signal.
 
 Range = tuple[int, int]
 
 ROWS_IN_A_SUM = 2**31 - 1
-"""Rows of a drive: 248 days. No sum of so many products of int16 counts reaches 2^61."""
+"""Maximum number of rows of a Gram row, 248 days: sums of products of int16 stay below 2^61."""
 
 MAX_SIGNALS = 32
-"""That a car counts of a set."""
+"""Maximum number of columns of a feature set that a car computes."""
 
-MOST_COLUMNS = 512
-"""Of a feature set that cars count: there is a bit for each."""
+MAX_COLUMNS = 512
+"""Maximum number of columns of a feature set on board: the bits of a mask."""
 
 
 @dataclass(frozen=True)
 class OnboardFeatureSet:
-    """A feature set that cars can count.
+    """A feature set that cars can compute.
 
     Attributes:
-        name, identity: of the set.
-        ranges: the smallest and the largest count of each column of its Gram rows, in order.
-        signals: what a car must know to count it, in catalog order.
-        times: over how many ticks columns change; none where they stand for themselves.
-        parts: what those parts of a drive are called; None alone where it is not divided.
-        in_time: whether the course is moved by its delay.
-        definition: what C code calls it.
+        name, identity: of the feature set.
+        ranges: smallest and largest count of each column, in order.
+        signals: source signals, in the order of the catalog.
+        times: durations of changes in ticks; empty for a feature set of the columns themselves.
+        blocks: names of the blocks of a drive; None for an undivided drive.
+        in_time: True if the course is corrected for its delay.
+        definition: number of the feature set in C code.
     """
 
     name: str
@@ -107,49 +107,50 @@ class OnboardFeatureSet:
     ranges: Mapping[str, Range]
     signals: tuple[str, ...]
     times: tuple[int, ...]
-    parts: tuple[str | None, ...]
+    blocks: tuple[str | None, ...]
     in_time: bool
     definition: int
 
     @property
     def key(self) -> str:
-        """What a table of Gram rows calls it: its name, and what its columns mean."""
+        """Name and definition: the value of the column `feature_set` in a Parquet file."""
         return f"{self.name}:{self.definition:016x}"
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of its Gram rows, in order."""
+        """Columns of the Gram rows, in order."""
         return tuple(self.ranges)
 
 
 def onboard_feature_sets(catalog: Catalog) -> dict[str, OnboardFeatureSet]:
-    """Return the sets by their identities, which Gram rows carry, the logged signals first."""
+    """Return the feature sets that cars can compute by identity, the logged signals first."""
     sets = {}
     for name in (PLAIN, *catalog.sets):
         feature_set = catalog.feature_set(name)
-        if not feature_set.block_ticks and len(feature_set.columns) <= MOST_COLUMNS:
+        if not feature_set.block_ticks and len(feature_set.columns) <= MAX_COLUMNS:
             identity = catalog.identity(name)
-            sets[identity] = _counted(catalog, name, identity)
+            sets[identity] = _onboard_feature_set(catalog, name, identity)
     return sets
 
 
-def _counted(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
+def _onboard_feature_set(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
     signals, resolved = catalog.signals, catalog.feature_set(name)
-    used = {*resolved.signals, *([COURSE, YAW_RATE] if resolved.change_ticks else [signals.label])}
-    used |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
-    used |= {signal for d in catalog.definitions(name).values() for signal in d.signals}
-    made_of = {signal: about for signal, about in signals.signals.items() if signal in used}
-    defined: list[Any] = [
-        [signal, f"{about.scale:f}", about.min_count, about.max_count]
-        for signal, about in made_of.items()
+    labels = [COURSE, YAW_RATE] if resolved.change_ticks else [signals.label]
+    names = {*resolved.signals, *labels}
+    names |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
+    names |= {signal for d in catalog.definitions(name).values() for signal in d.signals}
+    sources = {key: signal for key, signal in signals.signals.items() if key in names}
+    described: list[Any] = [
+        [key, f"{signal.scale:f}", signal.min_count, signal.max_count]
+        for key, signal in sources.items()
     ]
-    content = defined if name == PLAIN else [identity, defined]
+    content = described if name == PLAIN else [identity, described]
     digest = sha256_of(canonical_json(content))
     return OnboardFeatureSet(
         name,
         identity,
         {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
-        tuple(made_of),
+        tuple(sources),
         resolved.change_ticks,
         DriveBlocks.of_set(resolved).durations or (None,),
         resolved.in_time,
@@ -158,33 +159,34 @@ def _counted(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
 
 
 def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
+    """Return the smallest and largest count of a column, or of its changes over `times`."""
     signals, label = catalog.signals, catalog.signals.label
     if times and column in (*BESIDE, label):
         if column == STRAIGHT:
             return 0, 1
         units = course_units(signals)
-        most = units.largest // units.divisor + 1
+        limit = units.largest // units.divisor + 1
         if column == TURNED:
-            most = 2 * max(times) * COUNT_MAX // COARSER + 1
-        return -most, most
-    of = signals[column] if column == label else catalog.input(column)
-    if isinstance(of, Signal):
-        least, most = of.min_count, of.max_count
+            limit = 2 * max(times) * COUNT_MAX // COARSER + 1
+        return -limit, limit
+    source = signals[column] if column == label else catalog.input(column)
+    if isinstance(source, Signal):
+        low, high = source.min_count, source.max_count
     else:
-        most = limit_of(of.bits if isinstance(of, Feature) else of.definition.bits)
-        least = -most
-    return (least - most, most - least) if times else (least, most)
+        high = limit_of(source.bits if isinstance(source, Feature) else source.definition.bits)
+        low = -high
+    return (low - high, high - low) if times else (low, high)
 
 
-# Which Gram rows no drive of integer counts can have.
+# Validity of Gram rows of integer counts.
 #
 # Of n rows whose counts x of a signal are from l to h, with the sum s, and c the sum of products of
 # two signals x and y: n l <= s <= n h, and |c| <= n max|x| max|y|, in 64 bits: n is so small
-# (`most_rows`) that nothing reaches 2^63. The matrix of n, sums and products is positive
-# semidefinite: scaled to a diagonal of ones, its least eigenvalue is not below zero by more than
-# is computed wrongly (Higham, Accuracy and Stability of Numerical Algorithms, section 10.1).
+# (`max_gram_rows`) that nothing reaches 2^63. The matrix of n, sums and products is positive
+# semidefinite: scaled to a diagonal of ones, its smallest eigenvalue is not below zero by more than
+# the rounding error (Higham, Accuracy and Stability of Numerical Algorithms, section 10.1).
 
-NEAR = 1e-11
+EIGENVALUE_TOLERANCE = 1e-11
 LARGEST_SUM = 2**61
 
 NO_ROWS = "has no rows, or more than a drive can have"
@@ -194,62 +196,62 @@ INDEFINITE = "has a matrix that is not positive semidefinite"
 
 
 def find_impossible(table: GramTable, ranges: Sequence[tuple[int, int]]) -> dict[int, str]:
-    """Return why Gram rows are impossible, by place, given the range of each of their signals."""
+    """Return the reasons of impossible Gram rows by position, given the range of each signal."""
     sums, products = table.sums, table.products
-    least, most = np.array(ranges, dtype=np.int64).reshape(-1, 2).T
-    row, column = np.tril_indices(len(least))
-    size = np.maximum(np.abs(least), np.abs(most))
-    possible = (table.n >= 1) & (table.n <= most_rows(ranges))
+    low, high = np.array(ranges, dtype=np.int64).reshape(-1, 2).T
+    row, column = np.tril_indices(len(low))
+    size = np.maximum(np.abs(low), np.abs(high))
+    possible = (table.n >= 1) & (table.n <= max_gram_rows(ranges))
     n = np.where(possible, table.n, 1)[:, None]
     bound = n * (size[row] * size[column])
-    judged = {
+    faults = {
         NO_ROWS: ~possible,
-        SUMS: ((sums < n * least) | (sums > n * most)).any(axis=1),
+        SUMS: ((sums < n * low) | (sums > n * high)).any(axis=1),
         PRODUCTS: ((products > bound) | (products < -bound)).any(axis=1),
         INDEFINITE: _indefinite(replace(table, n=n[:, 0])),
     }
-    reasons = np.select([*judged.values()], [*judged], "").tolist()
-    return {place: reason for place, reason in enumerate(reasons) if reason}
+    reasons = np.select([*faults.values()], [*faults], "").tolist()
+    return {position: reason for position, reason in enumerate(reasons) if reason}
 
 
 def impossible_rows(
     rows: pa.Table, sets: Mapping[str, OnboardFeatureSet]
 ) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the Gram rows that no drive can have, and why, given the sets by their names there.
+    """Yield impossible Gram rows with the reason, given the feature sets by their name in `rows`.
 
-    Rows of other sets, which were defined otherwise, are passed over.
+    Rows of other feature sets are skipped.
     """
     for name in rows["feature_set"].unique().to_pylist():
         if name not in sets:
             continue
         ranges = sets[name].ranges
-        mine = rows.filter(pc.equal(rows["feature_set"], name)).combine_chunks()
-        for batch in mine.to_batches(BATCH_ROWS):
+        same_set = rows.filter(pc.equal(rows["feature_set"], name)).combine_chunks()
+        for batch in same_set.to_batches(BATCH_ROWS):
             for signals, alike, _ in by_signals(batch):
                 names = signals.split(",") if signals else []
-                found: dict[int, str] = {}
+                reasons: dict[int, str] = {}
                 if not set(names) <= ranges.keys():
-                    found = dict.fromkeys(range(len(alike)), "has signals that there are not")
+                    reasons = dict.fromkeys(range(len(alike)), "has unknown signals")
                 elif names:
-                    known = [ranges[name] for name in names]
-                    found = find_impossible(gram_table(signals, alike), known)
-                for place, reason in found.items():
-                    yield alike.slice(place, 1).to_pylist()[0], reason
+                    limits = [ranges[signal] for signal in names]
+                    reasons = find_impossible(gram_table(signals, alike), limits)
+                for position, reason in reasons.items():
+                    yield alike.slice(position, 1).to_pylist()[0], reason
 
 
-def most_rows(ranges: Sequence[tuple[int, int]]) -> int:
-    """Return of how many rows a Gram row can be: no sum of their products reaches 2^61."""
-    largest = max((abs(end) for one in ranges for end in one), default=1)
+def max_gram_rows(ranges: Sequence[tuple[int, int]]) -> int:
+    """Return the maximum number of rows of a Gram row, whose sums stay below 2^61."""
+    largest = max((abs(limit) for limits in ranges for limit in limits), default=1)
     return min(ROWS_IN_A_SUM, (LARGEST_SUM - 1) // largest**2)
 
 
 def _indefinite(table: GramTable) -> BoolArray:
-    """Whether each matrix is not positive semidefinite."""
+    """Return a mask of the matrices that are not positive semidefinite."""
     matrix = table.moments()
     scale = 1 / np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1.0))
     matrix *= scale[:, :, None] * scale[:, None, :]
-    bad: BoolArray = np.linalg.eigvalsh(matrix)[:, 0] < -NEAR
-    return bad
+    indefinite: BoolArray = np.linalg.eigvalsh(matrix)[:, 0] < -EIGENVALUE_TOLERANCE
+    return indefinite
 
 
 COLUMNS = pa.schema(
@@ -267,7 +269,7 @@ COLUMNS = pa.schema(
         ("products", pa.list_(pa.int64())),
     ]
 )
-"""The table of Gram rows; `part` and `course_late` may be null or absent (`docs/export.md`)."""
+"""Schema of the Parquet file; `part` and `course_late` are optional (`docs/export.md`)."""
 
 OPTIONAL = ("part", COURSE_LATE)
 NAMES = ("vehicle_id", "drive_id")
@@ -275,18 +277,18 @@ TEXTS = tuple(field.name for field in COLUMNS if field.type == pa.string())
 MAX_FILE_BYTES = 2**28
 MAX_ROWS, MAX_DECODED_BYTES = 500_000, 2**30
 MAX_TEXT_BYTES = 2**28
-"""Texts of a file; as many rows as a file may have have some 300 bytes of them each."""
+"""Maximum size of the texts of a file; with `MAX_ROWS` rows some 300 bytes each."""
 BATCH_ROWS_READ = 2**12
-"""Rows that are decoded at once; a row of 200 columns has 160,000 bytes."""
-LONGEST_ROWS = 86_400 * round(1 / SAMPLE_TIME_S)
-"""Rows of a day: the drives of a car that begin on one day have no more together."""
+"""Rows per decoded batch; a row of 200 columns has 160,000 bytes."""
+MAX_ROWS_OF_A_DAY = 86_400 * round(1 / SAMPLE_TIME_S)
+"""Maximum number of rows of the drives of a car that begin on one day: 24 hours."""
 ONE_AT_A_TIME = "receive"
-"""Transaction of every such commit, so that two at once, perhaps of one drive, are a conflict."""
+"""Transaction of all imports: two at the same time, perhaps of one drive, are a conflict."""
 
 
 @dataclass(frozen=True)
 class OnboardImport(Answer):
-    """What became of a file of Gram rows: whether it is new, its drives, and rows behind them."""
+    """Result of an import of Gram rows; `new` is False for a file that was imported before."""
 
     file: str
     new: bool
@@ -295,16 +297,16 @@ class OnboardImport(Answer):
     rows: int
 
     def parts(self) -> Iterator[Part]:
-        """Return what was loaded, as a remark."""
+        """Return a remark on the imported rows."""
         grams, drives = pluralize(self.gram_rows, "Gram row"), pluralize(self.drives, "drive")
-        said = f"{grams} of {drives}, {pluralize(self.rows, 'row')}"
+        content = f"{grams} of {drives}, {pluralize(self.rows, 'row')}"
         yield Remark(
-            f"{self.file}: {said if self.new else 'nothing to do, it was ingested before'}"
+            f"{self.file}: {content if self.new else 'nothing to do, it was ingested before'}"
         )
 
 
 def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
-    """Load the Gram rows of a file, once. Raises `InputError`, `RepeatedError`, `ConflictError`."""
+    """Import a file of Gram rows once. Raises `InputError`, `RepeatedError` and `ConflictError`."""
     content = read_named_file(file, MAX_FILE_BYTES, InputError)
     table = _read(file, content)
     digest = hashlib.sha256(content).hexdigest()
@@ -322,9 +324,9 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
-        if grams.transaction_version(transaction.name) is not None:  # meanwhile, by another process
+        if grams.transaction_version(transaction.name) is not None:  # by another process in the meantime
             return
-        # Asked after the snapshot: who forgets a car from now on makes this commit a conflict.
+        # Checked after the snapshot: an erasure from now on makes this commit a conflict.
         _require_allowed(file, warehouse, numbered)
         _require_new(file, grams, numbered)
         replaced = files_to_rewrite(grams, frozenset())
@@ -347,7 +349,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
         _require_decodable(file, content, read_footer(stream, file))
         parquet = pq.ParquetFile(stream)
         columns = _documented_columns(file, parquet.schema_arrow)
-        # Texts stay in dictionaries until their length is known: one can stand in every row.
+        # Texts stay in dictionaries until their total length is known: one can be in every row.
         texts = [
             name
             for name in TEXTS
@@ -367,21 +369,20 @@ _SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping su
 
 
 def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
-    """Return the columns of Gram rows that a file has. Raises `InputError` for missing ones."""
+    """Return the columns of `COLUMNS` in a file. Raises `InputError` for missing ones."""
     for field in COLUMNS:
         if field.name not in {*schema.names, *OPTIONAL}:
             raise InputError(
                 f"{file}: not a table of Gram rows, column {field.name} is missing. {_SEE}"
             )
-        places = schema.get_all_field_indices(field.name)
-        if len(places) > 1:
+        indices = schema.get_all_field_indices(field.name)
+        if len(indices) > 1:
             raise InputError(f"{file}: has two columns {field.name}. Leave one of them out.")
-        for kind in (schema.field(place).type for place in places):
+        for kind in (schema.field(index).type for index in indices):
             if not _is_convertible(kind, field.type):
                 raise InputError(
                     f"{file}: column {field.name} has the type {quote_name(kind)[:80]}; write it "
-                    "as "
-                    f"{field.type} (docs/export.md)."
+                    f"as {field.type} (docs/export.md)."
                 )
     return [name for name in COLUMNS.names if name in schema.names]
 
@@ -399,10 +400,7 @@ def _is_convertible(kind: pa.DataType, to: pa.DataType) -> bool:
 
 
 def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """Yield the rows of batches, with normalized names. Raises `InputError` for what is too long.
-
-    Texts are converted only if all of them fit.
-    """
+    """Yield the rows of batches with normalized names. Raises `InputError` for too long texts."""
     first, text_bytes = 1, 0
     for batch in batches:
         batch.validate(full=True)  # texts are UTF-8
@@ -411,9 +409,9 @@ def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]
             texts = columns[name].cast(pa.dictionary(pa.int32(), pa.string()))
             if name in NAMES:
                 names = [normalize_name(text) for text in texts.dictionary.to_pylist()]
-                for place, text in enumerate(names):
+                for index, text in enumerate(names):
                     if text and (fault := find_name_fault(text)):
-                        row = pc.index(texts.indices, place).as_py()
+                        row = pc.index(texts.indices, index).as_py()
                         _refuse(
                             file, first + row, batch["drive_id"][row], f"has a {name} that {fault}"
                         )
@@ -435,10 +433,10 @@ def _too_large(file: Path) -> InputError:
 
 
 def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -> None:
-    """Raise `InputError` for pages that decode to too much, or that have no checksum.
+    """Raise `InputError` for pages that decode to too many bytes, or that have no checksum.
 
-    The headers of all pages are read, since the footer can state other sizes. Without a checksum a
-    flipped bit of a product goes unseen.
+    Reads the headers of all pages, since the footer can state other sizes. Without a checksum a
+    flipped bit of a product remains undetected.
     """
     if any(chunk.is_in_other_file for group in groups for chunk in group.chunks):
         raise ValueError("columns in another file")
@@ -464,20 +462,20 @@ def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -
                 pages += 1
                 if decoded > MAX_DECODED_BYTES or pages > MAX_PAGES:
                     raise _too_large(file)
-            if values != chunk.values:  # the reader would go on behind the pages
+            if values != chunk.values:  # the reader would continue behind the pages
                 raise ValueError("the footer and the pages state different numbers of values")
 
 
 VALUE_BYTES = 8
 MAX_PAGES = 2**18
-"""Pages of a file; a header takes some 10 µs to read."""
+"""Maximum number of pages of a file; reading a header takes some 10 µs."""
 
 
 def _gram_rows(
     sets: Mapping[str, OnboardFeatureSet], table: pa.Table, schema: pa.Schema, name: str
 ) -> pa.Table:
-    """Return rows of `grams`."""
-    identities = {counted.key: identity for identity, counted in sets.items()}
+    """Return the rows in the schema of the table `grams`."""
+    identities = {feature_set.key: identity for identity, feature_set in sets.items()}
     names = pa.array([identities[key] for key in table["feature_set"].to_pylist()])
     rows = table.set_column(table.column_names.index("feature_set"), "feature_set", names)
     rows = rows.append_column("file", pa.repeat(name, len(table)))
@@ -489,8 +487,7 @@ def _refuse(
 ) -> NoReturn:
     raise error(
         f"{file}: row {row} (drive {quote_name(str(drive)[:MAX_NAME_CHARACTERS])}) {reason}. "
-        "Nothing "
-        "of the file was loaded: correct or remove the row, and load the file again."
+        "Nothing of the file was loaded: correct or remove the row, and load the file again."
     )
 
 
@@ -505,36 +502,36 @@ def _with_digests(rows: pa.Table) -> pa.Table:
 
 
 def _require_different(file: Path, rows: pa.Table) -> None:
-    """Raise `InputError` for the first row with the counts of a row before it."""
-    seen: dict[str, str] = {}
+    """Raise `InputError` for the first row with the counts of an earlier row."""
+    first_drives: dict[str, str] = {}
     drives, digests = rows["drive_id"].to_pylist(), rows["digest"].to_pylist()
     for row, (drive, digest) in enumerate(zip(drives, digests, strict=True), 1):
-        if (other := seen.setdefault(digest, drive)) != drive:
+        if (other := first_drives.setdefault(digest, drive)) != drive:
             _refuse(file, row, drive, f"is there twice, first as {quote_name(other)}")
 
 
 def _require_possible(sets: Mapping[str, OnboardFeatureSet], file: Path, table: pa.Table) -> None:
-    """Raise `InputError` for the first row that no drive can have."""
-    by_key = {counted.key: counted for counted in sets.values()}
+    """Raise `InputError` for the first impossible row."""
+    by_key = {feature_set.key: feature_set for feature_set in sets.values()}
     described = [
-        {"columns": counted.columns, "parts": [part or "" for part in counted.parts]}
-        | {"key": key, "in_time": counted.in_time}
-        for key, counted in by_key.items()
+        {"columns": feature_set.columns, "parts": [block or "" for block in feature_set.blocks]}
+        | {"key": key, "in_time": feature_set.in_time}
+        for key, feature_set in by_key.items()
     ]
-    late = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
+    delays = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
     with open_database() as database, database_errors("checking Gram rows"):
         database.register("counted", _numbered(table))
         database.register("known", pa.Table.from_pylist(described))
         statement = read_sql("jobs", "counted_wrong.sql")
-        wrong = database.execute(statement, {**late, "longest": LONGEST_ROWS}).fetchone()
-    if wrong:
-        _refuse(file, *wrong)
+        fault = database.execute(statement, {**delays, "longest": MAX_ROWS_OF_A_DAY}).fetchone()
+    if fault:
+        _refuse(file, *fault)
     for row, reason in impossible_rows(_numbered(table), by_key):
         _refuse(file, row["number"], row["drive_id"], reason)
 
 
 def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:
-    """Raise `InputError` for a car or a drive that was forgotten, or that has such counts."""
+    """Raise `InputError` for an erased car or drive, or for the counts of an erased drive."""
     erasure_log = ErasureLog(warehouse.root)
     cars, drives = (rows[name].to_pylist() for name in NAMES)
     erased, counts = erasure_log.erased(set(cars), set(drives)), erasure_log.erased_count_digests()
@@ -548,7 +545,7 @@ def _require_allowed(file: Path, warehouse: Warehouse, rows: pa.Table) -> None:
 
 
 def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
-    """Raise `RepeatedError` for a drive that is there, with a log or without, under any name.
+    """Raise `RepeatedError` for a drive in the data root, with a log or without, under any name.
 
     Raises `InputError` for a car that would drive more than 24 hours on a day.
     """
@@ -557,15 +554,17 @@ def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
     with open_database(reading=grams.table.folder) as database:
         database.register("counted", rows)
         database.execute("SET VARIABLE gram_files = $files", {"files": grams.paths})
-        with reading_files(database, "looking for drives that are there"):
+        with reading_files(database, "finding repeated drives"):
             statement = read_sql("jobs", "counted_again.sql").format(received=RECEIVED_FILES)
-            again = database.execute(statement).fetchone()
+            repeated = database.execute(statement).fetchone()
             statement = read_sql("jobs", "counted_time.sql")
-            over = None if again else database.execute(statement, [LONGEST_ROWS]).fetchone()
-    if again:
-        row, drive, there = again
-        _refuse(file, row, drive, f"is there already, as {quote_name(there)}", RepeatedError)
-    if over:
-        row, drive = over
+            excess = None
+            if not repeated:
+                excess = database.execute(statement, [MAX_ROWS_OF_A_DAY]).fetchone()
+    if repeated:
+        row, drive, stored = repeated
+        _refuse(file, row, drive, f"is there already, as {quote_name(stored)}", RepeatedError)
+    if excess:
+        row, drive = excess
         reason = "makes its car drive more than 24 hours on a day, with what is stored"
         _refuse(file, row, drive, reason)

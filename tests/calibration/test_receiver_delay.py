@@ -154,7 +154,7 @@ def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path
 
 MODEL = "steering_mean_16,ay_mean_16,ay_square_mean_8,yaw_rate_speed_mean_8"
 CORRECTED = """
-    SELECT drive_id, signals, course_late, n, sums, products FROM grams
+    SELECT drive_id, signals, course_delay_quarter_ticks, row_count, sums, products FROM grams
     WHERE feature_set LIKE 'course-%' ORDER BY ALL
 """
 

@@ -91,7 +91,9 @@ def test_a_model_names_the_rows_that_it_was_made_of(
     report = run_command("select", "--models", "table1", "--json", root=more_sets).json
     model = report["models"][1]
     assert model["drives"] == report["drives"] == 8
-    counted = f"SELECT count(DISTINCT drive_id), sum(n) FROM grams WHERE {model['gram_rows']}"
+    counted = (
+        f"SELECT count(DISTINCT drive_id), sum(row_count) FROM grams WHERE {model['gram_rows']}"
+    )
     (row,) = ask(more_sets, counted)
     assert row == (model["drives"], model["rows"])
 

@@ -208,6 +208,13 @@ def kernel_rows(
     return found
 
 
+GRAM_ROWS = """
+    SELECT * RENAME (block AS part, row_count AS n, course_delay_quarter_ticks AS course_late)
+    FROM grams
+"""
+"""The view with the names of the table."""
+
+
 def received_rows(
     root: Path, content: bytes, configs: Configs = SHIPPED_CONFIGS
 ) -> list[dict[str, Any]]:
@@ -217,7 +224,7 @@ def received_rows(
     fleet.import_onboard_grams(
         write_counted(root / "rows", rows_of_messages(content, fleet.warehouse.catalog))
     )
-    found: list[dict[str, Any]] = fleet.sql("SELECT * FROM grams").to_arrow_table().to_pylist()
+    found: list[dict[str, Any]] = fleet.sql(GRAM_ROWS).to_arrow_table().to_pylist()
     return found
 
 

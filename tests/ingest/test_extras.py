@@ -144,7 +144,7 @@ def test_features_may_use_extras(warehouse: Warehouse, tmp_path: Path) -> None:
     update_grams(warehouse, feature_set="one_angle")
     ((names, n, sums),) = ask(
         warehouse.root,
-        "SELECT signals, n, sums FROM grams "
+        "SELECT signals, row_count, sums FROM grams "
         "WHERE starts_with(feature_set, 'one_angle') AND contains(signals, 'steer_doubled')",
     )
     assert (names, n) == ("ax,steer,steer_doubled,sideslip", ROWS + 1)
@@ -155,7 +155,7 @@ def test_features_may_use_extras(warehouse: Warehouse, tmp_path: Path) -> None:
     assert {row["n"]: row["signals"] for row in late}[ROWS] == "ax,steer_late_1,sideslip"
     ((plain, rows),) = ask(
         warehouse.root,
-        "SELECT signals, n FROM grams WHERE starts_with(feature_set, 'one_angle') "
+        "SELECT signals, row_count FROM grams WHERE starts_with(feature_set, 'one_angle') "
         "AND NOT contains(signals, 'steer')",
     )
     assert (plain, rows) == ("ax,sideslip", ROWS)

@@ -117,8 +117,8 @@ def test_cars_without_a_log_or_a_label_teach_the_very_same_model(
     taught = without_label(fleet)
     counter = build(tmp_path, sets_on_board(CATALOG, taught), "-O0")
     logged = fleet.sql(
-        "SELECT drive_id, any_value(course_late) FROM grams "
-        "WHERE course_late IS NOT NULL GROUP BY drive_id ORDER BY drive_id"
+        "SELECT drive_id, any_value(course_delay_quarter_ticks) FROM grams "
+        "WHERE course_delay_quarter_ticks IS NOT NULL GROUP BY drive_id ORDER BY drive_id"
     ).fetchall()
     columns = ", ".join(name for name in counter.signals if name != SIGNALS.label)
     sent = []

@@ -97,7 +97,8 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
         for drive in read_drives(fleet.warehouse, file, plan)
     }
     grams = fleet.sql(
-        f"SELECT drive_id, n, sums, signals FROM grams WHERE feature_set LIKE 'tiny_{line.digest}%'"
+        "SELECT drive_id, row_count, sums, signals FROM grams "
+        f"WHERE feature_set LIKE 'tiny_{line.digest}%'"
     )
     folds = {drive: line.fold_of(drive) for drive in rows}
     assert len(set(folds.values())) == len(line.folds) > 2
@@ -113,7 +114,7 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
         own = own[:, np.isfinite(own).all(axis=0)]
         micro_rad = (fitted[:-1] @ own[:-1] + fitted[-1]) * 100  # a count of the label is 0.0001
         total = gram["sums"][gram["signals"].split(",").index("line")]
-        assert abs(total / gram["n"] - micro_rad.mean()) < 0.6
+        assert abs(total / gram["row_count"] - micro_rad.mean()) < 0.6
 
 
 def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:

@@ -17,7 +17,7 @@ from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.on_board import (
     COLUMNS,
     INDEFINITE,
-    LONGEST_ROWS,
+    MAX_ROWS_OF_A_DAY,
     NO_ROWS,
     PRODUCTS,
     SUMS,
@@ -49,7 +49,7 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path:
     report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     assert (report.new, report.gram_rows, report.drives, report.rows) == (True, 6, 6, 3000)
     for row, gram in zip(gram_rows(fleet), grams, strict=True):
-        assert (row["n"], tuple(row["sums"]), tuple(row["products"])) == (
+        assert (row["row_count"], tuple(row["sums"]), tuple(row["products"])) == (
             gram.n,
             gram.sums,
             gram.products,
@@ -87,7 +87,7 @@ HERE = np.array(GRAM.products)
 K = len(GRAM.signals)
 NEGATIVE = HERE.copy()
 NEGATIVE[1] = int((HERE[0] * HERE[2]) ** 0.5) + 10**6
-TOO_LONG = (np.array(some) * (LONGEST_ROWS // 500 + 1) for some in (GRAM.sums, GRAM.products))
+TOO_LONG = (np.array(some) * (MAX_ROWS_OF_A_DAY // 500 + 1) for some in (GRAM.sums, GRAM.products))
 LONG_SUMS, LONG_PRODUCTS = TOO_LONG
 
 
@@ -108,7 +108,7 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
         ({"sums": [None, *GRAM.sums[1:]]}, "null"),
         (
             {
-                "n": 500 * (LONGEST_ROWS // 500 + 1),
+                "n": 500 * (MAX_ROWS_OF_A_DAY // 500 + 1),
                 "sums": LONG_SUMS.tolist(),
                 "products": LONG_PRODUCTS.tolist(),
             },
@@ -194,7 +194,7 @@ def long_drive(seed: int, rows: int, name: str) -> dict[str, Any]:
 
 
 def test_a_car_drives_24_hours_a_day_at_most(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
-    drives = [long_drive(seed, LONGEST_ROWS // 2, f"drive-{seed}") for seed in range(4)]
+    drives = [long_drive(seed, MAX_ROWS_OF_A_DAY // 2, f"drive-{seed}") for seed in range(4)]
     reason = "makes its car drive more than 24 hours on a day"
     with pytest.raises(InputError, match=rf"row 3 \(drive drive-2\) {reason}"):
         fleet.import_onboard_grams(write_counted(tmp_path / "three", drives[:3]))
@@ -261,7 +261,7 @@ def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:
     row = fleet.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
     (stored,) = row.to_arrow_table().to_pylist()
     signals = tuple(stored["signals"].split(","))
-    gram = Gram(signals, stored["n"], tuple(stored["sums"]), tuple(stored["products"]))
+    gram = Gram(signals, stored["row_count"], tuple(stored["sums"]), tuple(stored["products"]))
     same = {"vehicle_id": stored["vehicle_id"], "day": stored["day"]}
     return row_of(gram, drive_id=name, **same), stored["drive_id"]
 
