@@ -324,7 +324,9 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
-        if grams.transaction_version(transaction.name) is not None:  # by another process in the meantime
+        if (
+            grams.transaction_version(transaction.name) is not None
+        ):  # by another process in the meantime
             return
         # Checked after the snapshot: an erasure from now on makes this commit a conflict.
         _require_allowed(file, warehouse, numbered)
