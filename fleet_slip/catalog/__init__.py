@@ -1,1 +1,1 @@
-"""What is measured: signals, features and feature sets, and the integer SQL that both become."""
+"""The catalog: signals, features, columns over time and feature sets."""

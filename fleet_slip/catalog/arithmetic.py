@@ -1,4 +1,4 @@
-"""Takes the integer SQL of a feature apart, to compute the same integers without SQL.
+"""Parses the integer SQL of a feature, to compute the same integers without SQL.
 
 The SQL of a feature is arithmetic of + - * and // (which truncates), abs and sign over the counts
 of one row, perhaps inside CASE WHEN divisor >= number THEN ... END.
@@ -17,7 +17,7 @@ LARGEST_INPUT = 2**15
 """Largest size of a logged count, int16."""
 
 _TEXT = re.compile(r"(?!.*--|.*/\*)[A-Za-z0-9_+*/()<>=: -]{1,5000}")
-"""What can stand in it, of a manifest that may come from anywhere."""
+"""Permitted characters and length: a manifest may come from anywhere."""
 _CAST = re.compile(r"::BIGINT\b")
 _GUARDED = re.compile(r"CASE WHEN (.+) >= ([0-9]+) THEN (.+) END", re.DOTALL)
 _OVERFLOW = 2**63
@@ -36,7 +36,7 @@ def nearest(a: int, b: int) -> int:
 
 
 def nearest_sql(number: str, divisor: str) -> str:
-    """Return `nearest` as DuckDB has it, whose `//` truncates: half a divisor is added before."""
+    """Return `nearest` in DuckDB's SQL, whose `//` truncates: adds half a divisor before."""
     return f"(2 * ({number}) + sign({number}) * ({divisor})) // (2 * ({divisor}))"
 
 
@@ -49,12 +49,12 @@ COMPUTED: Mapping[str, Callable[..., int | None]] = {
     "abs": abs,
     "sign": lambda a: (a > 0) - (a < 0),
 }
-"""What each function of a step is."""
+"""Python function of each step."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One operation; its operands are numbers of earlier steps, a name or a constant."""
+    """One operation on earlier steps; without operands a signal `name` or a constant `value`."""
 
     function: str
     operands: tuple[int, ...] = ()
@@ -64,12 +64,16 @@ class Step:
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """An expression taken apart into steps, equal parts once; the last step is the result.
+    """A parsed expression.
 
-    Attributes:
-        steps: what to compute, in order.
-        guard: the step that must be at least `at_least` for the row to have a value.
-        inputs: names of the signals in it.
+    Attributes
+    ----------
+    steps
+        Operations in order, without repetitions; the last is the result.
+    guard, at_least
+        The row has a value if step `guard` is at least `at_least`.
+    inputs
+        Names of the signals.
     """
 
     steps: tuple[Step, ...]
@@ -80,9 +84,9 @@ class Arithmetic:
 
 @cache
 def parse(sql: str) -> Arithmetic:
-    """Take the SQL of a feature apart. Raises `QuestionError` if it is no such arithmetic.
+    """Parse the SQL of a feature.
 
-    Also if it could need more than 64 bits, where SQL would end with an error.
+    Raises `QuestionError` for anything but integer arithmetic, or if it could exceed 64 bits.
     """
     if not _TEXT.fullmatch(sql):
         raise QuestionError(f"{sql[:200]!r} is not integer arithmetic on counts.")
@@ -102,7 +106,7 @@ def parse(sql: str) -> Arithmetic:
 
 
 def evaluate(sql: str, counts: Mapping[str, int]) -> int | None:
-    """Return what the SQL of a feature comes to in one row; None where it has no value."""
+    """Evaluate the SQL of a feature in one row; return None if it has no value."""
     arithmetic, results = parse(sql), list[int]()
     for step in arithmetic.steps:
         if step.function:
@@ -121,14 +125,14 @@ def _tree(text: str) -> ast.expr:
 
 
 class _Builder:
-    """Collects steps, and the largest size that each can have."""
+    """Collects steps, with the largest absolute value of each."""
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
         self.bounds: list[int] = []
 
     def add(self, tree: ast.expr, *, last: bool = False) -> int:
-        """Add what computes a tree; return the number of its result."""
+        """Add the steps of a tree; return the number of its result."""
         step, bound = self._step(tree)
         if step in self.steps and not last:
             return self.steps.index(step)

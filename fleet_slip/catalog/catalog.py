@@ -37,7 +37,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS, Configs
 
 @dataclass(frozen=True)
 class FeatureSet:
-    """The columns of one kind of Gram row, and how a drive's rows are divided.
+    """The columns of one kind of Gram row, and the division of a drive's rows.
 
     Attributes
     ----------
@@ -73,23 +73,23 @@ class FeatureSet:
 
     @property
     def change_text(self) -> str:
-        """The times over which columns change, as messages say them."""
+        """The times over which columns change, for messages."""
         *earlier, last = (f"{time_s:f}" for time_s in self.change_s)
         return f"{', '.join(earlier)} and {last} s" if earlier else f"{last} s"
 
     @property
     def in_time(self) -> bool:
-        """Whether the delays of receivers are corrected in the Gram rows."""
+        """True if the delays of receivers are corrected in the Gram rows."""
         return bool(self.change_ticks) and not self.as_logged
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """What a model of this set may use."""
+        """Names of the inputs of a model of this set."""
         return (*self.signals, *self.features, *self.windows, *self.calibrated)
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns of a Gram row, in its order; calibrated ones follow from it."""
+        """The columns of a Gram row, in order; calibrated ones are derived from them."""
         beside = BESIDE if self.change_ticks else ()
         return (*self.signals, *self.features, *self.windows, *beside, self.label)
 
@@ -103,9 +103,9 @@ class FirstStageModels(Protocol):
 
 @dataclass(frozen=True)
 class Catalog:
-    """Everything that a data root's columns can be made of.
+    """Signals, features, feature sets and first-stage models of a data root; immutable.
 
-    A `Warehouse` owns it; functions receive it. It reads no environment and does not change.
+    A `Warehouse` owns it and passes it to functions.
 
     Attributes
     ----------
@@ -211,12 +211,12 @@ class Catalog:
         model = self.first_stage_models.find(digest) if self.first_stage_models else None
         if model is None:
             raise QuestionError(
-                f"the line {digest} is not in this data root. Publish the model again."
+                f"the first-stage model {digest} is not in this data root. Publish the model again."
             )
         estimate = self.estimates.get(model.estimate)
         if estimate is None or estimate.scale != model.scale:
             raise QuestionError(
-                f"{name}: the line's estimate was in counts of {model.scale} rad. "
+                f"{name}: the first-stage estimate had counts of {model.scale} rad. "
                 "configs/features.toml has changed: publish the model again, from its list."
             )
         return model
@@ -347,9 +347,9 @@ class Catalog:
         return dict(names.values())
 
     def identity(self, name: str) -> str:
-        """Return what the Gram rows of a set carry: its name and a checksum of its definition.
+        """Return the identity of a set in Gram rows: its name and a checksum of its definition.
 
-        The set of the logged signals is called `signals`, without a checksum.
+        The identity of the logged signals is `signals`, without a checksum.
         """
         if name == PLAIN:
             return PLAIN
@@ -410,8 +410,8 @@ class Catalog:
         if exists and self.identity(name) == identity:
             return name
         raise QuestionError(
-            f"the feature set {identity} is not defined as it was then: configs/features.toml has "
-            "changed. Publish the model again."
+            f"the definition of the feature set {identity} has changed in configs/features.toml. "
+            "Publish the model again."
         )
 
 

@@ -12,16 +12,16 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.signals import COUNT_MAX, Signal
 
 BLOCK = 2**14
-"""Values that are rounded at once: what is made on the way stays in the processor's cache."""
+"""Values per block, so that intermediate results stay in the processor's cache."""
 
 EVENTFUL_CHANGES = 256
-"""Counts, at least, that change, in a drive that is recognised by them alone."""
+"""Minimum number of changing counts to identify a drive by them alone."""
 
 
 def valid_values(values: FloatArray, signal: Signal) -> FloatArray:
     """Return values in SI units, NaN where the count is beyond the signal's valid range.
 
-    -32768 is beyond it: on board, that count is a missing one.
+    -32768 is invalid: on board, that count means missing.
     """
     counts = np.rint(values / float(signal.scale))
     beyond = (counts < max(signal.min_count, -COUNT_MAX)) | (counts > signal.max_count)
@@ -29,9 +29,9 @@ def valid_values(values: FloatArray, signal: Signal) -> FloatArray:
 
 
 def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
-    """Return `values / scale` as int16 counts, null where NaN, of arrays one after the other.
+    """Return `values / scale` of concatenated arrays as int16 counts, null where NaN.
 
-    Halves round to even. A value beyond the signal's valid range takes the range's end.
+    Halves round to even. Values beyond the signal's valid range are clipped.
     """
     counts = np.empty(sum(chunk.size for chunk in chunks), dtype=np.int16)
     scaled, scale = np.empty(min(counts.size, BLOCK)), float(signal.scale)
@@ -54,7 +54,7 @@ def round_chunks(chunks: Sequence[FloatArray], signal: Signal) -> pa.Array:
 def as_arrow(numbers: NDArray[Any], absent: BoolArray | None = None) -> pa.Array:
     """Return numbers as an Arrow array that shares their memory, null where they are absent.
 
-    Not `pa.array`: it copies, and imports pandas if that is installed.
+    `pa.array` copies, and imports pandas if that is installed.
     """
     valid = None
     if absent is not None:
@@ -66,9 +66,9 @@ def as_arrow(numbers: NDArray[Any], absent: BoolArray | None = None) -> pa.Array
 def digest_counts(
     vehicle_id: str, day: str, ticks: NDArray[np.int32], counts: Mapping[str, pa.Array]
 ) -> str:
-    """Return 16 characters that tell a drive by its counts, whatever its file or car is called.
+    """Return 16 characters that identify a drive by its counts.
 
-    Where little happens, as in a car that stands, car and day count too.
+    If few counts change, as in a standing car, the digest includes car and day.
     """
     import polars as pl  # noqa: PLC0415 - takes a while
 

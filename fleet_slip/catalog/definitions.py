@@ -1,12 +1,12 @@
-"""A column of counts over time: what it is, as types that a manifest can hold.
+"""Definitions of columns of counts over time, as types of a manifest.
 
-A window looks back on the counts of one row, a logged signal or a feature, within its drive. One
-rule for all, in SQL, in the compiled kernel and on board:
+A window covers past values of a logged signal or a feature within a drive. The same rules hold in
+SQL, in the compiled kernel and on board:
 
-* A window of N ticks is what was logged in the last N ticks, this one included. Where a drive
-  begins, or after a hole, that is fewer values; a mean divides by as many as there are.
-* Where the looked-back value itself is missing now, the mean and the sum are missing too.
-* The value N ticks ago, and the change since, are missing where no such tick was logged.
+* A window of N ticks contains the values logged in the last N ticks, the current one included. At
+  the start of a drive or after a gap there are fewer values; a mean divides by their number.
+* If the current value is missing, mean and sum are missing.
+* The value N ticks ago, and the change since, are missing if that tick was not logged.
 * Everything is an integer. A quotient is rounded to the nearest, halves away from zero, once; then
   the count is clipped to its bits.
 """
@@ -27,8 +27,8 @@ from fleet_slip.config import Config
 from fleet_slip.errors import QuestionError
 
 Over = Literal["mean", "sum", "lag", "change", "running_mean"]
-"""What a window makes of the values: mean or sum over the last ticks, the value so many ticks ago,
-its change since then, mean since the drive began."""
+"""Function of a window: mean or sum over the last ticks, value N ticks ago, change since then, mean
+since the start of the drive."""
 
 LONGEST_TICKS = 2**16
 """Longest window: eleven minutes."""
@@ -37,20 +37,20 @@ LARGEST_RATIO = 2**14
 """Largest numerator and denominator of a ratio of scales: keeps every quotient below 2^53."""
 
 MAX_ATTRIBUTE = 2**16
-"""Largest size of a number that a car knows of itself."""
+"""Largest absolute value of a numeric vehicle attribute."""
 
 COUNT_BITS = 16
-"""Bits of a logged count, and of a feature that does not say how many."""
+"""Bits of a logged count, and by default of a feature."""
 
 LARGEST_BITS = 20
-"""Bits of a column that does not say how many."""
+"""Bits of a column over time by default."""
 
 Bits = Annotated[int, Field(ge=COUNT_BITS, le=LARGEST_BITS)]
 
 AttributeText = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]{1,60}$")]
 
 NO_CAR_KNOWS = frozenset({"adhesion", "lost_control_s", "speed_factor", "saturated"})
-"""Drive columns that are known to a simulation or afterwards, and to no car while it drives."""
+"""Drive columns that only a simulation knows, or that are known after the drive."""
 
 NOT_ATTRIBUTES = NO_CAR_KNOWS | {
     *("drive_id", "drive_name", "source_file", "trip_id", "started_at", "duration_s", "rows"),
@@ -59,7 +59,7 @@ NOT_ATTRIBUTES = NO_CAR_KNOWS | {
 
 
 def limit_of(bits: int) -> int:
-    """Return the largest count of so many bits; the range is symmetric."""
+    """Return the largest count of `bits`; the range is symmetric."""
     return int(2 ** (bits - 1) - 1)
 
 
@@ -73,14 +73,14 @@ def _ratio(value: Fraction) -> Fraction:
 
 
 def _signals_of(info: ValidationInfo) -> SignalCatalog | None:
-    """Return the signals to check names against: the context of a file or document that is read."""
+    """Return the signals of the validation context, to check names; None without them."""
     return info.context if isinstance(info.context, SignalCatalog) else None
 
 
 def integer_arithmetic(sql: str, info: ValidationInfo) -> str:
-    """Return the SQL of a feature. Raises `ValueError` if it is more than integer arithmetic.
+    """Validate the SQL of a feature. Raises `ValueError` for more than integer arithmetic.
 
-    With a `SignalCatalog` as context it must also be of input signals.
+    With a `SignalCatalog` as context, its names must be input signals.
     """
     if not sql:
         return sql
@@ -108,12 +108,12 @@ LARGEST_DIVISOR = 2**46
 LARGEST_WEIGHT = 2**10
 
 LARGEST_SLOPE = 2**36
-"""Largest part of a slope's ratio: times 25 bits it has 61."""
+"""Largest numerator or denominator of a slope's ratio: times 25 bits it has 61."""
 
 Whole = Annotated[int, Field(ge=-(2**62), le=2**62)]
 
 LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
-"""The first digits of a line's checksum."""
+"""The first digits of a first-stage model's checksum."""
 
 
 _LEFT_OUT = Field(exclude_if=lambda value: value is None)
@@ -122,8 +122,8 @@ _LEFT_OUT = Field(exclude_if=lambda value: value is None)
 class AttributeFactor(Config):
     """A vehicle attribute, as a whole number, as a factor of a column.
 
-    The number is `name` rounded, less `less`; or with `equals` 1 for cars of that value, 0 for
-    others. The column's count times that number times `ratio` is rounded and clipped again.
+    The factor is attribute `name`, rounded, minus `less`; with `equals`, 1 for cars of that value
+    and 0 for others. Column times factor times `ratio` is rounded and clipped.
     """
 
     name: Annotated[Identifier, AfterValidator(_not_unknowable)]
@@ -147,15 +147,18 @@ WEIGHT = 2**10
 
 
 class Gate(Config):
-    """How much of a column counts, in parts of `WEIGHT`: a hat over another column.
+    """The weight of a column: a hat function of another column.
 
-    The weight is 0 up to `low`, `WEIGHT` at `peak`, and 0 again from `high`, linear in between and
-    rounded down on the way up, so that the weights of neighbours add up to `WEIGHT`. Without `high`
-    it stays full. The column's count times the weight over `WEIGHT` is rounded.
+    The weight is 0 up to `low`, `WEIGHT` at `peak`, and 0 from `high`, linear in between. It is
+    rounded down on the way up, so that neighbouring weights add up to `WEIGHT`. Without `high` it
+    stays full. Column times weight over `WEIGHT` is rounded.
 
-    Attributes:
-        by: the column that opens and closes the gate; it has no gate or factor itself.
-        low, peak, high: counts of it, rising.
+    Attributes
+    ----------
+    by
+        The column that determines the weight; it has no gate or factor.
+    low, peak, high
+        Counts of it, increasing.
     """
 
     by: "Definition"
@@ -176,16 +179,20 @@ class Gate(Config):
 class ParameterFactor(Config):
     """A calibration parameter of the car as a factor of a column.
 
-    The column's count times the number's, less `less`: not rounded, and not clipped. A car whose
-    number is not known takes the mean since its drive began, `running`, of the same grain; without
-    one it counts as a usual car, whose number is `less`.
+    The product with the parameter's count minus `less` is neither rounded nor clipped. If the
+    parameter is unknown, the mean since the start of the drive replaces it, `running`; without that
+    the factor is 0, as of a typical car.
 
-    Attributes:
-        name: of the number.
-        grain: physical value of one of its counts.
-        less: taken from its count, so that the factor is small for a usual car.
-        alone: whether the column is the number itself, wherever what it is `of` has a value.
-        running: column that takes its place.
+    Attributes
+    ----------
+    name, grain
+        The parameter, and the physical value of one count.
+    less
+        Count of a typical car.
+    alone
+        True if the column is the factor itself, wherever the base column has a value.
+    running
+        Column that replaces an unknown parameter.
     """
 
     name: CalibrationParameterName
@@ -205,9 +212,9 @@ class ParameterFactor(Config):
 
 
 class Combination(Config):
-    """The estimate of a line, or any sum of columns: `(intercept + sum(c * column)) / divisor`.
+    """A linear combination of columns: `(intercept + sum(c * column)) / divisor`.
 
-    `line` names the line whose coefficients these are; "" where none has been fitted yet.
+    `line` is the digest of its first-stage model, "" if that has not been fitted yet.
     """
 
     intercept: Whole = 0
@@ -228,7 +235,7 @@ def _product_ratio(value: Fraction) -> Fraction:
 
 
 class Product(Config):
-    """The product of two columns times `ratio`; of one, it times `ratio`; of none, `ratio`."""
+    """The product of up to two columns and `ratio`."""
 
     of: tuple["Definition", ...] = Field(max_length=2)
     ratio: Annotated[Fraction, AfterValidator(_product_ratio)] = Fraction(1)
@@ -248,9 +255,9 @@ def _weight(value: Fraction) -> Fraction:
 
 
 class Equation(Config):
-    """What a column `y` is, but for noise, at each tick: a sum of unknowns times columns `x`.
+    """A linear equation at each tick: `y` is the sum of unknowns times columns `x`, plus noise.
 
-    A whole number in `x` is a column that is always the same. `weight` is that of its products.
+    An integer in `x` is a constant column. `weight` multiplies its products.
     """
 
     y: "Definition"
@@ -264,7 +271,7 @@ class Equation(Config):
 
 
 class Slope(Config):
-    """The first unknown of equations, by least squares over all ticks since the drive began.
+    """The first unknown of equations, by least squares over all ticks since the drive's start.
 
     Products of columns, each a sixteenth and rounded, are summed up over the ticks that lack
     nothing, and `ridge` is added to each diagonal: Gaussian elimination of whole numbers then
@@ -292,24 +299,31 @@ class Slope(Config):
 
 
 Made = Combination | Product | Slope
-"""What is made of other columns."""
+"""Composites of other columns."""
 
 
 class Definition(Config):
-    """Everything that defines a column of counts over time, whatever it is called.
+    """The definition of a column of counts over time, independent of its name.
 
-    Attributes:
-        of: the signal, feature, or what is made of columns, that is looked back on.
-        sql: integer SQL of that feature; empty for a logged signal.
-        made: what is made of other columns, if that is looked back on.
-        of_bits: to which the feature's count is clipped.
-        over, ticks: the window; ticks is 0 for all since the drive began. Without `over` it is
-            the value of this row.
-        ratio: counts of the column for one count of what is looked back on.
-        bits: to which the column's count is clipped.
-        fact: a factor, if there is one.
-        gate: how much of all that counts, if it is not everything.
-        number: a factor that the car's own drives tell, if there is one.
+    Attributes
+    ----------
+    of
+        Name of its source: a signal, a feature or a composite of columns.
+    sql
+        Integer SQL of a feature; empty for a logged signal.
+    made
+        Composite of columns, if that is the source.
+    of_bits
+        Bits to which the source is clipped.
+    over, ticks
+        The window; `ticks` is 0 for all since the start of the drive. Without `over` it is the
+        current value.
+    ratio
+        Counts of the column per count of the source.
+    bits
+        Bits to which the column is clipped.
+    fact, gate, number
+        A vehicle attribute, a weight and a calibration parameter that multiply it.
     """
 
     of: Identifier
@@ -346,7 +360,7 @@ class Definition(Config):
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The logged signals in it."""
+        """Names of its logged signals."""
         names: dict[str, None] = {}
         for row in self.rows():
             inputs = parse(row.sql).inputs if row.sql else () if row.made else (row.of,)
@@ -354,9 +368,9 @@ class Definition(Config):
         return tuple(names)
 
     def rows(self, seen: "set[int] | None" = None) -> "Iterator[Definition]":
-        """Yield what it and the columns in it look back on, each as a column of one row.
+        """Yield the sources of it and its columns, each as a column of one row.
 
-        What is made of columns is passed over if its identity was `seen`.
+        Skips composites whose identity was `seen`.
         """
         seen = set() if seen is None else seen
         if self.made is None or id(self.made) not in seen:
@@ -370,7 +384,7 @@ class Definition(Config):
 
     @property
     def row(self) -> "Definition":
-        """What it looks back on, as a column of one row."""
+        """Its source, as a column of one row."""
         return Definition.model_construct(
             of=self.of, sql=self.sql, made=self.made, of_bits=self.of_bits, bits=self.of_bits
         )
@@ -382,17 +396,17 @@ class Definition(Config):
 
     @property
     def components(self) -> tuple["Definition", ...]:
-        """What it is made of, each without a gate: itself, or the gated column and the gate's."""
+        """Its components without gates: itself, or the gated column and the gate's column."""
         return (self.ungated, self.gate.by) if self.gate else (self,)
 
 
 def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition:
-    """Return the definition of a signal, or of a feature of so many bits, as a column itself."""
+    """Return the definition of a signal or feature as a column of one row."""
     return Definition.model_construct(of=name, sql=sql, of_bits=bits, bits=bits)
 
 
 def rows_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
-    """Return what columns look back on, each as a column of one row, by name.
+    """Return the sources of columns, each as a column of one row, by name.
 
     Raises `QuestionError` if a column has the name of a feature behind one and is something else,
     or a feature is defined in two ways.
@@ -415,29 +429,29 @@ def rows_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
     return rows
 
 
-# Which columns change sign, and nothing else, when left and right are exchanged: odd ones.
+# Odd columns change sign, and nothing else, when left and right are exchanged.
 #
-# The side-slip angle does. So a line without an intercept is one of odd columns: an even one, such
-# as the longitudinal acceleration, has a mean that would stand in the place of the intercept.
+# The side-slip angle is odd. So a model without an intercept uses odd columns: the mean of an even
+# one, such as the longitudinal acceleration, would replace the intercept.
 
 OPPOSITE = frozenset(
     {"ay", "yaw_rate", "steering_wheel", "steer", "steer_fl", "steer_fr", "roll_rate"}
 )
-"""Signals of the other sign in the mirror. A front wheel's angle is nearly that of the other."""
+"""Signals that change sign in the mirror. Both front wheels have nearly the same angle."""
 EXCHANGED = {"wheel_fl": "wheel_fr", "wheel_rl": "wheel_rr"}
 EXCHANGED |= {right_wheel: left_wheel for left_wheel, right_wheel in EXCHANGED.items()}
-"""Signals that are those of the other side in the mirror; what is in neither stays."""
+"""Signals that the mirror exchanges; it does not change the others."""
 OFFSETS = frozenset({"yaw_rate_offset", "ay_offset", "steering_offset"})
-"""Numbers of a car of the other sign in the mirror."""
+"""Calibration parameters that change sign in the mirror."""
 TRIALS = 16
-"""Rows that a definition is tried on."""
+"""Rows on which a definition is evaluated."""
 
 
 @cache
 def parity(column: Definition) -> int:
     """Return -1 for an odd column, 1 for an even one, 0 for one that is neither.
 
-    A gate must be opened by an even column: hats over an odd one differ from side to side.
+    The column of a gate must be even: weights by an odd one differ from side to side.
     """
     if column.made:  # no set of changes has what is made of columns
         return 0
@@ -459,7 +473,7 @@ def _value(column: Definition, row: Mapping[str, int]) -> int | None:
 
 
 def _trial_rows(definition: Definition) -> tuple[Mapping[str, int], ...]:
-    """Return counts of cars at speed, whose left and right wheels differ, the same every time."""
+    """Return reproducible counts of moving cars with different left and right wheels."""
     draw = Random(1)  # noqa: S311 - no secret
     names = sorted({*definition.signals, *EXCHANGED})
     return tuple(

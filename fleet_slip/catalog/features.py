@@ -39,7 +39,7 @@ PLAIN = "signals"
 """The feature set whose columns are the catalog's inputs and label themselves."""
 
 FAMILIES = ("windows", "products", "estimates", "slopes", "factors", "gates", "calibrated")
-"""Tables of the file that make columns over time, in the order in which they stand."""
+"""Tables of the file that define columns over time, in order."""
 
 
 class FeatureSetEntry(Config):
@@ -47,17 +47,16 @@ class FeatureSetEntry(Config):
 
     description: str = Field(min_length=1)
     of: Identifier | None = None
-    """The set whose columns these are the changes of, beside those that are named."""
+    """The set whose columns' changes this set contains, besides the named ones."""
     signals: tuple[Identifier, ...] = ()
     features: tuple[Identifier, ...] = ()
     windows: tuple[Identifier, ...] = ()
     calibrated: tuple[Identifier, ...] = ()
     block_s: Decimal | None = Field(default=None, gt=0, le=100_000)
     change_s: tuple[Decimal, ...] = ()
-    """Instead of the columns, what they change by in so much time, with the course as the label;
-    of several times, each is a part of the drive."""
+    """Times over which columns change, with the course as label; one block of rows per time."""
     as_logged: bool = False
-    """Whether the course of changes stays where it was logged, however late its receiver is."""
+    """True if the delay of the course is not corrected."""
 
     @field_validator("change_s", mode="before")
     @classmethod
@@ -93,12 +92,12 @@ class FeatureSetEntry(Config):
 
     @property
     def block_ticks(self) -> int | None:
-        """Number of ticks of a block of time; None where rows are not divided by time."""
+        """Length of a block in ticks; None if rows are not divided by time."""
         return None if self.block_s is None else int(Fraction(self.block_s) / SAMPLE_TIME_S)
 
     @property
     def change_ticks(self) -> tuple[int, ...]:
-        """Numbers of ticks over which columns change; none where they stand for themselves."""
+        """Numbers of ticks over which columns change; empty if they do not."""
         return tuple(int(Fraction(time_s) / SAMPLE_TIME_S) for time_s in self.change_s)
 
 

@@ -26,7 +26,7 @@ SAMPLE_TIME_S = Fraction(1, 100)
 IDENTIFIER_PATTERN = r"^[a-z][a-z0-9_]{0,40}$"
 
 Identifier = Annotated[str, StringConstraints(pattern=IDENTIFIER_PATTERN)]
-"""A name that is safe to stand in SQL unquoted."""
+"""A name that is safe in SQL without quotes."""
 
 
 _SYMBOL = r"(?:m|s|kg|rad|N|Pa|W|K|A|V)(?:\^[2-9])?"
@@ -37,7 +37,7 @@ pattern, because a units library takes half a second to start and every command 
 
 
 class Scaled(Config):
-    """What is logged, or computed, in counts. `physical = scale * count`."""
+    """A quantity in counts: `physical = scale * count`."""
 
     scale: Decimal = Field(gt=0)
 
@@ -56,9 +56,9 @@ class Signal(Scaled):
     max: Decimal
     role: Literal["input", "extra", "label", "truth"]
     stepwise: bool = False
-    """Whether it changes in steps, such as a gear: between two samples the first one holds."""
+    """True if it changes in steps, such as a gear: resampling holds the previous value."""
     cyclic: bool = False
-    """Whether it is an angle of which 65,536 counts are a whole turn, so that int16 wraps."""
+    """True for an angle of 65,536 counts per turn, so that int16 wraps."""
     description: str = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -97,7 +97,7 @@ class DriveColumn(Config):
 
     type: Literal["string", "double", "integer", "timestamp"]
     optional: bool = False
-    """Whether a file has the column only where a drive in it has a value."""
+    """True if a file has the column only if one of its drives has a value."""
     description: str = Field(min_length=1)
 
     @property
@@ -122,7 +122,7 @@ NEEDED_DRIVE_COLUMNS = (
     *("drive_id", "trip_id", "vehicle_id", "vehicle_model", "source", "campaign", "track"),
     *("mass_kg", "adhesion", "speed_factor", "started_at", "duration_s", "rows", "saturated"),
 )
-"""What the shipped SQL asks of drives."""
+"""Drive columns that the shipped SQL requires."""
 
 
 class SignalCatalog(Config):
@@ -168,15 +168,15 @@ class SignalCatalog(Config):
 
     @cached_property
     def extras(self) -> tuple[str, ...]:
-        """Names of the signals that some cars log besides, in catalog order.
+        """Names of the signals that only some cars log, in catalog order.
 
-        A file of the logs has their columns only where a drive in it has them.
+        A log file has their columns only if one of its drives has them.
         """
         return tuple(name for name, signal in self.signals.items() if signal.role == "extra")
 
     @cached_property
     def optional(self) -> tuple[str, ...]:
-        """Names of the columns that a file of the logs has only where a drive has a value."""
+        """Names of the columns that a log file has only if one of its drives has a value."""
         return (*(name for name, column in self.drive.items() if column.optional), *self.extras)
 
     @cached_property
@@ -191,11 +191,11 @@ class SignalCatalog(Config):
 
     @property
     def stored_columns(self) -> tuple[str, ...]:
-        """Names of the columns that may come to the table `logs` with a new catalog."""
+        """Names of the columns of the table `logs` that depend on the catalog."""
         return (*self.drive, *self.signals)
 
     def null_sql(self, name: str) -> str:
-        """Return SQL of a stored column that has no value."""
+        """Return the SQL of a stored column without a value."""
         kind = "SMALLINT" if name in self.signals else self.drive[name].sql_type
         return f"NULL::{kind} AS {name}"
 

@@ -1,6 +1,6 @@
-"""Features and columns over time of `configs/features.toml`, as types that make columns.
+"""Features and columns over time of `configs/features.toml`.
 
-A family knows what its columns are called, and makes them of those that are known.
+A family names its columns and makes them from existing ones.
 """
 
 import math
@@ -45,7 +45,7 @@ from fleet_slip.config import Config
 # Features of `configs/features.toml` as types: integer functions of the counts of one row.
 
 _DECLARED = re.compile(r"(?:[a-z0-9_+\-*() ]|// [1-9][0-9]*(?![0-9]))+")
-"""What `configs/features.toml` may say; division that rounds comes of `divided_by`."""
+"""Expressions permitted in `configs/features.toml`; `divided_by` rounds instead."""
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -75,7 +75,7 @@ class Feature(Scaled):
 
     @cached_property
     def sql(self) -> str:
-        """The count before it is clipped, as SQL over the view `log_counts`."""
+        """The unclipped count, as SQL over the view `log_counts`."""
         counts = _widened(self.counts)
         if self.divided_by is None:
             return counts
@@ -91,7 +91,7 @@ class Feature(Scaled):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The signals that it is computed from."""
+        """Names of its signals."""
         return tuple(parse(self.sql).inputs)
 
 
@@ -106,7 +106,7 @@ def _widened(text: str) -> str:
 
 
 class TimeColumn(Scaled):
-    """One column over time: how it is defined, and what a count of it is worth."""
+    """One column over time: its definition and scale."""
 
     definition: Definition
     unit: ColumnUnit
@@ -115,14 +115,14 @@ class TimeColumn(Scaled):
 
 
 class NotYetMadeError(Exception):
-    """A column is made of one that is to be made before."""
+    """A column depends on one that has not been made yet."""
 
 
 @dataclass
 class KnownColumns:
-    """What columns can be made of: signals, features, and the columns over time that there are.
+    """Sources of columns: signals, features, and the columns over time made so far.
 
-    `missing` are the names of those that are to be made.
+    `missing` contains the names of columns that have not been made yet.
     """
 
     signals: SignalCatalog
@@ -131,7 +131,7 @@ class KnownColumns:
     missing: frozenset[str] = frozenset()
 
     def of(self, name: str) -> Signal | Feature | TimeColumn:
-        """Return an input by name. Raises `ValueError` for what is none, and `NotYetMadeError`."""
+        """Return an input by name. Raises `ValueError` if unknown, and `NotYetMadeError`."""
         if name in self.missing:
             raise NotYetMadeError
         if column := self.over_time.get(name) or self.features.get(name):
@@ -141,7 +141,7 @@ class KnownColumns:
         return self.signals[name]
 
     def definition(self, name: str) -> Definition:
-        """Return a column over time, or a row as one. Raises `ValueError` for no input."""
+        """Return the definition of an input. Raises `ValueError` if unknown."""
         column = self.of(name)
         if isinstance(column, TimeColumn):
             return column.definition
@@ -150,7 +150,7 @@ class KnownColumns:
         return Definition(of=name)
 
     def columns(self, *names: str) -> list[TimeColumn]:
-        """Return columns over time. Raises `ValueError` for what is none, and `NotYetMadeError`."""
+        """Return columns over time. Raises `ValueError` if unknown, and `NotYetMadeError`."""
         if not self.missing.isdisjoint(names):
             raise NotYetMadeError
         if unknown := [name for name in names if name not in self.over_time]:
@@ -159,7 +159,7 @@ class KnownColumns:
 
 
 class ColumnFamily(Config):
-    """What makes columns over time."""
+    """A table entry that defines columns over time."""
 
     description: str = Field(min_length=1)
 
@@ -172,20 +172,20 @@ class ColumnFamily(Config):
         raise NotImplementedError
 
     def _column(self, definition: Definition, **other: Any) -> TimeColumn:
-        """Return a column that is called as the family is, but for what is given."""
+        """Return a column with the family's attributes, except for `other`."""
         names = ("scale", "unit", "column", "description")
         shared = {name: getattr(self, name) for name in names if name not in other}
         return TimeColumn(definition=definition, **shared, **other)
 
 
 TICKS = "{ticks}"
-"""In the column of a family of windows: the number of ticks of each."""
+"""Placeholder for the number of ticks in the name of a window's column."""
 
 
 class Window(ColumnFamily):
-    """A family of columns that look back on a signal, feature, product or estimate: one of N ticks.
+    """A family of windows over a signal, feature, product or estimate.
 
-    The column of N ticks is called NAME_N; the mean since the drive began is called NAME.
+    The column of N ticks is called NAME_N; the mean since the start of the drive is called NAME.
     """
 
     of: Identifier
@@ -238,7 +238,7 @@ class Window(ColumnFamily):
 
 
 class Factor(ColumnFamily):
-    """A column times what a car knows of itself: a number less `less`, or whether it `equals`."""
+    """A column times a vehicle attribute: a number minus `less`, or 1 if it `equals` a text."""
 
     of: Identifier
     fact: Identifier
@@ -262,7 +262,7 @@ class Factor(ColumnFamily):
 
 
 class Calibrated(ColumnFamily):
-    """A column times a number that the car's own drives tell; `alone`, the number by itself."""
+    """A column times a calibration parameter; `alone`, the parameter itself."""
 
     of: Identifier
     number: CalibrationParameterName
@@ -311,7 +311,7 @@ class Calibrated(ColumnFamily):
 
 
 class MadeColumn(ColumnFamily):
-    """A column that is made of others."""
+    """A composite of other columns."""
 
     scale: Decimal = Field(gt=0)
     unit: SIUnit
@@ -322,12 +322,12 @@ class MadeColumn(ColumnFamily):
 
 
 class EstimateColumn(MadeColumn):
-    """The estimate of a line that is fitted before, by the `line` of a model list."""
+    """The estimate of a first-stage model, which the `line` of a model list names."""
 
     unit: Literal["rad"] = "rad"
 
     def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
-        """Return the estimate of a line that has not been fitted."""
+        """Return the estimate of a model that has not been fitted."""
         return self._of(name, Combination(line=""))
 
 
@@ -345,10 +345,10 @@ class ProductColumn(MadeColumn):
 
 
 class EquationColumns(Config):
-    """What tells a slope: `y`, a sum of columns, is the slope times `of`, but for noise.
+    """An equation of a slope: `y`, a sum of columns, is the slope times `of` plus noise.
 
-    Other unknowns times the columns `beside` come to it; a whole number there is a column that is
-    always the same. It counts with a `weight`, at most 1.
+    Further terms are unknowns times the columns `beside`; an integer is a constant column. The
+    equation has a `weight` of at most 1.
     """
 
     y: dict[Identifier, Literal[-1, 1]] = Field(min_length=1)
@@ -358,7 +358,7 @@ class EquationColumns(Config):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The columns in it."""
+        """Names of its columns."""
         return (*self.y, self.of, *(column for column in self.beside if isinstance(column, str)))
 
 
@@ -400,17 +400,17 @@ class SlopeColumn(MadeColumn):
 
 
 class GateFamily(ColumnFamily):
-    """Several linear models with a blend between them, as columns: one for each knot but the first.
+    """Columns of a gate, which blends linear models: one for each knot except the first.
 
-    At a knot one model holds alone; between two knots they are mixed in proportion. Weights add up
-    to one, so that a model has the columns themselves and, for each further knot, what changes
-    there. The column of a knot is called COLUMN_NAME_K, K from 1.
+    At a knot one model holds; between two knots both are mixed linearly. Weights add up to one, so
+    a model contains the columns themselves and, for each further knot, the change there. The column
+    of a knot is called COLUMN_NAME_K, K from 1.
     """
 
     of: Identifier
-    """The column over time that opens and closes the gates."""
+    """The column over time that determines the weights."""
     knots: tuple[Decimal, ...] = Field(min_length=2, max_length=20)
-    """Physical values of it, rising; beyond the ends the outermost models hold."""
+    """Physical values of it, increasing; the outermost models hold beyond the ends."""
     columns: tuple[Identifier, ...] = Field(min_length=1)
     """Columns over time that are gated."""
 

@@ -1,4 +1,4 @@
-"""What each operation is in SQL: plain SQL of many engines, and what DuckDB writes otherwise.
+"""SQL of the operations and columns: plain SQL of many engines, and DuckDB's.
 
 Null is a missing value. Integers have 64 bits.
 """
@@ -27,7 +27,7 @@ from fleet_slip.columns.lowering import (
 from fleet_slip.errors import DataError, QuestionError
 
 QUOTIENT = "CAST(ROUND(({0} - {0} % {1}) / {1}) AS BIGINT)"
-"""{0} / {1}, truncated; exact in floating point too: a small multiple of the divisor."""
+"""{0} / {1}, truncated. Exact in floating point too, as a small multiple of the divisor."""
 
 _POWER = "(1 + 0 * {0}" + "".join(
     f" + CASE WHEN {{0}} > CAST({1 << bit} AS BIGINT) * {{1}} THEN {1 << bit} ELSE 0 END"
@@ -68,12 +68,12 @@ DIVIDES = ("//", "nearest")
 
 
 def sql_constant(value: int) -> str:
-    """Return a constant; a negative one may stand behind a minus."""
+    """Return a constant; in parentheses if negative, as a minus may precede it."""
     return str(value) if value >= 0 else f"({value})"
 
 
 def attribute_sql(attribute: VehicleAttribute) -> str:
-    """Return the whole number of a fact, given the column of the drive; null if not known."""
+    """Return the SQL of a vehicle attribute's integer from the drive's column; null if unknown."""
     if attribute.equals is None:
         is_valid = f"ABS({attribute.name}) <= {MAX_ATTRIBUTE}"
         return f"CASE WHEN {is_valid} THEN CAST(ROUND({attribute.name}) AS BIGINT) END"
@@ -84,7 +84,7 @@ def attribute_sql(attribute: VehicleAttribute) -> str:
 def sql_of(
     operation: str, operands: list[str], *plain: int, divides_by: int, table: Mapping[str, str]
 ) -> str:
-    """Return an operation on operands in SQL; `divides_by` is the least that the divisor can be."""
+    """Return an operation in SQL; `divides_by` is the smallest possible divisor."""
     frame = f"RANGE BETWEEN {plain[0] - 1} PRECEDING AND CURRENT ROW" if plain and plain[0] else ""
     text = table[operation].format(
         *operands,
@@ -98,14 +98,13 @@ def sql_of(
 
 
 INLINE = ("+", "-", "*", "negative")
-"""What may stand within another step, where it is used once."""
+"""Operations that are inlined if used once."""
 
 
 class SqlLayers:
-    """The layers of steps; those that are asked for are written, with what they need.
+    """Subquery layers of the requested steps and their operands.
 
-    Attributes:
-        layers: the columns of each, by its number from 1.
+    `layers` contains the columns of each layer, by its number from 1.
     """
 
     def __init__(
@@ -121,13 +120,13 @@ class SqlLayers:
         self._texts: dict[int, tuple[str, int]] = {}
 
     def text(self, number: int) -> tuple[str, int]:
-        """Return a step in SQL, and the layer that has all columns in it."""
+        """Return the SQL of a step, and the layer that defines its columns."""
         if number not in self._texts:
             self._texts[number] = self._written(number)
         return self._texts[number]
 
     def column(self, number: int) -> tuple[str, int]:
-        """Return a step as one word."""
+        """Return a step as the name of a column, and its layer."""
         text, layer = self.text(number)
         if " " in text:
             self._texts[number] = self._named(number, text, layer)
@@ -161,12 +160,12 @@ class SqlLayers:
         return f"step_{number}", layer + 1
 
 
-# Columns lowered for the warehouse, which counts how often a value is clipped.
+# Lowering for the warehouse, which counts clipped values.
 #
-# Clipping comes last, lest what is missing be counted; exported programs clip first: the same.
+# It clips last, so that missing values are not counted. Exported programs clip first: same values.
 
 LOGGED: Range = (-(2**15), 2**15 - 1)
-"""What 16 bits of a log can hold."""
+"""Range of logged counts."""
 
 
 class _ClippedLast(Lowering):
@@ -176,13 +175,17 @@ class _ClippedLast(Lowering):
 
 @dataclass(frozen=True)
 class CountedColumns:
-    """Steps, and how often what they clip counts.
+    """Steps of columns, with the weight of their clipping.
 
-    Attributes:
-        steps: those of `lowered` by their numbers, with the range of each in `ranges`.
-        places: the step of each column of one row, and of each column over time, by name.
-        times: how often a step's clipping counts: once for each feature or column over time that
-            it is in; for gates and what they gate, once in all.
+    Attributes
+    ----------
+    steps, ranges
+        The steps of `lowered` in order, and their ranges.
+    places
+        The step of each column, by name.
+    times
+        Weight of a step's clipping: once per feature or column over time that contains it; once in
+        all for gates and gated columns.
     """
 
     lowered: Lowering
@@ -195,7 +198,7 @@ class CountedColumns:
     def of(
         cls, rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
     ) -> "CountedColumns":
-        """Lower columns over time, and the `rows` that they look back on with others."""
+        """Lower columns over time, and `rows`, which include their sources."""
         signals = dict.fromkeys(name for definition in rows.values() for name in definition.signals)
         lowered = _ClippedLast({name: place for place, name in enumerate(signals)})
         components = [
@@ -212,7 +215,7 @@ class CountedColumns:
         ]
         components += dict.fromkeys(gated)
         places = {}
-        for name, row in rows.items():  # a row, and all that looks back on it, stand together
+        for name, row in rows.items():  # each row is followed by the columns that use it
             places[name] = lowered.row(row)
             for component in components:
                 if component.of == name:
@@ -228,7 +231,7 @@ class CountedColumns:
 
 
 def components_of(column: Definition) -> Iterator[Definition]:
-    """Yield what a column is made of, each without a gate or a number."""
+    """Yield the components of a column, without gates and calibration parameters."""
     if column.number is not None:
         yield from components_of(column.model_copy(update={"number": None}))
         if column.number.running is not None:
@@ -240,7 +243,7 @@ def components_of(column: Definition) -> Iterator[Definition]:
 def rows_of(
     rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
 ) -> dict[str, Definition]:
-    """Return columns of one row, looked back on ones too. Raises `QuestionError`, `DataError`."""
+    """Add the sources of columns to `rows`. Raises `QuestionError`, `DataError`."""
     merged = dict(rows)
     for name, row in rows_behind(over_time).items():
         if merged.setdefault(name, row) != row:
@@ -249,7 +252,7 @@ def rows_of(
 
 
 def _clips(steps: tuple[Step, ...], end: int, ends: Iterable[int]) -> set[int]:
-    """Return the steps that clip on the way to a step from `ends`, which are not looked into."""
+    """Return the clipping steps between `ends` and a step."""
     clips, waiting = set[int](), [end]
     while waiting:
         step = waiting.pop()
@@ -259,13 +262,13 @@ def _clips(steps: tuple[Step, ...], end: int, ends: Iterable[int]) -> set[int]:
     return clips
 
 
-# The SQL of columns of counts, of a row and over time, as subqueries of `log_counts`.
+# SQL of columns as subqueries of `log_counts`.
 
 _SEPARATOR = ",\n            "
 
 
 def with_absent(signals: SignalCatalog, rows: str, absent: Sequence[str]) -> str:
-    """Return a table expression with stored columns that none of its files has, as nulls."""
+    """Return a table expression with absent stored columns as nulls."""
     if not absent:
         return rows
     nulls = ", ".join(map(signals.null_sql, absent))
@@ -275,10 +278,10 @@ def with_absent(signals: SignalCatalog, rows: str, absent: Sequence[str]) -> str
 def with_columns(
     rows: str, features: Mapping[str, Definition], over_time: Mapping[str, Definition]
 ) -> str:
-    """Return a subquery: the rows of a table expression with features and columns over time.
+    """Return a subquery that adds features and columns over time to rows.
 
-    `clipped` counts what was out of range in a row. Raises `QuestionError` or `DataError` for a
-    feature that is defined in two ways.
+    `clipped` counts the values of a row beyond their range. Raises `QuestionError` or `DataError`
+    for a feature with two definitions.
     """
     if not features and not over_time:
         return rows

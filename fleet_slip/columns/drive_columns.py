@@ -1,4 +1,4 @@
-"""From the counts of one drive to the integer columns of a feature set, sample by sample.
+"""Computes the integer columns of a feature set from the counts of one drive.
 
 Gram rows, scores, evaluations and predictions come through it, and it computes what
 the SQL of `fleet_slip.columns.column_sql` says.
@@ -25,13 +25,18 @@ _COUNTS = np.iinfo(np.int16)
 
 @dataclass(frozen=True)
 class DriveCounts:
-    """One drive in the order of time.
+    """The counts of one drive.
 
-    Attributes:
-        ticks: rising, shape (rows,).
-        counts, present: by signal, shape (rows,); a signal that never is missing has no `present`.
-        facts: what the car knows of itself, by drive column.
-        numbers: counts of what the car's drives before determined; those that are known.
+    Attributes
+    ----------
+    ticks
+        Increasing, shape (rows,).
+    counts, present
+        By signal, shape (rows,); a signal without missing values has no `present`.
+    facts
+        Vehicle attributes, by drive column.
+    numbers
+        Counts of the known calibration parameters.
     """
 
     ticks: NDArray[Any]
@@ -42,13 +47,13 @@ class DriveCounts:
 
     @property
     def is_complete(self) -> bool:
-        """Whether no tick between the first and the last is missing."""
+        """True if no tick between the first and the last is missing."""
         return bool(int(self.ticks[-1]) - int(self.ticks[0]) + 1 == len(self.ticks))
 
     def segment(
         self, rows: Any, facts: Mapping[str, Any], numbers: Mapping[str, int]
     ) -> "DriveCounts":
-        """Return some of the rows, as those of a drive of which that is known."""
+        """Return some rows, with these attributes and parameters."""
         counts = {name: values[rows] for name, values in self.counts.items()}
         present = {name: values[rows] for name, values in self.present.items()}
         return DriveCounts(self.ticks[rows], counts, present, facts, numbers)
@@ -75,21 +80,21 @@ def as_counts(
 
 
 class Workspace:
-    """The memory of a plan's columns, for one drive after the other and one thread.
+    """Reusable memory of a plan's columns, for one thread.
 
-    `rows_at_most` are those that memory was taken for.
+    `rows_at_most` is the number of rows for which memory is allocated.
     """
 
     def __init__(self, plan: ColumnPlan) -> None:
-        """Take a plan; memory is taken when a drive comes."""
+        """Set the plan; memory is allocated with the first drive."""
         self.plan, self._program = plan, plan.program
         self.rows_at_most = -1
 
     def blocks(self, drive: DriveCounts) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Yield a drive's columns block by block: which rows, values and how often clipped.
+        """Yield blocks of a drive: row range, values, and number of clipped values per row.
 
-        Values have the shape (columns, rows), NaN where missing; their memory is used again. Raises
-        `DataError` for a drive that cannot be looked back on.
+        Values have the shape (columns, rows), NaN where missing; their memory is reused. Raises
+        `DataError` for a drive with invalid ticks or too many rows.
         """
         rows, columns = len(drive.ticks), len(self.plan.names)
         self._load(drive, rows)
@@ -131,7 +136,7 @@ class Workspace:
 
 
 def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
-    """Raise `DataError` for a drive of which not every sum would be exact."""
+    """Raise `DataError` for a drive whose sums may not be exact."""
     rows = len(drive.ticks)
     if (drive.ticks[1:] <= drive.ticks[:-1]).any():
         raise DataError(

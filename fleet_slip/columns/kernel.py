@@ -17,7 +17,7 @@ from fleet_slip.compiling import equation, inner_loop, kernel
 def _calculate(  # noqa: PLR0912 - one loop for each operation
     operation: int, out: Any, a: Any, b: Any
 ) -> None:
-    """Do an operation that is the same for binary64 and int64."""
+    """Execute an operation that is the same for binary64 and int64."""
     size = len(out)
     if operation == op.COPY:
         for i in range(size):
@@ -53,9 +53,9 @@ def compute(  # noqa: PLR0912 - one loop for each operation
     limit: float,
     times: float,
 ) -> None:
-    """Do an operation that writes binary64; `places` are where out, a and b begin.
+    """Execute an operation that writes binary64; `places` are the begins of out, a and b.
 
-    What is clipped counts so many `times` in the first rows of the memory.
+    Clipped values add `times` to the first rows of the memory.
     """
     at, of_a, of_b = places
     out, a = memory[at : at + size], memory[of_a : of_a + size]
@@ -123,7 +123,7 @@ def compute(  # noqa: PLR0912 - one loop for each operation
 
 @inner_loop
 def compute_integers(operation: int, memory: Any, places: Any, size: int, number: int) -> None:
-    """Do an operation that writes int64; `COPY` is from binary64."""
+    """Execute an operation that writes int64; `COPY` reads binary64."""
     at, of_a, of_b = places
     integers = memory.view(np.int64)
     out, a, b = integers[at : at + size], integers[of_a : of_a + size], integers[of_b : of_b + size]
@@ -185,7 +185,7 @@ def clip(value: float, limit: float) -> Any:
 def add_up(
     memory: Any, values: int, sums: int, counts: int, first: int, size: int, gaps: Any
 ) -> Any:
-    """Write running sums of a block; return whether there have been gaps, which counts are for."""
+    """Write running sums of a block; return True after gaps, which counts account for."""
     a, out = memory[values : values + size], memory[sums + first : sums + first + size + 1]
     count = memory[counts : counts + first + size + 1]
     total = out[0] if first else 0.0
@@ -280,7 +280,7 @@ def find_begins(memory: Any, of_ticks: int, rows: int, ticks: int, begins: int) 
 
 
 GAPS, FOUND = 0, 1
-"""Rows of `flags`: whether a sum has had gaps, and whether a kind's begins were found."""
+"""Rows of `flags`: a sum has had gaps; the begins of a window length are computed."""
 
 
 @kernel
@@ -289,8 +289,8 @@ def run(
 ) -> None:
     """Compute the block of rows that begins with `first`.
 
-    `steps` and `ratios` are a program, `memory` its registers, `flags` what is known of sums and
-    windows; `ticks` begin there.
+    `steps` and `ratios` are a program, `memory` its registers, `flags` the state of sums and
+    windows, and `ticks` the place of the ticks in the memory.
     """
     size = min(op.BLOCK_ROWS, rows - first)
     memory[:size] = 0.0

@@ -1,8 +1,8 @@
-"""The operations that every column is made of: docs/export.md says what each computes.
+"""Lowers columns to steps of some twenty integer operations (docs/export.md).
 
-A step is an operation, the numbers of earlier steps, then plain numbers. Its value is a whole
-number of at most 63 bits, or missing where an operand is ("operands" if that is all). Targets have
-a table with a line an operation, and take ranges, missing and look-back from here.
+A step is an operation, the numbers of earlier steps, then plain numbers. Its value is an integer of
+at most 63 bits, or missing. Each target (SQL, kernel, C, ONNX) has a table with one entry per
+operation, and uses the ranges, rules of missing values and look-back of this module.
 """
 
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
@@ -35,16 +35,16 @@ Step = tuple[str | int, ...]
 Range = tuple[int, int]
 
 Missing = Literal["never", "given", "operands", "divisor", "less", "both"]
-"""Where a step is missing: never; where what is given or remembered is; where an operand is; also
-for a divisor not above zero, or a first operand below the second; where both are.
+"""When a step is missing: never; with its input or past value; with an operand; also for a divisor
+not above zero, or for a first operand below the second; if both operands are missing.
 """
 
 
 @dataclass(frozen=True)
 class Operation:
-    """An operation: its range, from those of its `steps` operands, then its plain numbers.
+    """An operation on `steps` operands, with the function of its range.
 
-    `over_time`: it looks back on its step.
+    `over_time`: True if it uses past values of its operand.
     """
 
     range_of: Callable[..., Range]
@@ -54,7 +54,7 @@ class Operation:
 
 
 def _corners(compute: Callable[[int, int], int]) -> Callable[[Range, Range], Range]:
-    """Return the range of what rises or falls in each operand: its extremes are at the ends."""
+    """Return the range of a function that is monotonic in each operand."""
 
     def range_of(a: Range, b: Range) -> Range:
         corners = [compute(x, y) for x in a for y in b]
@@ -77,7 +77,7 @@ def _powers(a: Range, divisor: Range) -> Range:
 
 
 POWERS = 32
-"""So many powers of two a target that cannot count them compares with."""
+"""Number of powers of two with which targets without bit operations compare."""
 
 
 def power(value: int, divisor: int) -> int:
@@ -90,7 +90,7 @@ def _sums(a: Range, _: int, count: int) -> Range:
 
 
 OPERATIONS: Mapping[str, Operation] = {
-    # What is given: its place. The range is that of `given`, see `ranges_of`.
+    # Inputs, by their place. `ranges_of` receives their ranges.
     "signal": Operation(_first, 0, "given"),
     "fact": Operation(_first, 0, "given"),
     "number": Operation(_first, 0, "given"),
@@ -108,11 +108,11 @@ OPERATIONS: Mapping[str, Operation] = {
     "sign": Operation(lambda a: ((a[0] > 0) - (a[0] < 0), (a[1] > 0) - (a[1] < 0)), 1),
     "clip": Operation(lambda _, limit: (-limit[1], limit[1])),
     "power": Operation(_powers),  # of two, the least p with a <= b p
-    # What may be missing.
+    # Missing values.
     "at_least": Operation(_first, missing="less"),
     "where": Operation(_first),
     "else": Operation(lambda a, b: (min(a[0], b[0]), max(a[1], b[1])), missing="both"),
-    # What looks back, on so many ticks.
+    # Past values, with a number of ticks.
     "ago": Operation(_first, 1, "given", over_time=True),
     "sum": Operation(_sums, 1, "never", over_time=True),
     "values": Operation(lambda *operands: (0, operands[2]), 1, "never", over_time=True),
@@ -127,12 +127,12 @@ def operation_of(step: Step) -> str:
 
 
 def plain_of(step: Step) -> tuple[int, ...]:
-    """Return everything that a step works on: numbers of steps, then plain numbers."""
+    """Return the operands of a step: numbers of steps, then plain numbers."""
     return tuple(int(operand) for operand in step[1:])
 
 
 def operands_of(step: Step) -> tuple[int, ...]:
-    """Return the numbers of the steps that a step works on."""
+    """Return the numbers of the steps that are operands of a step."""
     return plain_of(step)[: OPERATIONS[operation_of(step)].steps]
 
 
@@ -152,7 +152,7 @@ def ranges_of(steps: Sequence[Step], inputs: Mapping[str, Sequence[Range]]) -> l
 
 
 def roots_of(steps: Sequence[Step], ranges: Sequence[Range]) -> list[tuple[int, ...]]:
-    """Return, for each step, the steps that must be there by themselves for it to be there."""
+    """Return, for each step, the steps whose presence determines its presence."""
     result: list[tuple[int, ...]] = []
     for number, step in enumerate(steps):
         missing, operands = OPERATIONS[operation_of(step)].missing, operands_of(step)
@@ -172,7 +172,7 @@ def roots_of(steps: Sequence[Step], ranges: Sequence[Range]) -> list[tuple[int, 
 
 
 def _mean_of(steps: Sequence[Step], mean: int, now: int) -> set[int]:
-    """Return the quotients in a mean by the number of values of a window that `now` is in."""
+    """Return the quotients in a mean whose window contains the value `now`."""
     quotients, inner = set[int](), [mean]
     while inner:
         number = inner.pop()
@@ -188,7 +188,7 @@ def _mean_of(steps: Sequence[Step], mean: int, now: int) -> set[int]:
 
 
 def rings_of(steps: Sequence[Step]) -> dict[int, int]:
-    """Return the steps that are looked back on, and how many ticks; 0 are all since the start."""
+    """Return the steps whose past values are used, with the number of ticks; 0 for all."""
     rings: dict[int, int] = {}
     for step in steps:
         if OPERATIONS[operation_of(step)].over_time:
@@ -198,40 +198,38 @@ def rings_of(steps: Sequence[Step]) -> dict[int, int]:
 
 
 def size_of(interval: Range) -> int:
-    """Return the largest size of a value of a range."""
+    """Return the largest absolute value of a range."""
     return max(-interval[0], interval[1])
 
 
 def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
-    """Return the largest size of a step's value, and of what rounding it computes."""
+    """Return the largest absolute value of a step, including intermediate values of rounding."""
     if step[0] == "nearest":
         a, b = (size_of(ranges[i]) for i in operands_of(step))
         return 2 * a + b
     return size_of(ranges[number])
 
 
-# Lowers signals, features, windows, factors, gates and own numbers to steps: the one place.
-#
-# Columns are `fleet_slip.catalog.definitions`, steps `fleet_slip.columns.lowering`, once each.
+# The lowering of `fleet_slip.catalog.definitions` to steps, each step once.
 
 Key = TypeVar("Key", bound=Hashable)
 
 LARGEST_WORD = 2**63 - 1
-"""Largest size of anything that steps compute."""
+"""Largest absolute value of any step."""
 
 MOST_VALUES = 2**31 - 1
-"""Most values of a running mean: 248 days."""
+"""Maximum number of values of a running mean: 248 days."""
 
 
 @dataclass(frozen=True)
 class VehicleAttribute:
-    """What a car knows of itself: a number, rounded; or, with `equals`, 1 if it is that, else 0."""
+    """A vehicle attribute: a rounded number; with `equals`, 1 if it has that value, else 0."""
 
     name: str
     equals: str | None = None
 
     def count(self, value: Any) -> int | None:
-        """Return the whole number for what a car knows; None where it does not know it."""
+        """Return the integer of an attribute's value; None if unknown."""
         if value is None:
             return None
         if self.equals is not None:
@@ -242,7 +240,7 @@ class VehicleAttribute:
 
     @property
     def field(self) -> str:
-        """Its name where programs have one name for each."""
+        """Unique name for programs."""
         if self.equals is None:
             return self.name
         return f"{self.name}_is_" + "".join(c if c.isalnum() else "_" for c in self.equals).lower()
@@ -250,7 +248,7 @@ class VehicleAttribute:
 
 @dataclass(frozen=True)
 class ParameterCount:
-    """What a car's own drives tell of it: a count of so many `grain`."""
+    """A calibration parameter as an input: a count of `grain`."""
 
     name: str
     unit: str
@@ -259,7 +257,7 @@ class ParameterCount:
 
 @dataclass
 class Lowering:
-    """Steps in an order in which they can be computed; signals, facts and numbers by place."""
+    """Steps in the order of computation; signals, attributes and parameters by place."""
 
     signals: Mapping[str, int]
     steps: dict[Step, int] = field(default_factory=dict)
@@ -271,7 +269,7 @@ class Lowering:
     def of(
         cls, signals: Sequence[str], columns: Sequence[Definition]
     ) -> tuple["Lowering", list[int]]:
-        """Lower columns; return the step of each, too."""
+        """Lower columns; return the lowering and the step of each column."""
         self = cls({name: place for place, name in enumerate(signals)})
         for column in columns:
             self._rows(column)
@@ -296,7 +294,7 @@ class Lowering:
         return self.steps.setdefault((operation, *operands), len(self.steps))
 
     def constant(self, value: int) -> int:
-        """Return the number of a step that is always the same."""
+        """Return the number of a constant step."""
         return self.do("constant", value)
 
     def clip(self, step: int, limit: int) -> int:
@@ -304,7 +302,7 @@ class Lowering:
         return self.do("clip", step, self.constant(limit))
 
     def clip_where(self, step: int, limit: int, presence: Callable[[], int]) -> int:
-        """Return a step within ±limit, where another one is there too, which comes after it."""
+        """Return a step within ±limit that is missing with a later step, `presence`."""
         return self.do("where", self.clip(step, limit), presence())
 
     def nearest(self, step: int, numerator: int, divisor: int) -> int:
@@ -317,7 +315,7 @@ class Lowering:
         return self.do("-", step, self.constant(constant)) if constant else step
 
     def _rows(self, column: Definition) -> None:
-        """Add what a column is made of at one tick, before anything that looks back."""
+        """Add the sources of a column, before steps that use past values."""
         self.row(column)
         if column.gate is not None:
             self.row(column.gate.by)
@@ -325,9 +323,9 @@ class Lowering:
             self.row(column.number.running)
 
     def row(self, column: Definition) -> int:
-        """Return the step of what a column looks back on: a signal, or a feature clipped."""
+        """Return the step of a column's source: a signal or a clipped feature or composite."""
         if column.made:
-            key = id(column.made)  # of several columns, computed again for none
+            key = id(column.made)  # shared by several columns
             if key not in self._made:
                 self._made[key] = self._made_of(column.made)
             return self.clip(self._made[key], limit_of(column.of_bits))
@@ -392,7 +390,7 @@ class Lowering:
         return self.nearest(times, 1, self.constant(WEIGHT))
 
     def weight(self, by: int, gate: Gate) -> int:
-        """Return the weight of a gate: what rises, or what falls where that is less."""
+        """Return the step of a gate's weight: the lesser of both ramps."""
         full, none = self.constant(WEIGHT), self.constant(0)
         rises = self._ramp(by, gate.low, gate.peak)
         opened = self.do("max", self.do("min", rises, full), none)
@@ -415,9 +413,9 @@ class Lowering:
         return self.do("where", factor, base) if number.alone else self.do("*", base, factor)
 
     def _made_of(self, composite: Made) -> int:
-        """Return the step of what is made of columns.
+        """Return the step of a composite.
 
-        Raises `QuestionError` for the estimate of a line that has not been fitted.
+        Raises `QuestionError` for the estimate of a model that has not been fitted.
         """
         if isinstance(composite, Slope):
             return self._slope(composite)
@@ -429,7 +427,7 @@ class Lowering:
             )
         if composite.line == "":
             raise QuestionError(
-                "its columns are made of the estimate of a line, which is fitted first. Run: "
+                "its columns use the estimate of a first-stage model, which is not fitted. Run: "
                 "fleet-slip publish NAME --models learning, or another list of its feature set"
             )
         terms = [
@@ -442,11 +440,11 @@ class Lowering:
         return self.nearest(total, 1, self.constant(composite.divisor))
 
     def _slope(self, slope: Slope) -> int:
-        """Eliminate all unknowns but the first, which comes before the right-hand side.
+        """Eliminate all unknowns except the first, which is last before the right-hand side.
 
-        Sums of products are divided by one power of two, so that no sum of squares is above
-        `PIVOT`. These bound all others (Cauchy and Schwarz), and elimination makes none larger:
-        clipping is for what rounding adds.
+        Dividing all sums of products by one power of two limits the sums of squares to `PIVOT`.
+        These bound the others (Cauchy-Schwarz), and elimination makes none larger; clipping only
+        removes rounding errors.
         """
         last = len(slope.ridge)
         sums = self._normal_equations(slope)
@@ -469,7 +467,7 @@ class Lowering:
         return self.nearest(entries[last - 1, last], slope.ratio.numerator, times)
 
     def _normal_equations(self, slope: Slope) -> dict[tuple[int, int], int]:
-        """Return sums of products, with the ridge: the first unknown last, then `y`."""
+        """Return the sums of products with the ridge, in reverse order of unknowns, then `y`."""
         order = [*range(len(slope.ridge) - 1, -1, -1), None]
         products = [self._products_of(equation, order) for equation in slope.equations]
         sums = {}
@@ -487,7 +485,7 @@ class Lowering:
     def _products_of(
         self, equation: Equation, order: Sequence[int | None]
     ) -> dict[tuple[int, int], int]:
-        """Return the products of an equation's columns at one tick; 0 where one is missing."""
+        """Return the products of an equation's columns at one tick; 0 if one is missing."""
         columns = [equation.y if unknown is None else equation.x[unknown] for unknown in order]
         steps = [
             self.constant(column) if isinstance(column, int) else self.column(column)
@@ -510,14 +508,14 @@ class Lowering:
 
 
 GRAIN = 16
-"""Of the products that a slope sums up."""
+"""Divisor of the products that a slope sums."""
 
 PIVOT = 2**25
-"""Largest size of a slope's equations, so that twice a product of two is exact in binary64."""
+"""Largest entry of a slope's equations, so that twice a product is exact in binary64."""
 
 
 def most_products(equations: int) -> int:
-    """Return how many ticks a slope sums up at most, so that twice a sum is below 2^53."""
+    """Return the maximum number of ticks of a slope, so that twice a sum is below 2^53."""
     largest = equations * nearest(limit_of(COUNT_BITS) ** 2, GRAIN)
     return 2**51 // largest
 
@@ -525,7 +523,7 @@ def most_products(equations: int) -> int:
 def given_ranges(
     signals: Sequence[Range], facts: Iterable[VehicleAttribute], numbers: Collection[ParameterCount]
 ) -> dict[str, list[Range]]:
-    """Return the valid ranges of signals, facts and numbers: what is beyond is missing."""
+    """Return the valid ranges of signals, attributes and parameters; other values are missing."""
     fact = (-MAX_ATTRIBUTE, MAX_ATTRIBUTE)
     return {
         "signal": list(signals),
@@ -535,7 +533,7 @@ def given_ranges(
 
 
 def most_values(column: Definition) -> int:
-    """Return how many values a window adds up at most, so that 2 sum numerator has 64 bits."""
+    """Return the maximum number of values of a window, so that 2 sum numerator has 64 bits."""
     if column.over != "running_mean":
         return column.ticks
     limit = limit_of(column.of_bits) if column.sql else COUNT_MAX
@@ -544,5 +542,5 @@ def most_values(column: Definition) -> int:
 
 
 def _place(places: dict[Key, int], key: Key) -> int:
-    """Return the place of a key, in the order in which they came."""
+    """Return the place of a key; append a new one."""
     return places.setdefault(key, len(places))

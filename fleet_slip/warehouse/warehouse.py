@@ -54,7 +54,9 @@ class StackedModels:
                 model = None
             if model is None or model.digest != digest:
                 file = documents.file(1)
-                raise StorageError(f"{file}: no line of that checksum. Restore the folder.")
+                raise StorageError(
+                    f"{file}: no first-stage model of that checksum. Restore the folder."
+                )
             self._models[digest] = model
         return self._models[digest]
 

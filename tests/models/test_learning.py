@@ -1,4 +1,4 @@
-"""Two stages: a line that is fitted first, and one whose columns have its estimate."""
+"""Stacked models: a first-stage model whose estimate is an input of a second."""
 
 import json
 import shutil
@@ -199,11 +199,11 @@ def test_a_line_that_was_changed_is_refused(fleet: Fleet, own_set: Path) -> None
 
 
 def test_a_set_without_its_line_has_no_rows(fleet: Fleet) -> None:
-    with pytest.raises(QuestionError, match="fitted first"):
+    with pytest.raises(QuestionError, match="first-stage model, which is not fitted"):
         update_grams(fleet.warehouse, feature_set="tiny")
     with pytest.raises(QuestionError, match="choose a model list"):
         fleet.cohort().select(features="tiny", model="ay")
-    with pytest.raises(QuestionError, match="the line 0123456789ab is not"):
+    with pytest.raises(QuestionError, match="the first-stage model 0123456789ab is not"):
         update_grams(fleet.warehouse, feature_set="tiny_0123456789ab")
 
 
