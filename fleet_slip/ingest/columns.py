@@ -26,7 +26,7 @@ from fleet_slip.ingest.formats.source import OWN_TIME
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
 _POWER = re.compile(r"(?<=[^\W\d_])([2-9])(?!\w)")
-_LONGEST_UNIT = 40
+_MAX_UNIT_CHARACTERS = 40
 
 _NEEDS = {
     "rad": "an angle, such as 'deg'",
@@ -53,8 +53,8 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     if si_unit == "1" and unit in _NUMBERS:
         return _NUMBERS[unit]
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
-    if len(unit) > _LONGEST_UNIT or not _EXPRESSION.fullmatch(unit):
-        raise ValueError(f"has the invalid unit {unit[:_LONGEST_UNIT]!r}; {needs}")
+    if len(unit) > _MAX_UNIT_CHARACTERS or not _EXPRESSION.fullmatch(unit):
+        raise ValueError(f"has the invalid unit {unit[:_MAX_UNIT_CHARACTERS]!r}; {needs}")
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
     if name not in registry:  # a digit after a letter is a power, as in m/s2

@@ -27,7 +27,7 @@ from fleet_slip.ingest.guess import (
 )
 from fleet_slip.ingest.profile import FileProfile
 
-_MOST_REFUSED = 20
+_MAX_REFUSED = 20
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
 
 def _refused(profile: FileProfile) -> Iterator[str]:
     """Yield the channels that could not be read, with reasons."""
-    more = len(profile.refused) - _MOST_REFUSED
-    for reason in profile.refused[:_MOST_REFUSED]:
+    more = len(profile.refused) - _MAX_REFUSED
+    for reason in profile.refused[:_MAX_REFUSED]:
         yield f"not read: {reason}"
     if more > 0:
         yield f"not read: {more:,} channels more."

@@ -34,7 +34,7 @@ from fleet_slip.ingest.resampling import (
     place_label,
 )
 
-LONGEST_DRIVE_S = 2**19 * STEP_S
+MAX_DRIVE_S = 2**19 * STEP_S
 """A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
 
 
@@ -61,7 +61,7 @@ class DriveCutter:
     The result does not depend on the blocks: a row that needs the next one waits for it.
     """
 
-    def __init__(self, base: TimeBase, longest_s: float = LONGEST_DRIVE_S) -> None:
+    def __init__(self, base: TimeBase, longest_s: float = MAX_DRIVE_S) -> None:
         """Set the gap that ends a drive, and the maximum duration of a part."""
         self._gap_s = base.split_gap_s + TIME_EPSILON_S
         self._longest_s = longest_s

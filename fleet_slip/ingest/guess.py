@@ -249,8 +249,8 @@ _STEPS = ((0.5, "s"), (500.0, "ms"), (500_000.0, "us"), (np.inf, "ns"))
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _EPOCH_S = (6e8, 4e9)
 """Times between 1989 and 2096 are counted from 1970."""
-_MOST_CARS = 1000
-_LEAST_RISING = 0.95
+_MAX_CARS = 1000
+_MIN_RISING_SHARE = 0.95
 
 
 @dataclass(frozen=True)
@@ -270,7 +270,7 @@ def guess_cars(profiles: Iterable[Profile]) -> tuple[dict[str, dict[str, str]], 
         for profile in profiles:
             if not profile.keys.size or not is_called(words, profile.channel.name):
                 continue
-            if np.unique(profile.keys).size > min(_MOST_CARS, max(profile.keys.size // 20, 1)):
+            if np.unique(profile.keys).size > min(_MAX_CARS, max(profile.keys.size // 20, 1)):
                 continue
             keys[key] = {"drive" if key == "column" else "column": profile.channel.name}
             if not group.size or group.size == profile.keys.size:
@@ -298,7 +298,7 @@ def guess_time(
             continue
         values = values[np.isfinite(values)]
         steps = np.diff(values)
-        if steps.size and (steps >= 0).mean() >= _LEAST_RISING:
+        if steps.size and (steps >= 0).mean() >= _MIN_RISING_SHARE:
             candidates.append((float((steps > 0).mean()), candidate, values))
     if candidates:
         _, candidate, values = max(candidates, key=lambda item: round(item[0], 2))

@@ -201,7 +201,7 @@ def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
 
 # The fields of a mapping: values in SI units and their problems.
 
-LONGEST_TEXT = 200
+MAX_VALUE_CHARACTERS = 200
 """Characters of offending values that are kept."""
 
 
@@ -483,5 +483,5 @@ def _explain(bad: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
         "group",
         pl.lit(REASONS[reason]).alias("reason"),
         pl.lit(field.name or None, pl.String).alias("signal"),
-        field.raw.cast(pl.String).str.slice(0, LONGEST_TEXT).alias("value"),
+        field.raw.cast(pl.String).str.slice(0, MAX_VALUE_CHARACTERS).alias("value"),
     )

@@ -11,11 +11,11 @@ import polars as pl
 
 from fleet_slip.ingest.formats.source import Spool
 
-MOST_OPEN_VALUES = 2**21
+MAX_OPEN_VALUES = 2**21
 """Values of drives that have not ended, in memory; all others wait in a temporary file."""
-MOST_PARTS = 64
+MAX_PARTS_AT_ONCE = 64
 """Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
-MOST_PIECES, BUNDLED_GROUPS = 512, 128
+MAX_SINGLE_PIECES, BUNDLED_GROUPS = 512, 128
 """Maximum number of parts that are spilled one by one; beyond it groups are bundled."""
 
 
@@ -95,8 +95,8 @@ class OpenDrives:
             yield from self._unbundled()
 
     def _take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
-        for start in range(0, len(parts), MOST_PARTS):
-            chunk = parts[start : start + MOST_PARTS]
+        for start in range(0, len(parts), MAX_PARTS_AT_ONCE):
+            chunk = parts[start : start + MAX_PARTS_AT_ONCE]
             rows_in_memory = self._let_go(chunk)
             for part in chunk:
                 self._group_of.pop(part, None)
@@ -125,7 +125,7 @@ class OpenDrives:
         for bundle, parts in sorted(bundles.items()):
             for piece in self._spool.take(("bundle", bundle)):
                 self.add(pl.read_ipc_stream(piece))
-                if self._in_memory > MOST_OPEN_VALUES:
+                if self._in_memory > MAX_OPEN_VALUES:
                     self._put_aside(bundled=False)
             if self._blocks:  # hundreds of small frames a part would take much memory
                 self._blocks = [pl.concat(self._blocks, rechunk=True)]
@@ -133,9 +133,9 @@ class OpenDrives:
 
     def spill(self) -> None:
         """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
-        if self._in_memory > MOST_OPEN_VALUES:
+        if self._in_memory > MAX_OPEN_VALUES:
             parts = pl.concat([rows["part"] for rows in self._blocks]).n_unique()
-            self._bundled |= parts > MOST_PIECES
+            self._bundled |= parts > MAX_SINGLE_PIECES
             self._put_aside(bundled=self._bundled)
 
     def _put_aside(self, *, bundled: bool) -> None:

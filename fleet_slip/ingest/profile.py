@@ -138,7 +138,7 @@ def _units(header: list[str], between: list[list[str]]) -> dict[str, str]:
 
 _FAR = 2.0
 """How many times the range of the others a number lies outside of it, to be none."""
-_FEWEST = 20
+_MIN_VALUES = 20
 
 
 def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[float, ...]]:
@@ -157,7 +157,7 @@ def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[f
         is_known = np.isin(present, markers["numbers"])
         values = present[~is_known]
         for number in map(float, np.unique(present[is_known])):
-            is_none = values.size >= _FEWEST
+            is_none = values.size >= _MIN_VALUES
             if is_none:
                 low, high = float(values.min()), float(values.max())
                 margin = _FAR * max(high - low, 1e-6)
@@ -168,9 +168,9 @@ def find_absent(profiles: Sequence["Profile"]) -> tuple[tuple[str, ...], tuple[f
     return tuple(dict.fromkeys([*written, *texts])), numbers
 
 
-MOST_ROWS = 200_000
+PROFILE_ROWS = 200_000
 """Rows of each time base that are looked at."""
-_LOOKED_AT = 200
+_SAMPLE_TEXTS = 200
 """Texts that show whether a column has times, and of which format."""
 
 
@@ -224,7 +224,7 @@ class FileProfile:
 
 
 def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
-    """Look at the first `MOST_ROWS` rows of every channel. Raises `InputError`."""
+    """Look at the first `PROFILE_ROWS` rows of every channel. Raises `InputError`."""
     with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
         layout, units = guess_layout(file) if bus is None else (CsvFormat(), {})
         formats = FileFormats(csv=layout, can=bus)
@@ -272,9 +272,9 @@ def _first_rows(source: Source, channels: list[Channel]) -> pl.DataFrame:
     for frame in source.batches([channel.name for channel in channels]):
         frames.append(frame)
         rows += frame.height
-        if rows >= MOST_ROWS:
+        if rows >= PROFILE_ROWS:
             break
-    return pl.concat(frames).head(MOST_ROWS) if frames else pl.DataFrame()
+    return pl.concat(frames).head(PROFILE_ROWS) if frames else pl.DataFrame()
 
 
 def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: CsvFormat) -> Profile:
@@ -311,7 +311,7 @@ def _keys(column: pl.Series) -> NDArray[np.int64]:
 
 def _time_format(texts: pl.Series) -> str | None:
     """Return the first format that all texts at the beginning have."""
-    examples = texts.drop_nulls().head(_LOOKED_AT)
+    examples = texts.drop_nulls().head(_SAMPLE_TEXTS)
     formats: list[str] = vocabulary()["time"]["formats"] if examples.len() else []
     return next(
         (candidate for candidate in formats if np.isfinite(_read_times(examples, candidate)).all()),

@@ -32,15 +32,15 @@ HELD_RAD = 0.005
 """Turn of the car with an unchanged course: half a degree is the step of coarse receivers."""
 BACKWARDS_MPS = 8.0
 """Nobody drives backwards faster."""
-LEAST_TURNING_RAD_S = 0.1
+MIN_TURNING_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
 
 GRIDS = tuple(ticks for ticks in range(1, TICKS_PER_S + 1) if TICKS_PER_S % ticks == 0)
 """Spacings of fixes, in ticks, of which a whole number is a second."""
 REGULAR = 0.8
-LONGEST_BETWEEN = 25
+MAX_TICKS_BETWEEN = 25
 """Ticks between two fixes, in which the side-slip angle is nearly a straight line."""
-LONGEST_BESIDE = 5
+MAX_TICKS_TO_FIX = 5
 """Maximum ticks to a single near fix: the slip changes by some tenths of a degree."""
 
 
@@ -70,7 +70,7 @@ def is_backwards(
         np.convolve(np.nan_to_num(signal), second)[second.size // 2 :][place]
         for signal in (yaw_rate**2, yaw_rate * ay)
     )
-    turning = squares > second.size * LEAST_TURNING_RAD_S**2
+    turning = squares > second.size * MIN_TURNING_RAD_S**2
     backwards: BoolArray = turning & (speed < BACKWARDS_MPS) & (products < -0.5 * speed * squares)
     return backwards
 
@@ -129,10 +129,10 @@ def _between(ticks: IntArray, values: FloatArray, at: IntArray) -> FloatArray:
     times, present_values = ticks[present], values[present]
     right = np.clip(np.searchsorted(times, at), 0, times.size - 1)
     before = np.maximum(right - 1, 0)
-    bridged = (times[right] >= at) & (times[right] - times[before] <= LONGEST_BETWEEN)
+    bridged = (times[right] >= at) & (times[right] - times[before] <= MAX_TICKS_BETWEEN)
     bridged &= times[before] <= at
     nearer = np.where(at - times[before] < times[right] - at, before, right)
-    beside = np.abs(times[nearer] - at) <= LONGEST_BESIDE
+    beside = np.abs(times[nearer] - at) <= MAX_TICKS_TO_FIX
     line = np.where(bridged, np.interp(at, times, present_values), np.nan)
     return np.where(bridged | ~beside, line, present_values[nearer])
 
@@ -144,7 +144,7 @@ SNAP_TOLERANCE_S = 0.1 * STEP_S
 TIME_EPSILON_S = 1e-6
 """Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
-LEAST_SPEED_MPS = 2.0
+MIN_SPEED_MPS = 2.0
 """Below, receivers freeze the course or report noise; two velocities give no angle of side-slip."""
 
 
@@ -290,7 +290,7 @@ def fixes_on_ticks(
     `fixes` are two columns of the resampler's samples: the velocities to the north and to the east,
     or course and speed, depending on `source`; `yaw_rate` in rad/s and `ay` in m/s² are of the
     ticks. A sample that repeats the previous one is no fix. The course is NaN without a yaw rate,
-    below `LEAST_SPEED_MPS`, and where it `is_held` or `is_backwards`.
+    below `MIN_SPEED_MPS`, and where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
     yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
@@ -314,7 +314,7 @@ def fixes_on_ticks(
     along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
     turned = course - np.arctan2(across, along) + r * late_s
     speeds[place] = along + r * (source.antenna_y_m or 0.0)
-    sound = (speed >= LEAST_SPEED_MPS) & ~is_held(course, yaw_rate, place)
+    sound = (speed >= MIN_SPEED_MPS) & ~is_held(course, yaw_rate, place)
     if ay is not None:
         sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
@@ -345,7 +345,7 @@ def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) ->
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
     """Return the counts of the label at the centre of gravity, and of velocities it is made of.
 
-    There is no label below `LEAST_SPEED_MPS`, where sensors of angles report noise.
+    There is no label below `MIN_SPEED_MPS`, where sensors of angles report noise.
     """
     sensor, signals = mapping.label, mapping.signal_catalog
     columns: dict[str, FloatArray] = {}
@@ -354,7 +354,7 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
     elif signals.label in counts and (speed := _speed(mapping, counts)) is not None:
         if sensor is not None and sensor.is_elsewhere:
             columns = _angle(signals, sensor, speed, counts)
-        elif (slow := speed < LEAST_SPEED_MPS).any():
+        elif (slow := speed < MIN_SPEED_MPS).any():
             angle = physical(signals, counts, signals.label)
             columns = {signals.label: np.where(slow, np.nan, angle)}
     return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
@@ -367,7 +367,7 @@ def _velocities(
     if sensor.is_elsewhere:
         yaw_rate = physical(signals, counts, "yaw_rate")
         vx, vy = vx + yaw_rate * sensor.sensor_y_m, vy - yaw_rate * sensor.sensor_x_m
-    fast = np.hypot(vx, vy) >= LEAST_SPEED_MPS
+    fast = np.hypot(vx, vy) >= MIN_SPEED_MPS
     return {"vx": vx, "vy": vy, signals.label: np.where(fast, np.arctan2(vy, vx), np.nan)}
 
 
@@ -381,7 +381,7 @@ def _angle(
     angle, yaw_rate = physical(signals, counts, label), physical(signals, counts, "yaw_rate")
     vx = speed * np.cos(angle) + yaw_rate * sensor.sensor_y_m
     vy = speed * np.sin(angle) - yaw_rate * sensor.sensor_x_m
-    return {label: np.where(speed >= LEAST_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
+    return {label: np.where(speed >= MIN_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
 
 
 def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:

@@ -22,7 +22,7 @@ from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import (
-    LONGEST_DRIVE_S,
+    MAX_DRIVE_S,
     DriveCutter,
     MeasuredDrive,
     drive_id,
@@ -57,7 +57,7 @@ MAX_DRIVES = 10_000
 SHORT_ROWS = 1000
 MAX_TICKS = 40_000_000
 """Maximum ticks of all drives of a file that has few rows for them."""
-MOST_TICKS_A_ROW = 1000
+MAX_TICKS_PER_ROW = 1000
 
 
 @dataclass
@@ -79,9 +79,9 @@ class IngestCounts:
     ticks: int = 0
 
 
-RATE_ROWS, MOST_RATE_ROWS = 2**17, 2**21
+RATE_ROWS, MAX_RATE_ROWS = 2**17, 2**21
 """The fewest and the most first rows of a file whose median step is the usual time between rows."""
-FEWEST_STEPS = 1000
+MIN_STEPS = 1000
 
 
 REFUSED_ROWS = 2**18
@@ -124,7 +124,7 @@ class MeasuredStream:
         """
         with closing(read_ahead(self.checker.blocks())) as blocks:
             early, intervals_s = self._usual_intervals(blocks)
-            longest_s = LONGEST_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
+            longest_s = MAX_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s)
             for block in chain(early, blocks):
                 yield from self._ended(cutter, block, intervals_s)
@@ -147,8 +147,8 @@ class MeasuredStream:
             early.append(block)
             while _reach(early) >= enough:
                 first = _trial(self.mapping, early, enough)
-                has_steps = first["part"].is_duplicated().sum() > FEWEST_STEPS
-                if has_steps or enough >= MOST_RATE_ROWS:
+                has_steps = first["part"].is_duplicated().sum() > MIN_STEPS
+                if has_steps or enough >= MAX_RATE_ROWS:
                     return early, sample_intervals_s(first)
                 enough += RATE_ROWS
         return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
@@ -238,7 +238,7 @@ class MeasuredStream:
                 f"{counts.rows_kept / counts.drives:.0f} rows on average. Check time, split_gap_s "
                 f"and the drive's column in the mapping {name!r}."
             )
-        if counts.ticks > MAX_TICKS and counts.ticks > MOST_TICKS_A_ROW * counts.rows_kept:
+        if counts.ticks > MAX_TICKS and counts.ticks > MAX_TICKS_PER_ROW * counts.rows_kept:
             raise InputError(
                 f"{quote_name(self.file)}: {counts.rows_kept:,} rows span {counts.ticks:,} ticks "
                 "of "
@@ -380,14 +380,14 @@ def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataF
 # Faults of a log as a whole: many rejected rows, and several cars, where one is under way
 # twice, or a column named like cars is not mapped.
 
-FEWEST_REFUSED = 10
+MIN_REFUSED = 10
 _REFUSED: dict[str, Check] = {
     "out_of_range": REFUSED_RANGE,
     "not_a_number": REFUSED_TEXTS,
     "not_finite": REFUSED_INFINITE,
 }
 _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
-MOST_NAMES, LEAST_ROWS_A_NAME = 1000, 20
+MAX_NAMES, MIN_ROWS_PER_NAME = 1000, 20
 
 
 def find_refusals(
@@ -397,7 +397,7 @@ def find_refusals(
 
     `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    limit = max(rows * MANY_REFUSED.high, FEWEST_REFUSED)
+    limit = max(rows * MANY_REFUSED.high, MIN_REFUSED)
     several = {key: count for key, count in refused.items() if count > limit}
     for (name, reason), count in several.items():
         check = _REFUSED.get(reason, REFUSED_VALUES)
@@ -452,13 +452,13 @@ def _values_and_runs(pieces: Iterable[pl.Series]) -> tuple[int, int]:
         texts = piece.cast(pl.String).str.strip_chars()
         present = texts.filter(texts.is_not_null() & (texts != ""))
         values.update(present.unique())
-        if len(values) > MOST_NAMES:
+        if len(values) > MAX_NAMES:
             return 0, 0
         if len(present):
             rows += len(present)
             runs += int((present != present.shift()).sum()) + (present[0] != before)
             before = present[-1]
-    return (0, 0) if len(values) > rows // LEAST_ROWS_A_NAME else (len(values), runs)
+    return (0, 0) if len(values) > rows // MIN_ROWS_PER_NAME else (len(values), runs)
 
 
 def _overlaps(under_way: list[tuple[float, float]]) -> int:

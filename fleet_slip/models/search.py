@@ -12,7 +12,7 @@ from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
     CROSS_VALIDATION,
     DEFAULT_TOLERANCE,
-    FEWEST_FOLDS,
+    MIN_FOLDS,
     ZERO_TOLERANCE,
     NestedChoice,
     NestedDistances,
@@ -117,7 +117,7 @@ def select_inputs(
         chosen = select_nested(training, inputs, label, rule)
         models = cross_validate_nested(training, chosen.order, label)[1:]
         honest = None
-        if len(training.folds.grams) >= FEWEST_FOLDS:
+        if len(training.folds.grams) >= MIN_FOLDS:
             honest = cross_validate_selection(
                 "the choice itself", training, fold, inputs, label, rule
             )

@@ -37,7 +37,7 @@ from fleet_slip.warehouse.gram_rows import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600
-LEAST_MEMORY_BYTES = 2**30
+MIN_MEMORY_BYTES = 2**30
 """The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 _FULL = "disk {:.1%} free, below {:.0%}"
 
@@ -186,7 +186,7 @@ def status_of(
 
 def _unfit(root: Folder) -> Iterator[str]:
     """Yield what of this machine, or of an object store, is not fit for the jobs."""
-    if memory_bytes() < LEAST_MEMORY_BYTES:
+    if memory_bytes() < MIN_MEMORY_BYTES:
         yield "this process may have less than 1 GiB of memory, which large commands take"
     if root.free_bytes() is not None:
         return  # a local disk keeps a file from being made twice

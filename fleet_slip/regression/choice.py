@@ -305,7 +305,7 @@ CROSS_VALIDATION = "cross-validation"
 """Criterion: cross-validate all nested models; the smallest that is nearly best wins."""
 
 
-FEWEST_FOLDS = 3
+MIN_FOLDS = 3
 """Minimum number of folds to repeat a choice in the training folds, of which two must remain."""
 
 
@@ -481,7 +481,7 @@ def cross_validate_selection(
 
 
 def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
-    if len(training.folds.grams) < FEWEST_FOLDS:
+    if len(training.folds.grams) < MIN_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
     remaining = training.folds.without(number, int(np.count_nonzero(fold != number)))
     return replace(training, folds=remaining, drives=training.drives.take(fold != number))

@@ -478,7 +478,7 @@ def _variance(full: Fit) -> Fraction:
 # C. N. Morris and R. Tang, "Estimating random effects via adjustment for density maximization",
 # Statistical Science 26 (2011), 271-287.
 
-FEWEST_MEMBERS = 4
+MIN_MEMBERS = 4
 """Minimum number of members: fewer do not determine their variance."""
 _HALVINGS, _STEP = 60, 1e-4
 
@@ -517,13 +517,13 @@ def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
     Returns
     -------
     Pooled or None
-        None for fewer than `FEWEST_MEMBERS` members.
+        None for fewer than `MIN_MEMBERS` members.
 
     References
     ----------
     Morris and Tang, Statistical Science 26, 2011, 271-287.
     """
-    if len(values) < FEWEST_MEMBERS:
+    if len(values) < MIN_MEMBERS:
         return None
 
     def slope(log_between: float) -> float:

@@ -122,7 +122,7 @@ def _criterion(name: str) -> Callable[[Problem], FloatArray]:
         raise QuestionError(f"unknown criterion {name!r}. Known criteria: {names}.") from None
 
 
-MOST_INPUTS = 22
+MAX_SUBSET_INPUTS = 22
 """Maximum number of signals for all subsets: 2^22 take about two seconds."""
 
 _SPARE = 3
@@ -156,7 +156,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
     ----------
     gram : Gram
     inputs : sequence of str
-        The k signals, at most `MOST_INPUTS`.
+        The k signals, at most `MAX_SUBSET_INPUTS`.
     label : str
     count : int
         Number of models of each size.
@@ -175,10 +175,10 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
     relations = dependence(gram, inputs)
     if relations:
         raise DataError(relations)
-    if len(inputs) > MOST_INPUTS:
+    if len(inputs) > MAX_SUBSET_INPUTS:
         raise QuestionError(
-            f"all subsets of {len(inputs)} signals are too many: give at most {MOST_INPUTS}, or "
-            "search among them with: search exchange."
+            f"all subsets of {len(inputs)} signals are too many: give at most {MAX_SUBSET_INPUTS}, "
+            "or search among them with: search exchange."
         )
     part = gram.restrict([*inputs, label])
     matrix = correlation_matrix(part)

@@ -295,7 +295,7 @@ def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
     columns["t"] = [10 * i for i in range(300)]
     monkeypatch.setattr(stream, "MAX_TICKS", 100)
-    monkeypatch.setattr(stream, "MOST_TICKS_A_ROW", 10)
+    monkeypatch.setattr(stream, "MAX_TICKS_PER_ROW", 10)
     with pytest.raises(InputError, match="300 rows span 299,001 ticks"):
         read_columns(tmp_path, columns, a_mapping(time={"split_gap_s": 60, "longest_gap_s": 10}))
 

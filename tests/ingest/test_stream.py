@@ -91,7 +91,7 @@ def test_blocks_change_nothing(
 def test_a_drive_that_lasts_too_long_is_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "LONGEST_DRIVE_S", 0.5)
+    monkeypatch.setattr(stream, "MAX_DRIVE_S", 0.5)
     log = read_columns(tmp_path, good_columns(60))
     name = f"test-{log.digest[:12]}-1"
     assert log.drives["drive_id"].to_pylist() == [name] * 50 + [f"{name}-2"] * 10
@@ -107,7 +107,7 @@ def test_the_usual_rate_does_not_depend_on_blocks(
     t = [*(i / 100 for i in range(30)), *(0.3 + i / 1000 for i in range(300))]
     columns = {"t": t, "ax": [1] * 330, "beta": [1] * 330}
     monkeypatch.setattr(stream, "RATE_ROWS", 20)
-    monkeypatch.setattr(stream, "FEWEST_STEPS", 10)
+    monkeypatch.setattr(stream, "MIN_STEPS", 10)
     whole = read_columns(tmp_path, columns)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 12 * rows)
     assert read_columns(tmp_path, columns).drives.equals(whole.drives)
@@ -200,9 +200,9 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
-    monkeypatch.setattr(open_drives, "MOST_OPEN_VALUES", 8 * rows)
-    monkeypatch.setattr(open_drives, "MOST_PARTS", parts)
-    monkeypatch.setattr(open_drives, "MOST_PIECES", pieces)
+    monkeypatch.setattr(open_drives, "MAX_OPEN_VALUES", 8 * rows)
+    monkeypatch.setattr(open_drives, "MAX_PARTS_AT_ONCE", parts)
+    monkeypatch.setattr(open_drives, "MAX_SINGLE_PIECES", pieces)
     monkeypatch.setattr(open_drives, "BUNDLED_GROUPS", groups)
     spilled = read_columns(tmp_path, columns, mapping)
     assert spilled.drives.equals(whole.drives)

@@ -144,13 +144,13 @@ def read_in(
         patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(open_drives, "MOST_PARTS", 1 + batch % 3))
-        patched.enter_context(mock.patch.object(open_drives, "MOST_OPEN_VALUES", 40 * window))
-        patched.enter_context(mock.patch.object(open_drives, "MOST_PIECES", batch % 5))
+        patched.enter_context(mock.patch.object(open_drives, "MAX_PARTS_AT_ONCE", 1 + batch % 3))
+        patched.enter_context(mock.patch.object(open_drives, "MAX_OPEN_VALUES", 40 * window))
+        patched.enter_context(mock.patch.object(open_drives, "MAX_SINGLE_PIECES", batch % 5))
         patched.enter_context(mock.patch.object(open_drives, "BUNDLED_GROUPS", 1 + batch % 2))
         patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
-        patched.enter_context(mock.patch.object(stream, "FEWEST_STEPS", 20))
-        patched.enter_context(mock.patch.object(stream, "LONGEST_DRIVE_S", 0.8))
+        patched.enter_context(mock.patch.object(stream, "MIN_STEPS", 20))
+        patched.enter_context(mock.patch.object(stream, "MAX_DRIVE_S", 0.8))
         try:
             return read_measured(file, mapping)
         except InputError as error:

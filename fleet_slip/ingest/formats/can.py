@@ -43,7 +43,7 @@ from fleet_slip.ingest.formats.source import (
 
 Bytes = NDArray[np.uint8]
 
-MOST_BYTES = 64
+MAX_FRAME_BYTES = 64
 """Bytes of a frame of CAN FD."""
 _FLOATS = {16: np.float16, 32: np.float32, 64: np.float64}
 
@@ -53,9 +53,11 @@ PIECE_FRAMES = 2**12
 
 def is_possible(signal: Any) -> bool:
     """Return True if a signal fits a frame: at most 64 bits in 64 bytes, floats of their sizes."""
-    if not 0 <= signal.start < 8 * MOST_BYTES or not 1 <= signal.length <= 64:
+    if not 0 <= signal.start < 8 * MAX_FRAME_BYTES or not 1 <= signal.length <= 64:
         return False
-    return needed_bytes(signal) <= MOST_BYTES and (not signal.is_float or signal.length in _FLOATS)
+    return needed_bytes(signal) <= MAX_FRAME_BYTES and (
+        not signal.is_float or signal.length in _FLOATS
+    )
 
 
 def needed_bytes(signal: Any) -> int:
@@ -281,14 +283,14 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
 
 def _block_of(frames: list[Any]) -> FrameBlock:
     """Return frames of python-can."""
-    payloads = b"".join(bytes(frame.data).ljust(MOST_BYTES, b"\0") for frame in frames)
+    payloads = b"".join(bytes(frame.data).ljust(MAX_FRAME_BYTES, b"\0") for frame in frames)
     return FrameBlock(
         np.array([frame.arbitration_id for frame in frames]),
         np.array([frame.is_extended_id for frame in frames]),
         np.array([frame.timestamp for frame in frames]),
         np.array([str(frame.channel) for frame in frames]),
         np.array([len(frame.data) for frame in frames]),
-        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MOST_BYTES),
+        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MAX_FRAME_BYTES),
     )
 
 

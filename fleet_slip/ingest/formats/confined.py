@@ -45,8 +45,8 @@ _ENVIRONMENT = {
 }
 """Else libraries reserve memory for threads that a reader does not need."""
 _INHERITED = ("TZ", "LD_LIBRARY_PATH")
-_LARGEST_TEXT = 2**26
-_LOOK_S = 0.1
+_MAX_TEXT_BYTES = 2**26
+_POLL_S = 0.1
 """Interval in s at which the sum of a reader's temporary files is measured."""
 _ONE_AT_A_TIME = Lock()
 
@@ -139,7 +139,7 @@ class ConfinedSource(Source):
         until_s = time.monotonic() + self._budget.seconds
         self._require_disk()
         text, size = SIZES.unpack(self._take(SIZES.size, until_s))
-        if text > _LARGEST_TEXT or size > self._budget.memory:
+        if text > _MAX_TEXT_BYTES or size > self._budget.memory:
             raise self._budget.crashed()
         try:
             answer = json.loads(self._take(text, until_s))
@@ -164,11 +164,11 @@ class ConfinedSource(Source):
         remaining = memoryview(taken)
         while remaining:
             remaining_s = until_s - time.monotonic()
-            self._channel.settimeout(min(max(remaining_s, 1e-3), _LOOK_S))
+            self._channel.settimeout(min(max(remaining_s, 1e-3), _POLL_S))
             try:
                 came = self._channel.recv_into(remaining)
             except TimeoutError:
-                if remaining_s < _LOOK_S:
+                if remaining_s < _POLL_S:
                     raise self._budget.over_time() from None
                 self._require_disk()
                 continue

@@ -23,7 +23,7 @@ from fleet_slip.ingest.formats.source import (
 )
 
 _COLUMN = re.compile(r"(.+)\(:,(\d+)\)")
-_MOST_COLUMNS = 64
+_MAX_COLUMNS = 64
 _NUMBERS = re.compile(r"u?int(8|16|32|64)|double|single|logical")
 _PACKED = {"scale_factor", "add_offset"}
 """Attributes of netCDF for integers that encode physical values."""
@@ -80,7 +80,7 @@ class Vectors(FormatSource):
         for path, matrix in self._matrices.items():
             rows, columns = matrix.size
             names = [path] if columns == 1 else [f"{path}(:,{i + 1})" for i in range(columns)]
-            if rows > 1 and columns <= _MOST_COLUMNS:
+            if rows > 1 and columns <= _MAX_COLUMNS:
                 channels += [Channel(name, matrix.unit, f"{rows} rows") for name in names]
         return channels
 

@@ -29,7 +29,7 @@ from fleet_slip.ingest.formats.source import (
 )
 
 Decode = Callable[[bytes], Any]
-_MOST_ITEMS, _DEEPEST = 64, 20
+_MAX_ITEMS, _DEEPEST = 64, 20
 """Items of an array that are columns, and levels of messages in messages."""
 PIECE_ROWS = 2**13
 """Messages of a topic that are in memory at once."""
@@ -42,7 +42,7 @@ def leaves_of(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str,
     elif depth < _DEEPEST:
         below: list[tuple[str, Any]]
         if isinstance(value, list | tuple | array):
-            below = [(f"[{number}]", item) for number, item in enumerate(value[:_MOST_ITEMS])]
+            below = [(f"[{number}]", item) for number, item in enumerate(value[:_MAX_ITEMS])]
         else:
             names = value if isinstance(value, dict) else getattr(type(value), "__slots__", ())
             members = value if isinstance(value, dict) else {n: getattr(value, n) for n in names}
@@ -70,7 +70,7 @@ def value_at(message: Any, path: _Path) -> Any:
             message = (
                 message.get(step) if isinstance(message, dict) else getattr(message, step, None)
             )
-        elif isinstance(message, list | tuple | array) and step < min(len(message), _MOST_ITEMS):
+        elif isinstance(message, list | tuple | array) and step < min(len(message), _MAX_ITEMS):
             message = message[step]
         else:
             return None

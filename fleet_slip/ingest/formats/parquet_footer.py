@@ -12,7 +12,7 @@ DELTA_BYTE_ARRAY = 7
 
 _DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
 MAGIC, _TAIL_BYTES = b"PAR1", 8
-_MAX_HEADER_BYTES, _DEEPEST, _LONGEST_VARINT = 2**16, 12, 10
+_MAX_HEADER_BYTES, _DEEPEST, _MAX_VARINT_BYTES = 2**16, 12, 10
 
 
 class ColumnChunk(NamedTuple):
@@ -163,7 +163,7 @@ def _read_integer(content: memoryview, at: int) -> tuple[int, int]:
 
 def _read_varint(content: memoryview, at: int) -> tuple[int, int]:
     value = 0
-    for place in range(_LONGEST_VARINT):
+    for place in range(_MAX_VARINT_BYTES):
         byte = content[at + place]
         value |= (byte & 0x7F) << (7 * place)
         if byte < 0x80:

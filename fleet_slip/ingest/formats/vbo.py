@@ -22,12 +22,12 @@ from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel
 from fleet_slip.ingest.vocabulary import unit_called
 
 VBO_BEGINS = re.compile(rb"(\xef\xbb\xbf)?\s*(file created on|\[header\])", re.IGNORECASE)
-_MOST_HEAD_LINES = 1000
+_MAX_HEAD_LINES = 1000
 """Lines above the data."""
 _CREATED = re.compile(r"(\d+/\d+/\d{4})(?:\D+(\d+):(\d+))?")
 _TIME, _TIME_OF_DAY = "time", r"^(\d\d)([0-5]\d)([0-5]\d(?:[.,]\d+)?)$"
 _DAY_S = 86_400
-_KNOWN = {
+_STANDARD_CHANNELS = {
     "lat": ("latitude", "deg"), "long": ("longitude", "deg"), "velocity": ("gnss speed", "km/h"),
     "heading": ("course", "deg"), "height": ("height", "m"),
 }  # fmt: skip
@@ -45,7 +45,7 @@ class VboSource(CsvSource):
 
     def __init__(self, budget: Budget, numbers: PlainNumbers) -> None:
         """Take a file and read its header. Raises `InputError`."""
-        lines = first_lines(budget.file, CsvFormat(), _MOST_HEAD_LINES)
+        lines = first_lines(budget.file, CsvFormat(), _MAX_HEAD_LINES)
         self._places = {line.strip().lower(): number for number, line in enumerate(lines, 1)}
         for section in ("[column names]", "[data]"):
             if section not in self._places:
@@ -69,14 +69,16 @@ class VboSource(CsvSource):
     def channels(self) -> list[Channel]:
         """Return the columns but the time, with the units behind titles and those of modules."""
         titles, of_modules = self._section("[header]"), self._section("[channel units]")
-        units = {name: unit for name, (_, unit) in _KNOWN.items()}
+        units = {name: unit for name, (_, unit) in _STANDARD_CHANNELS.items()}
         if len(titles) == len(self._names):
             called = (unit_called(title.rpartition(" ")[2]) for title in titles)
             units |= {n: unit for n, unit in zip(self._names, called, strict=True) if unit}
         units |= zip(self._names[::-1], of_modules[::-1], strict=False)  # the last columns
         return [
             Channel(
-                channel.name, units.get(channel.name, ""), title=_KNOWN.get(channel.name, ("",))[0]
+                channel.name,
+                units.get(channel.name, ""),
+                title=_STANDARD_CHANNELS.get(channel.name, ("",))[0],
             )
             for channel in super().channels()
             if channel.name not in {"", _TIME}
