@@ -1,4 +1,4 @@
-"""How good the label of a cohort is: its noise, and what a model without one is known by."""
+"""The noise of the label of a cohort, as campaigns state it."""
 
 import math
 
@@ -13,10 +13,10 @@ from fleet_slip.warehouse.warehouse import Warehouse
 def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
     """Return the standard deviation of the label's noise, of all rows of a cohort together.
 
-    A cross-validated error has it in it, as no model knows the noise of other drives. So has it the
-    step of its counts, as a uniform error. None where no campaign states it in its `[sensors]`.
+    It is part of every cross-validated error. The quantisation step counts as a uniform error.
+    None where no campaign states it in its `[sensors]`.
     """
-    if not warehouse.logs.snapshot().rows:  # all rows are of messages: none is read for this
+    if not warehouse.logs.snapshot().rows:  # all Gram rows are from messages
         return None
     with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
         rows = opened.label_sources(cohort.predicate)
@@ -31,7 +31,7 @@ def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
 
 
 def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | None:
-    """Return the noise that a campaign states; None of measured drives and unknown campaigns."""
+    """Return the noise that a campaign states; None for measured drives and unknown campaigns."""
     if source != "simulated" or campaign is None:
         return None
     try:
@@ -39,5 +39,5 @@ def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | 
         if "sensors" not in content:
             content = load_toml(configs.find("campaigns", content["base"]))
         return float(content["sensors"]["sideslip_std_rad"])
-    except (ConfigError, KeyError):  # its file was elsewhere
+    except (ConfigError, KeyError):  # its file is not among the configs
         return None

@@ -75,39 +75,40 @@ def require_sound_drives(
         )
 
 
-# A course that is late looks like a side-slip angle, in all figures, and so does a heading.
+# A late course looks like a side-slip angle in all figures, and so does a heading.
 
-MOST_S, SURE_S = 0.01, 0.005
-"""Delay that may be left, and its standard error: 20 ms cost 0.4 deg on a real car."""
-NAMED, SHOWN = 5, 3
+MAX_DELAY_S, MAX_ERROR_S = 0.01, 0.005
+"""Largest remaining delay, and its standard error: 20 ms cost 0.4 deg on a real car."""
+MAX_CARS, MAX_FAULTS = 5, 3
+"""Cars and faults in a message."""
 
 
 def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
-    """Return how late courses still are, in s, in the Gram rows of the cars that taught a model.
+    """Return the remaining delays of courses in Gram rows, in s, by car of the training drives.
 
-    Raises `RefusedError` unless all are known and corrected for, `DataError` without Gram rows.
+    Raises `RefusedError` unless all are estimated and corrected, `DataError` without Gram rows.
     """
     signals = warehouse.catalog.signals
     predicate = parse_cohort(signals, manifest.trained_on.cohort)
     with open_grams(warehouse, DELAY, predicate) as opened:
-        told = opened.batches(parse_predicate(signals, ALL_DRIVES))
-        delays = receiver_delays(told).cars
+        batches = opened.batches(parse_predicate(signals, ALL_DRIVES))
+        delays = receiver_delays(batches).cars
     feature_set = warehouse.catalog.name_of(manifest.trained_on.feature_set)
     with open_grams(warehouse, feature_set, predicate) as opened:
         cars = dict(opened.course_delays(predicate))
-    left = {
+    remaining = {
         car: max((delays[car].value - GRAIN_S * parts for parts in corrected), key=abs)
         for car, corrected in cars.items()
         if car in delays
     }
-    unsure = [car for car in left if (delays[car].uncertainty or math.inf) > SURE_S]
-    late = [car for car, delay_s in left.items() if abs(delay_s) > MOST_S]
+    unsure = [car for car in remaining if (delays[car].uncertainty or math.inf) > MAX_ERROR_S]
+    late = [car for car, delay_s in remaining.items() if abs(delay_s) > MAX_DELAY_S]
     problems = []
     if unsure:
         problems.append(
-            f"delays are not estimated to {1000 * SURE_S:g} ms ({_named(delays, unsure)})"
+            f"delays are not estimated to {1000 * MAX_ERROR_S:g} ms ({_named(delays, unsure)})"
         )
-    if unknown := len(cars) - len(left):
+    if unknown := len(cars) - len(remaining):
         cars_text = pluralize(unknown, "car")
         problems.append(f"that of {cars_text} cannot be estimated from their drives")
     if late:
@@ -119,23 +120,23 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
     if problems:
         raise RefusedError(
             f"{manifest.name} was not published: a late course looks like side-slip, and "
-            f"{'; '.join(problems)}. fleet-slip calibrate --car NAME says it. Choose "
+            f"{'; '.join(problems)}. See: fleet-slip calibrate --car NAME. Choose "
             "other cars, add drives, or set the receiver type (receiver in the mapping). "
             f"To publish it anyway: fleet-slip publish {manifest.name} --label "
             "course --force"
         )
-    return left
+    return remaining
 
 
 def _named(delays: Mapping[str, ReceiverDelay], cars: Sequence[str]) -> str:
-    shown = ", ".join(f"{car}: {delays[car]}" for car in cars[:NAMED])
-    return f"{shown}, and {len(cars) - NAMED} more" if len(cars) > NAMED else shown
+    shown = ", ".join(f"{car}: {delays[car]}" for car in cars[:MAX_CARS])
+    return f"{shown}, and {len(cars) - MAX_CARS} more" if len(cars) > MAX_CARS else shown
 
 
 def require_sound_course(
     warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
 ) -> None:
-    """Raise `RefusedError` unless all courses, `delays_s` late in Gram rows, are those of a car."""
+    """Raise `RefusedError` if a course, `delays_s` late in Gram rows, is not that of a car."""
     predicate = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
     with GramReader(warehouse) as reader:
         cars = course_moments(reader, predicate)
@@ -147,8 +148,8 @@ def require_sound_course(
     if not faults:
         return
     first = next(iter(faults.values()))
-    named = "; ".join(f"{car}: {one.figure}" for car, one in list(faults.items())[:SHOWN])
-    more = f", and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
+    named = "; ".join(f"{car}: {fault.figure}" for car, fault in list(faults.items())[:MAX_FAULTS])
+    more = f", and {len(faults) - MAX_FAULTS} more" if len(faults) > MAX_FAULTS else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
         f"{pluralize(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "

@@ -113,9 +113,9 @@ def examine_drives(
     drives = parse_cohort(warehouse.catalog.signals, predicate)
     with GramReader(warehouse) as reader:
         models = _vehicle_models(reader, drives)
-        known = _faulty_courses(reader, drives)
-        known |= find_wrong_labels(load_cohort(reader, drives))
-        reports = [examine(load_cohort(reader, drives & of_model), known) for of_model in models]
+        faulty = _faulty_courses(reader, drives)
+        faulty |= find_wrong_labels(load_cohort(reader, drives))
+        reports = [examine(load_cohort(reader, drives & of_model), faulty) for of_model in models]
     findings = {finding.drive_id: finding for report in reports for finding in report.findings}
     inspection = inspect_drives(warehouse, drives, MAX_INSPECTED)
     systematic: dict[tuple[str, tuple[str, ...]], Fault] = {}
@@ -183,23 +183,25 @@ def find_wrong_labels(cohort: Cohort) -> dict[str, Fault]:
     return faults
 
 
-def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> QualityReport:
+def examine(cohort: Cohort, faulty: Mapping[str, Fault] | None = None) -> QualityReport:
     """Run the checks of Gram rows on each drive, with its car's and its vehicle model's drives.
 
     First those that need no peers, then the comparison with peers, if there are `min_drives` of
-    them; see `_peer_groups`. `known` are faulty drives. A drive with several sets of signals has
-    several Gram rows, and is one drive.
+    them; see `_peer_groups`. `faulty` are the faults of drives that other checks reported. A drive
+    with several sets of signals has several Gram rows, and is one drive.
     """
     catalog = cohort.catalog
     limits = thresholds(catalog.configs).quality
     drives, compared = set[str](), set[str]()
-    known = {**(known or {}), **find_repeated(cohort.drives)}
+    faulty = {**(faulty or {}), **find_repeated(cohort.drives)}
     findings: dict[str, SensorFault] = {}
     for table, metadata in _groups(cohort, limits.min_rows):
         names = np.array(metadata["drive_id"].to_pylist(), dtype=object)
         faults = check_moments(table, catalog.signals, limits.min_correlation)
         faults |= _saturated(table, metadata, limits)
-        faults = {drive: known[name] for drive, name in enumerate(names) if name in known} | faults
+        faults = {
+            drive: faulty[name] for drive, name in enumerate(names) if name in faulty
+        } | faults
         in_order = np.array([drive not in faults for drive in range(len(table))])
         for group in _peer_groups(metadata, limits.min_drives):
             if in_order[group].sum() >= limits.min_drives:
@@ -214,7 +216,7 @@ def examine(cohort: Cohort, known: Mapping[str, Fault] | None = None) -> Quality
 
 
 def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
-    """Return the days of drives and the files that they came in, as numbers, and their cars."""
+    """Return numberings of drives by day and by file, and by car."""
     sources = [SourceRef.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
     files = [one.digest if one else "" for one in sources]
     of_day, of_file, of_car = (
@@ -224,25 +226,25 @@ def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
     return [of_day, of_file], of_car
 
 
-def _peer_groups(metadata: pa.Table, enough: int) -> Iterator[BoolArray]:
-    """Yield which drives to compare with one another: those of a car, and those of many cars.
+def _peer_groups(metadata: pa.Table, min_drives: int) -> Iterator[BoolArray]:
+    """Yield masks of drives to compare with one another: those of a car, and those of many cars.
 
-    A car with enough drives is compared with itself, which shows what differs between its drives.
-    Among other cars it counts by no more drives than they have, the first by name, so that a car
-    that is logged every day does not say alone what is usual; that shows what is wrong with all of
-    its drives.
+    A car with enough drives is compared with itself, which shows differences between its drives.
+    The comparison with other cars shows faults of all its drives. There it has no more drives than
+    they have, the first by name, so that a car that is logged every day does not define the usual.
     """
     ids, cars = (np.array(metadata[n].to_pylist(), dtype=str) for n in ("drive_id", "vehicle_id"))
     of_car = np.unique(cars, return_inverse=True)[1]
     counts = np.bincount(of_car)
-    for car in np.flatnonzero(counts >= enough):
+    for car in np.flatnonzero(counts >= min_drives):
         yield of_car == car
     if len(counts) > 1:
-        few = counts[counts < enough]
-        most = max(ceil(enough / len(counts)), int(np.median(few)) if len(few) else 1)
+        small = counts[counts < min_drives]
+        median = int(np.median(small)) if len(small) else 1
+        max_drives = max(ceil(min_drives / len(counts)), median)
         number = np.empty(len(cars), dtype=np.int64)  # of each drive among those of its car
         number[np.lexsort((ids, of_car))] = np.concatenate([np.arange(n) for n in counts])
-        yield (counts[of_car] < enough) | (number < most)
+        yield (counts[of_car] < min_drives) | (number < max_drives)
 
 
 def _long_drives(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
@@ -255,7 +257,7 @@ def _long_drives(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.
 
 
 def _groups(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.Table]]:
-    """Yield the same, each vehicle model by itself."""
+    """Yield long drives by set of signals and vehicle model, with their metadata."""
     for table, metadata in _long_drives(cohort, min_rows):
         models = np.array([str(name) for name in metadata["vehicle_model"].to_pylist()])
         for model in sorted(set(models)):
@@ -278,10 +280,10 @@ def _unlike_peers(
     in_order: BoolArray,
     limits: QualityThresholds,
 ) -> dict[int, Fault]:
-    """Return the faults of the drives of a group that are not as the others of it."""
+    """Return the faults of the drives of a group that differ from its others."""
     peers_table = table.take(group)
     peers, suspects = settle(peers_table, in_order[group], label, limits)
     if not suspects.any():
         return {}
-    faults = peers.explain(DriveBatches.of(peers_table, suspects))
+    faults = peers.explain(DriveBatches.from_table(peers_table, suspects))
     return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))

@@ -1,9 +1,9 @@
-"""Which drives of a cohort may train a model: those that were examined and have no fault.
+"""The screen of training drives: those that were checked and have no fault may train a model.
 
-Drives are examined once: what was found is kept in the user's cache, as hashes of drives, as long
-as Gram rows and thresholds are what they were. Many drives are examined in pieces of whole days, so
-that a night costs its own piece. Simulated drives are not examined: what is wrong in them is meant.
-Whatever trains, scores or publishes asks here, so that all have the same answer.
+Drives are checked once: results are cached for the user, as hashes of drives, as long as Gram rows,
+checks and thresholds stay the same. Many drives are checked in pieces of whole days, so that a
+night checks its own piece. Simulated drives are not checked: their faults are intended. Whatever
+trains, scores or publishes calls this screen, so that all have the same drives.
 """
 
 import json
@@ -62,28 +62,29 @@ CHECK_ROWS = 20_000_000
 
 @dataclass(frozen=True)
 class SensorScreen:
-    """What was found.
+    """The result of checking the drives of a cohort.
 
     Attributes:
         cohort: the predicate without the faulty drives.
-        drives: how many were long enough to be examined.
-        found: the fault of each faulty drive, by its hash.
-        missing: how many measured drives were not, since they have no Gram rows.
+        drives: number of drives that were long enough to be checked.
+        faults_by_hash: the fault of each faulty drive, by its hash.
+        missing: number of measured drives without Gram rows, which were not checked.
     """
 
     cohort: str
     drives: int = 0
-    found: Mapping[str, Fault] = field(default_factory=dict)
+    faults_by_hash: Mapping[str, Fault] = field(default_factory=dict)
     missing: int = 0
 
     @property
     def faults(self) -> Mapping[str, int]:
-        """How many drives have each fault, such as `reversed sideslip`."""
-        return Counter(" ".join((one.kind, *one.signals)) for one in self.found.values())
+        """Return the number of drives with each fault, such as `reversed sideslip`."""
+        faults = self.faults_by_hash.values()
+        return Counter(" ".join((fault.kind, *fault.signals)) for fault in faults)
 
     @property
-    def lacking(self) -> str:
-        """What was not examined and what to do, as a sentence; nothing if all were examined."""
+    def remaining_text(self) -> str:
+        """Return which drives were not checked and what to do; nothing if all were checked."""
         if not self.missing:
             return ""
         return (
@@ -92,15 +93,15 @@ class SensorScreen:
         )
 
     def __str__(self) -> str:
-        """Return what is left out, and what was not examined; nothing if none is faulty."""
-        said = []
-        if self.found:
-            out = pluralize(len(self.found), "drive")
-            said.append(
+        """Return which drives are left out, and which were not checked; nothing if none is."""
+        sentences = []
+        if self.faults_by_hash:
+            out = pluralize(len(self.faults_by_hash), "drive")
+            sentences.append(
                 f"{out} of {self.drives:,} left out: faulty sensors ({self._faults_text}). See: "
                 "fleet-slip quality. To use them anyway: --include-faulty"
             )
-        return " ".join([*said, self.lacking]).strip()
+        return " ".join([*sentences, self.remaining_text]).strip()
 
     @property
     def _faults_text(self) -> str:
@@ -108,13 +109,13 @@ class SensorScreen:
 
     @contextmanager
     def explaining(self) -> Iterator[None]:
-        """Say in the error of a cohort without a drive that all were left out, if they were."""
+        """Explain the error of an empty cohort if all its drives were left out."""
         try:
             yield
         except DataError as error:
             if (
-                len(self.found) < self.drives
-                or not self.found
+                len(self.faults_by_hash) < self.drives
+                or not self.faults_by_hash
                 or isinstance(error, NotComputedError)
             ):
                 raise
@@ -126,13 +127,14 @@ class SensorScreen:
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
         """Return the faulty drives by name, by day and drive."""
-        if not self.found:
+        if not self.faults_by_hash:
             return ()
         query = "SELECT DISTINCT drive_id, vehicle_id, day FROM grams ORDER BY day, drive_id"
         with connect_tables(warehouse, query) as database:
             rows = database.execute(query).fetchall()
-        named = ((hash_drive(NAME, drive), (drive, car, day)) for drive, car, day in rows)
-        return tuple(SensorFault(*row, self.found[one]) for one, row in named if one in self.found)
+        drives = ((hash_drive(NAME, drive), (drive, car, day)) for drive, car, day in rows)
+        faults = self.faults_by_hash
+        return tuple(SensorFault(*row, faults[name]) for name, row in drives if name in faults)
 
 
 class _Piece(NamedTuple):
@@ -153,38 +155,38 @@ class _Piece(NamedTuple):
 
 
 def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
-    """Examine the drives of a cohort like `quality`; return it without the faulty ones.
+    """Check the drives of a cohort like `quality`; return the cohort without the faulty ones.
 
-    Drives without Gram rows of `signals` are not examined, and counted. Of a predicate on rows all
-    drives are examined. Raises what `examine_drives` raises; where no drive is measured there is
-    nothing to examine.
+    Drives without Gram rows of `signals` are counted, and not checked. A predicate on rows does not
+    limit the drives. Raises what `examine_drives` raises; without measured drives nothing is
+    checked.
     """
     signals = warehouse.catalog.signals
     measured = parse_predicate(signals, f"source IN ('{MEASURED}', '{RECEIVED}')")
-    asked = parse_predicate(signals, cohort, row_columns(signals))
-    predicate = measured if asked.columns - set(drive_columns(signals)) else asked & measured
+    requested = parse_predicate(signals, cohort, row_columns(signals))
+    is_on_rows = bool(requested.columns - set(drive_columns(signals)))
+    predicate = measured if is_on_rows else requested & measured
     grams, logs = gram_snapshots(warehouse)
     missing = _count_unreduced(warehouse, grams, logs, predicate)
-    parts: list[Mapping[str, Any]] = []
+    results: list[Mapping[str, Any]] = []
     for piece in _pieces(warehouse, predicate) if _has_measured(grams) else []:
         about = {"cohort": predicate.text, "from": piece.first, "root": warehouse.root.uri}
         limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
         state = [piece.rows, sha256(f"{CHECKS}{canonical_json(limits)}".encode()).hexdigest()]
         name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
-        kept = cache_folder("examined") / f"{name[:32]}.json"
-        parts.append(
-            _known(kept, state) or _examine(warehouse, predicate & piece.predicate(signals))
-        )
-        content = {**parts[-1], "state": state}
-        keep_json(kept, {**content, "sha256": sha256_of(canonical_json(content))})
-    found = {
-        name: Fault(kind, tuple(signals), figure)
-        for one in parts
-        for name, (kind, signals, figure) in one["found"].items()
+        cached = cache_folder("examined") / f"{name[:32]}.json"
+        result = _read_cache(cached, state)
+        result = result or _check_piece(warehouse, predicate & piece.predicate(signals))
+        content = {**result, "state": state}
+        keep_json(cached, {**content, "sha256": sha256_of(canonical_json(content))})
+        results.append(result)
+    faults = {
+        name: Fault(kind, tuple(names), figure)
+        for result in results
+        for name, (kind, names, figure) in result["faults"].items()
     }
-    kept_cohort = without_drives(cohort, NAME, found)
-    examined = sum(one["examined"] for one in parts)
-    return SensorScreen(kept_cohort, examined, found, missing)
+    checked = sum(result["checked"] for result in results)
+    return SensorScreen(without_drives(cohort, NAME, faults), checked, faults, missing)
 
 
 def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
@@ -192,30 +194,34 @@ def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
 
     Raises `NotScreenedError` if that takes more than seconds.
     """
-    examined = screen_computed_drives(warehouse, cohort)
-    if examined.missing:
+    screen = screen_computed_drives(warehouse, cohort)
+    if screen.missing:
         ensure_grams(warehouse, PLAIN, reason="the sensor check needs them", max_rows=CHECK_ROWS)
-        examined = screen_computed_drives(warehouse, cohort)
-    if examined.missing:
-        raise NotScreenedError(f"{examined.lacking}, or use them unchecked: --include-faulty")
-    return examined
+        screen = screen_computed_drives(warehouse, cohort)
+    if screen.missing:
+        raise NotScreenedError(f"{screen.remaining_text}, or use them unchecked: --include-faulty")
+    return screen
 
 
-def _examine(warehouse: Warehouse, predicate: Predicate) -> Mapping[str, Any]:
+def _check_piece(warehouse: Warehouse, predicate: Predicate) -> Mapping[str, Any]:
     report = examine_drives(warehouse, predicate)
-    found = {
-        hash_drive(NAME, one.drive_id): [one.fault.kind, list(one.fault.signals), one.fault.figure]
-        for one in report.findings
+    faults = {
+        hash_drive(NAME, finding.drive_id): [
+            finding.fault.kind,
+            list(finding.fault.signals),
+            finding.fault.figure,
+        ]
+        for finding in report.findings
     }
-    return {"found": found, "examined": report.drives}
+    return {"faults": faults, "checked": report.drives}
 
 
-def _known(kept: Path, state: list[Any]) -> Mapping[str, Any] | None:
+def _read_cache(file: Path, state: list[Any]) -> Mapping[str, Any] | None:
     with suppress(OSError, ValueError, KeyError, TypeError):
-        known = json.loads(kept.read_bytes())
-        checksum = known.pop("sha256")
-        if known["state"] == state and checksum == sha256_of(canonical_json(known)):
-            return dict(known)
+        content = json.loads(file.read_bytes())
+        checksum = content.pop("sha256")
+        if content["state"] == state and checksum == sha256_of(canonical_json(content)):
+            return dict(content)
     return None
 
 
@@ -234,9 +240,9 @@ def _pieces(warehouse: Warehouse, predicate: Predicate) -> list[_Piece]:
         opened = reader.opened(PLAIN, predicate)
         statement = opened.statement("examined_days.sql", predicate)
         with guarded_query(opened.database, predicate):
-            found = opened.database.execute(statement).fetchall()
+            days = opened.database.execute(statement).fetchall()
     pieces: list[_Piece] = []
-    for day in (_Piece(day, day, drives, [rows]) for day, drives, rows in found if drives):
+    for day in (_Piece(day, day, drives, [rows]) for day, drives, rows in days if drives):
         if pieces and pieces[-1].drives < PIECE:
             pieces[-1] = pieces[-1].and_then(day)
         else:
@@ -254,10 +260,10 @@ def _count_unreduced(
     if not missing:
         return 0
     query = f"SELECT count(*) FROM drives WHERE {predicate.sql} AND source <> '{RECEIVED}'"
-    others = frozenset(f.path for f in logs.files) - frozenset(f.path for f in missing)
-    only = [grams, replace(logs, without=others)]
-    with open_tables(warehouse, views_in(query), only) as database:
-        lock(database, [path for one in only for path in one.paths])
+    reduced = frozenset(f.path for f in logs.files) - frozenset(f.path for f in missing)
+    snapshots = [grams, replace(logs, without=reduced)]
+    with open_tables(warehouse, views_in(query), snapshots) as database:
+        lock(database, [path for snapshot in snapshots for path in snapshot.paths])
         with guarded_query(database, predicate):
             [(drives,)] = database.execute(query).fetchall()
     return int(drives)

@@ -88,8 +88,8 @@ def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> D
 
 def _averaged(values: FloatArray) -> FloatArray:
     """Return means of `STEP` ticks, along the last axis."""
-    whole = values[..., : values.shape[-1] // STEP * STEP]
-    return np.asarray(whole.reshape(*whole.shape[:-1], -1, STEP).mean(axis=-1))
+    blocks = values[..., : values.shape[-1] // STEP * STEP]
+    return np.asarray(blocks.reshape(*blocks.shape[:-1], -1, STEP).mean(axis=-1))
 
 
 def _moments(y: FloatArray, x: FloatArray, lags: NDArray[np.intp], steps: int) -> FloatArray:
@@ -163,10 +163,10 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
         return
     # All angles of the steering are one witness: its first.
     steering = [name for name in delays if name in STEERING]
-    values = [delay.value_s for name, delay in delays.items() if name not in steering[1:]]
-    if len(values) < MIN_WITNESSES:
+    lags_s = [delay.value_s for name, delay in delays.items() if name not in steering[1:]]
+    if len(lags_s) < MIN_WITNESSES:
         return
-    middle = float(np.median(values))
+    middle = float(np.median(lags_s))
     errors = sorted(delay.error_s for delay in delays.values())
     for name, delay in delays.items():
         # The reference itself has no error; that of the others' median stands for it.

@@ -47,7 +47,7 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
     """
     if label not in table.signals or len(table.signals) < 2 or in_order.sum() < 2:
         return {}
-    drives = DriveBatches.of(table, in_order)
+    drives = DriveBatches.from_table(table, in_order)
     gains = _gains(drives, table.signals.index(label))
     if gains is None:
         return {}
@@ -94,9 +94,9 @@ def _fit_signs(
 
 def label_blocks(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the covariances of the inputs, theirs with the label, and the label's variances."""
-    others = np.delete(np.arange(covariances.shape[1]), label)
-    inputs = covariances[:, others[:, None], others]
-    return inputs, covariances[:, others, label], covariances[:, label, label]
+    inputs_at = np.delete(np.arange(covariances.shape[1]), label)
+    inputs = covariances[:, inputs_at[:, None], inputs_at]
+    return inputs, covariances[:, inputs_at, label], covariances[:, label, label]
 
 
 def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:
@@ -148,7 +148,7 @@ def find_odd_days(
     faults: dict[int, Fault] = {}
     usual = in_order.copy()
     while usual.sum() >= limits.min_drives:
-        figures = _figures(DriveBatches.of(table, usual), table.signals.index(label))
+        figures = _figures(DriveBatches.from_table(table, usual), table.signals.index(label))
         if figures is None:
             break
         chosen = [group[usual] for group in groups]
@@ -194,10 +194,10 @@ def _odd_drives(
     return faults
 
 
-def _fault(label: str, column: int, difference: float, others: str) -> Fault:
+def _fault(label: str, column: int, difference: float, reference: str) -> Fault:
     if column == GAIN:
-        return LABEL_GAIN.fault(label, gain=math.exp(difference), others=others)
-    return LABEL_OFFSET.fault(label, offset=difference, others=others)
+        return LABEL_GAIN.fault(label, gain=math.exp(difference), others=reference)
+    return LABEL_OFFSET.fault(label, offset=difference, others=reference)
 
 
 def _odd_groups(
@@ -218,12 +218,12 @@ def _odd_groups(
         sizes = [len(np.unique(cars[side])) if has_cars else int(side.sum()) for side in sides]
         if 2 * mask.sum() > len(mask) or min(sizes) < MIN_CARS:
             continue
-        in_group, others = medians = [np.median(figures[side], axis=0) for side in sides]
+        medians = [np.median(figures[side], axis=0) for side in sides]
         variance = np.full(2, np.finfo(np.float64).tiny)
         for side, median, size in zip(sides, medians, sizes, strict=True):
             scale = MAD_TO_STD * np.median(np.abs(figures[side] - median), axis=0)
             variance += math.pi / 2 * scale**2 / size
-        differences = in_group - others
+        differences = medians[0] - medians[1]
         scores = np.abs(differences) / np.sqrt(variance)
         for column, bound in bounds.items():
             if abs(differences[column]) > bound and scores[column] > limit:

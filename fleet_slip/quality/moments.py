@@ -30,13 +30,13 @@ class MeanMoments:
     matrices: FloatArray
 
     @classmethod
-    def of(cls, table: "GramTable") -> "MeanMoments":
+    def from_table(cls, table: "GramTable") -> "MeanMoments":
         """Divide the sums of a table by its rows."""
         n = table.n.astype(np.float64)
         return cls(table.signals, table.moments() / n[:, None, None])
 
     @classmethod
-    def of_rows(cls, values: Mapping[str, FloatArray], rows: BoolArray) -> "MeanMoments":
+    def from_rows(cls, values: Mapping[str, FloatArray], rows: BoolArray) -> "MeanMoments":
         """Return the moments of some rows of one drive, each signal about its mean."""
         table = np.array([signal[rows] for signal in values.values()])
         table -= table.mean(axis=1, keepdims=True)
@@ -78,7 +78,7 @@ class DriveBatches:
     rows: NDArray[np.intp]
 
     @classmethod
-    def of(cls, table: "GramTable", mask: BoolArray | None = None) -> "DriveBatches":
+    def from_table(cls, table: "GramTable", mask: BoolArray | None = None) -> "DriveBatches":
         """Take all drives of a table, or those of a mask."""
         return cls(table, np.arange(len(table)) if mask is None else np.flatnonzero(mask))
 
@@ -89,7 +89,7 @@ class DriveBatches:
     def __iter__(self) -> Iterator[MeanMoments]:
         """Yield the moments of the drives in their order."""
         for first in range(0, len(self), BATCH):
-            yield MeanMoments.of(self.table.take(self.rows[first : first + BATCH]))
+            yield MeanMoments.from_table(self.table.take(self.rows[first : first + BATCH]))
 
     @cached_property
     def mean(self) -> FloatArray:

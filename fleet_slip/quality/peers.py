@@ -144,11 +144,11 @@ class Prediction:
         residual[np.arange(len(w)), self.targets] += 1
         offset = m[:, 0] @ residual.T
         square = _quadratic(m, residual)
-        own = np.take_along_axis(m @ w.T, self.targets[None, None, :], axis=1)[:, 0]
+        with_own = np.take_along_axis(m @ w.T, self.targets[None, None, :], axis=1)[:, 0]
         predicted = np.maximum(_quadratic(m, w), np.finfo(np.float64).tiny)
         # A residual below a tenth of a count is rounding.
         noise = 0.5 * np.log(np.maximum(square - offset**2, 0.01))
-        return np.stack([offset, own / predicted, noise], axis=2)
+        return np.stack([offset, with_own / predicted, noise], axis=2)
 
     def scores(self, moments: MeanMoments) -> FloatArray:
         """Return standard deviations from the median, (drives, targets, 3); above it for noise."""
@@ -256,8 +256,8 @@ def settle(
     """Fit peers on sound drives without suspects, until these stay the same; return both."""
     suspects = ~in_order
     for _ in range(ROUNDS):
-        peers = Peers(DriveBatches.of(table, ~suspects), label, limits)
-        beyond = peers.suspects(DriveBatches.of(table)) | ~in_order
+        peers = Peers(DriveBatches.from_table(table, ~suspects), label, limits)
+        beyond = peers.suspects(DriveBatches.from_table(table)) | ~in_order
         if (beyond == suspects).all() or (~beyond).sum() < limits.min_drives:
             break
         suspects = beyond

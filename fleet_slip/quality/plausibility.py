@@ -131,8 +131,8 @@ def find_one_sided(signals: Signals, moving: BoolArray, label: str) -> Iterator[
     for name in (*SIGNED, label):
         if name not in signals or not (side := _side(signals[name], moving)):
             continue
-        others = [mean for other, mean in means.items() if other != name]
-        if others and np.median(others) > MIN_MEAN_RATIO:
+        ratios = [mean for other, mean in means.items() if other != name]
+        if ratios and np.median(ratios) > MIN_MEAN_RATIO:
             continue
         sign, minutes = ("negative" if side > 0 else "positive"), signals[name].size / 6000
         check = LABEL_ONE_SIDED if name == label else ONE_SIDED
@@ -168,7 +168,7 @@ def _turning(signals: Signals, moving: BoolArray, label: str) -> list[Fault]:
     rows = moving & np.isfinite(list(used.values())).all(axis=0)
     if rows.sum() < MIN_TICKS:
         return []
-    moments = MeanMoments.of_rows(used, rows)
+    moments = MeanMoments.from_rows(used, rows)
     faults = find_reversed_or_swapped(moments).get(0, [])
     if faults and set(faults[0].signals) == {"ay", "yaw_rate"}:
         faults = [_decide(faults[0], signals, moving, label)]

@@ -63,7 +63,7 @@ def check_moments(
 ) -> dict[int, Fault]:
     """Return the drives whose signals contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
-    for first, moments in zip(count(0, BATCH), DriveBatches.of(table)):
+    for first, moments in zip(count(0, BATCH), DriveBatches.from_table(table)):
         in_batch = find_swapped_steering(moments, signals)
         if len(_witnesses(moments)) >= MIN_WITNESSES:
             turning = find_reversed_or_swapped(moments, min_correlation)
@@ -124,10 +124,10 @@ def find_reversed_or_swapped(
     loadings *= np.where(signs == 0, 1, signs)[:, None]
     faults: dict[int, list[Fault]] = {}
     for drive, i in np.argwhere(loadings < -MIN_LOADING).tolist():
-        others = correlations[drive, i, loadings[drive] > MIN_LOADING]
-        if not others.size or np.median(others) > lowest:
+        opposed = correlations[drive, i, loadings[drive] > MIN_LOADING]
+        if not opposed.size or np.median(opposed) > lowest:
             continue
-        signals, correlation = WITNESSES[names[i]], float(np.median(others))
+        signals, correlation = WITNESSES[names[i]], float(np.median(opposed))
         if len(signals) == 1:
             fault = TURNING_SIGN.fault(*signals, correlation=correlation)
         else:
@@ -152,12 +152,12 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
     squares = np.diagonal(weights @ m[:, 1:, 1:] @ weights.T, axis1=1, axis2=2)
     away = np.divide(np.abs(means), np.sqrt(squares), out=np.zeros_like(means), where=squares > 0)
     agreement = np.abs(_correlations(moments, names))
-    others = ~np.eye(len(names), dtype=bool)
+    is_peer = ~np.eye(len(names), dtype=bool)
     faults = {}
     for i, name in enumerate(names):
         if len(WITNESSES[name]) == 2:
             continue
-        peers = others[i]
+        peers = is_peer[i]
         within = agreement[:, peers][:, :, peers]
         agree = np.median(within[:, ~np.eye(peers.sum(), dtype=bool)], axis=1) > MIN_AGREEMENT
         lone = agreement[:, i, peers].max(axis=1) < MAX_LONE_CORRELATION
