@@ -68,7 +68,7 @@ def open_views(
     if "runs" in views:
         add_runs(database, warehouse.root)
     if "models" in views:
-        add_table(database, "models", Registry.of(warehouse).as_table())
+        add_table(database, "models", Registry.open(warehouse).as_table())
     if "dictionary" in views:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalog.signals))
     if not unlocked:

@@ -204,7 +204,7 @@ class FleetCohort:
                 raise UsageError("name a published model or signals (of a feature set), not both.")
             cohort = self._load(features or PLAIN)
             return diagnose(cohort, inputs_of(cohort, signals or WHOLE_SET), cluster=cluster)
-        registry = Registry.of(self.warehouse)
+        registry = Registry.open(self.warehouse)
         if model is None:
             model = registry.only(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)

@@ -36,7 +36,7 @@ class FleetModels:
     @property
     def registry(self) -> Registry:
         """The registry that stores the versions and aliases."""
-        return Registry.of(self.warehouse)
+        return Registry.open(self.warehouse)
 
     def get(self, model: str | ModelVersion | None = None) -> ModelVersion:
         """Return the version of a reference; a version is returned as it is."""

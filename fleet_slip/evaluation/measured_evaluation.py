@@ -223,7 +223,7 @@ class Competition:
         executor: Executor,
     ) -> "Competition":
         """Collect Table I, the versions, and filters in the car if there is one."""
-        catalog, registry = warehouse.catalog, Registry.of(warehouse)
+        catalog, registry = warehouse.catalog, Registry.open(warehouse)
         recipes = {
             f"table1/{row.name}": (FITTED, SelectionRequest(model=",".join(row.signals)))
             for row in load_model_list(catalog, TABLE_ONE).model

@@ -170,7 +170,7 @@ def _subject(
     checks = make_checks(version.catalog.signals, version.manifest, program)
     drives = None
     if warehouse is not None:
-        drives = Registry.of(warehouse).trained_drives(version.manifest).content
+        drives = Registry.open(warehouse).trained_drives(version.manifest).content
     return Subject(version, program, checks, drives, with_gram)
 
 
@@ -182,7 +182,7 @@ def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
     """
     from fleet_slip.export.mlflow import log_to_mlflow  # noqa: PLC0415 - mlflow imports this module
 
-    aliases = Registry.of(warehouse).history(version.manifest.name).aliases()
+    aliases = Registry.open(warehouse).history(version.manifest.name).aliases()
     return log_to_mlflow(uri, _subject(version, warehouse), aliases)
 
 

@@ -46,12 +46,12 @@ CHAMPION = "champion"
 """The alias of the version in use."""
 
 CANDIDATE = "candidate"
-"""The alias of the version that waits for somebody to look at it."""
+"""The alias of the version that waits for `promote`."""
 
 Command = Literal["publish", "promote", "rollback", "pin", "unpin"]
 
 HOLDING: frozenset[Command] = frozenset({"rollback", "pin"})
-"""After these no publication moves the alias, until a person lets it go."""
+"""After these commands no publication moves the alias, until one of `RELEASING`."""
 
 RELEASING: frozenset[Command] = frozenset({"promote", "unpin"})
 
@@ -59,14 +59,14 @@ T = TypeVar("T")
 
 
 class AliasMove(Config):
-    """One entry of the history: an alias points at a version from this moment on."""
+    """Entry of the history: from `at` on an alias points at a version."""
 
     alias: Identifier
     version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
     command: Command
     at: datetime
     best: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)] | None = None
-    """Of a publication: the best of the champions so far, if that is another version."""
+    """For a publication: the best champion so far, if it is another version."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class AliasHistory:
         return list(self.latest_moves())[::-1]
 
     def latest_moves(self) -> Iterator[AliasMove]:
-        """Yield the moves, newest first, each read when it is asked for."""
+        """Yield the moves, newest first, and read each when it is needed."""
         for number in reversed(self.documents.numbers()):
             document = self.documents.read(number)
             file = self.documents.file(number)
@@ -91,9 +91,9 @@ class AliasHistory:
         return next((move.version for move in self.latest_moves() if move.alias == alias), None)
 
     def before(self, alias: str) -> int | None:
-        """Return the version that an alias pointed at before the one of now, or None.
+        """Return the version that an alias pointed at before, or None.
 
-        What was rolled back does not count: going back twice goes back two versions.
+        Rolled back versions do not count: two rollbacks go back two versions.
         """
         trail: list[int] = []
         for move in self.moves():
@@ -102,21 +102,21 @@ class AliasHistory:
         return trail[-2] if len(trail) > 1 else None
 
     def best_of(self, alias: str) -> int | None:
-        """Return the best of the versions that an alias was led through since a person moved it.
+        """Return the best version of an alias since a person moved it, as publications judged.
 
-        That is what publications said; None if the alias points at no version.
+        Returns None if the alias points at no version.
         """
         last = next((move for move in self.latest_moves() if move.alias == alias), None)
         return None if last is None else last.best or last.version
 
     def published_at(self, version: int) -> datetime | None:
-        """Return when a version was published last; None if no move tells."""
+        """Return when a version was published last; None if unknown."""
         moves = self.latest_moves()
         published = (m.at for m in moves if m.version == version and m.command == "publish")
         return next(published, None)
 
     def held_by(self, alias: str) -> AliasMove | None:
-        """Return the move since which no publication may move an alias; None if one may."""
+        """Return the move that keeps publications from moving an alias; None without."""
         moves = (move for move in self.latest_moves() if move.alias == alias)
         last = next((move for move in moves if move.command in HOLDING | RELEASING), None)
         return last if last is not None and last.command in HOLDING else None
@@ -126,10 +126,10 @@ class AliasHistory:
         return {move.alias: move.version for move in self.moves()}
 
     def decide(self, decision: Callable[[int], T | None]) -> T:
-        """Return what a decision comes to, which is taken again while it comes to None.
+        """Return the result of a decision; repeat it while the result is None.
 
-        The decision gets the number of the newest move, which it passes to `move`; it must read
-        nothing of the history before it is called. Raises `ConflictError` after many attempts.
+        The decision receives the number of the newest move and passes it to `move`. It must not
+        read the history earlier. Raises `ConflictError` after many attempts.
         """
         return self.documents.after_newest(decision)
 
@@ -154,7 +154,7 @@ class AliasHistory:
 
 
 def _after(trail: list[int], move: AliasMove) -> list[int]:
-    """Return the versions that an alias was led through, after one more move."""
+    """Return the versions that an alias pointed at, after another move."""
     match move.command:
         case "rollback":
             return trail[:-1]
@@ -170,14 +170,14 @@ def _after(trail: list[int], move: AliasMove) -> list[int]:
 
 
 class ArrowStream(Protocol):
-    """A table of Arrow, or of a library that hands its tables over as Arrow."""
+    """An Arrow table, or a table that exports Arrow streams."""
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
         """Return the table's batches."""
 
 
 class PandasFrame(Protocol):
-    """A data frame of pandas, which need not be installed."""
+    """A pandas data frame; pandas need not be installed."""
 
     @property
     def iloc(self) -> Any:
@@ -201,14 +201,14 @@ class ModelVersion:
         )
 
     def _repr_html_(self) -> str:
-        terms = [(one.column, one.unit, one.coefficient) for one in self.manifest.terms]
+        terms = [(term.column, term.unit, term.coefficient) for term in self.manifest.terms]
         terms.append(("intercept", self.manifest.label.unit, self.manifest.intercept))
         table = TextTable("", "signal|unit|coefficient", terms, "{0}|{1}|{2:.6g}", text_columns=2)
         return f"<pre>{escape(repr(self)[1:-1])}\n{escape(table.text())}</pre>"
 
     @property
     def reference(self) -> str:
-        """The version as it is named on the command line: `NAME@VERSION`."""
+        """Reference on the command line: `NAME@VERSION`."""
         return f"{self.manifest.name}@{self.version}"
 
     @property
@@ -271,8 +271,8 @@ class Registry:
     catalog: Catalog
 
     @classmethod
-    def of(cls, warehouse: "Warehouse") -> "Registry":
-        """Return the models of a data root."""
+    def open(cls, warehouse: "Warehouse") -> "Registry":
+        """Return the registry of a data root."""
         return cls(warehouse.root, warehouse.catalog)
 
     @property
@@ -289,12 +289,12 @@ class Registry:
         ]
 
     def require(self, name: str) -> None:
-        """Raise `QuestionError` if no model is called so."""
+        """Raise `QuestionError` if there is no model of this name."""
         if name not in self.names():
-            raise QuestionError(f"no model is called {name!r}. Models: {self._known}.")
+            raise QuestionError(f"no model is called {name!r}. Models: {self._listed_names}.")
 
     @property
-    def _known(self) -> str:
+    def _listed_names(self) -> str:
         none = f"none in {self.folder} yet; publish one with: fleet-slip publish NAME"
         return ", ".join(self.names()) or none
 
@@ -333,20 +333,20 @@ class Registry:
         """Return the name of the only model. Raises `QuestionError` if there is not one."""
         names = self.names()
         if len(names) != 1:
-            raise QuestionError(f"name a published model{or_else}. Models: {self._known}.")
+            raise QuestionError(f"name a published model{or_else}. Models: {self._listed_names}.")
         return names[0]
 
     def resolve(self, reference: str | None) -> ModelVersion:
         """Return the version of a reference, or the only model. Raises `QuestionError`."""
-        name, _, which = (reference or self.only()).partition("@")
+        name, _, label = (reference or self.only()).partition("@")
         self.require(name)
-        which = which or CHAMPION
-        if which.isascii() and which.isdigit() and len(which) <= MAX_DIGITS:
-            return self.load(name, int(which))
+        label = label or CHAMPION
+        if label.isascii() and label.isdigit() and len(label) <= MAX_DIGITS:
+            return self.load(name, int(label))
         history = self.history(name)
-        version = history.pointed_at(which)
+        version = history.pointed_at(label)
         if version is None:
-            raise _unknown(name, which, [*self.versions(name), *sorted(history.aliases())])
+            raise _unknown(name, label, [*self.versions(name), *sorted(history.aliases())])
         return self.load(name, version)
 
     def folder_of(self, name: str) -> Folder:
@@ -404,9 +404,9 @@ class Registry:
         history = self.history(name)
 
         def move(newest: int) -> int | None:
-            chosen = history.pointed_at(alias) == history.best_of(alias) == version
-            there = chosen and not history.held_by(alias)
-            moved = there or history.move(alias, version, "promote", after=newest)
+            is_best = history.pointed_at(alias) == history.best_of(alias) == version
+            unchanged = is_best and not history.held_by(alias)
+            moved = unchanged or history.move(alias, version, "promote", after=newest)
             return version if moved else None
 
         history.decide(move)
@@ -417,8 +417,9 @@ class Registry:
         history = self.history(name)
 
         def move(newest: int) -> int | None:
-            there = bool(history.held_by(alias)) == (command == "pin")
-            return version if there or history.move(alias, version, command, after=newest) else None
+            unchanged = bool(history.held_by(alias)) == (command == "pin")
+            moved = unchanged or history.move(alias, version, command, after=newest)
+            return version if moved else None
 
         return history.decide(move)
 
@@ -441,7 +442,7 @@ class Registry:
     def as_table(self, name: str | None = None) -> pa.Table:
         """Return all versions of all models, or of one, as rows."""
         names = self.names() if name is None else [name]
-        rows = [row for one in names for row in self._rows(one)]
+        rows = [row for name in names for row in self._rows(name)]
         return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
 
     def _rows(self, name: str) -> list[Mapping[str, Any]]:
@@ -455,14 +456,14 @@ class Registry:
             version = self.load(name, number)
             manifest = version.manifest
             figures, trained = manifest.cross_validation, manifest.trained_on
-            own = {
+            columns = {
                 "version": number,
                 "aliases": ",".join(aliases.get(number, [])),
                 "signals": ",".join(manifest.signals),
                 "published_at": published.get(number),
                 "sha256": version.sha256,
             }
-            rows.append({**vars(trained), **vars(figures), "name": name, **own})
+            rows.append({**vars(trained), **vars(figures), "name": name, **columns})
         return rows
 
     def _versions(self, name: str) -> DocumentFolder:
@@ -488,43 +489,46 @@ _TABLE_SCHEMA = pa.schema(
 )
 
 
-def _unknown(name: str, which: str, known: Sequence[int | str]) -> QuestionError:
-    there = ", ".join(map(str, known))
-    return QuestionError(f"{name} has no version or alias {which!r}. It has: {there}.")
+def _unknown(name: str, label: str, labels: Sequence[int | str]) -> QuestionError:
+    """Return the error for a version or alias that a model does not have."""
+    available = ", ".join(map(str, labels))
+    return QuestionError(f"{name} has no version or alias {label!r}. It has: {available}.")
 
 
 def _drives_file(sha256: str) -> str:
     return f"drives-{sha256}.bin"
 
 
-# What differs between two versions: every entry of their manifests, and the drives.
+# Differences of two versions: entries of their manifests, and their training drives.
 
 _LONGEST_SHOWN = 40
-"""Characters of a value in the table; the document has it whole."""
+"""Maximum number of characters of a value in the table; the document is complete."""
 
 
 @dataclass(frozen=True)
 class Difference(Answer):
-    """Two versions, what differs of their manifests, and how many drives made either.
+    """Differences of two versions.
 
     Attributes:
-        facts: values of both by the path of their entry; None where one has no such entry.
-        drives: that made only the one, only the other, and both; None of two models.
+        facts: values of both by the path of the entry; None where an entry is missing.
+        drives: training drives of the first alone, the second alone, and both; None if the
+            versions are of two models.
     """
 
-    one: ModelVersion
-    other: ModelVersion
+    first: ModelVersion
+    second: ModelVersion
     facts: dict[str, tuple[Any, Any]]
     drives: tuple[int, int, int] | None
 
     def parts(self) -> Iterator[Part]:
-        """Return a table of what differs, and the numbers of drives.
+        """Return a table of the differences, and the numbers of drives.
 
-        Of a term that one has alone it shows the coefficient.
+        For a term of a single version it shows the coefficient alone.
         """
-        one, other = self.one.reference, self.other.reference
-        theirs = [{term.signal for term in two.manifest.terms} for two in (self.one, self.other)]
-        once = tuple(f"terms.{signal}." for signal in theirs[0] ^ theirs[1])
+        versions = (self.first, self.second)
+        one_name, other_name = (version.reference for version in versions)
+        signals = [{term.signal for term in version.manifest.terms} for version in versions]
+        once = tuple(f"terms.{signal}." for signal in signals[0] ^ signals[1])
         rows = [
             [name, _shown(a), _shown(b)]
             for name, (a, b) in self.facts.items()
@@ -532,32 +536,33 @@ class Difference(Answer):
             and (not name.startswith(once) or name.endswith(".coefficient"))
         ]
         if not rows:
-            yield Remark(f"{one} and {other} are the same estimator from the same data")
+            yield Remark(f"{one_name} and {other_name} are the same estimator from the same data")
             return
-        yield TextTable("", f"what differs|{one}|{other}", rows, text_columns=3)
+        yield TextTable("", f"what differs|{one_name}|{other_name}", rows, text_columns=3)
         if self.drives:
             only_one, only_other, both = self.drives
             yield Remark(
-                f"drives: {both:,} made both, {only_one:,} only {one}, {only_other:,} only {other}"
+                f"drives: {both:,} made both, {only_one:,} only {one_name}, {only_other:,} only "
+                f"{other_name}"
             )
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `diff --json` prints."""
         names = ("only_one", "only_other", "both")
         return {
-            "one": self.one.reference,
-            "other": self.other.reference,
+            "one": self.first.reference,
+            "other": self.second.reference,
             "drives": dict(zip(names, self.drives, strict=True)) if self.drives else None,
             "facts": {name: {"one": a, "other": b} for name, (a, b) in self.facts.items()},
         }
 
 
-def compare_versions(registry: Registry, one: ModelVersion, other: ModelVersion) -> Difference:
-    """Compare two versions. Raises `StorageError` if what one keeps of its drives is damaged."""
-    a, b = (dict(_entries(version)) for version in (one, other))
+def compare_versions(registry: Registry, first: ModelVersion, second: ModelVersion) -> Difference:
+    """Compare two versions. Raises `StorageError` if a file of training drives is damaged."""
+    a, b = (dict(_entries(version)) for version in (first, second))
     names = [name for name in dict.fromkeys([*a, *b]) if a.get(name) != b.get(name)]
     facts = {name: (a.get(name), b.get(name)) for name in names}
-    return Difference(one, other, facts, _count_drives(registry, one, other))
+    return Difference(first, second, facts, _count_drives(registry, first, second))
 
 
 def _entries(version: ModelVersion) -> Iterator[tuple[str, Any]]:
@@ -581,10 +586,11 @@ def _shown(value: Any) -> str:
 
 
 def _count_drives(
-    registry: Registry, one: ModelVersion, other: ModelVersion
+    registry: Registry, first: ModelVersion, second: ModelVersion
 ) -> tuple[int, int, int] | None:
-    if one.manifest.name != other.manifest.name:  # their hashes are salted differently
+    """Return the training drives of the first alone, the second alone, and both."""
+    if first.manifest.name != second.manifest.name:  # their hashes are salted differently
         return None
-    a, b = (registry.trained_drives(version.manifest).salted for version in (one, other))
+    a, b = (registry.trained_drives(version.manifest).salted for version in (first, second))
     both = len(np.intersect1d(a, b, assume_unique=True))
     return len(a) - both, len(b) - both, both

@@ -231,7 +231,7 @@ def _begin(
     drives: Collection[str],
     located: Located,
 ) -> list[str]:
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     judged = {name: max(registry.versions(name), default=0) for name in registry.names()}
     models = models_trained_on(warehouse, drives)
     known = () if subject.kind == "before" else digests_of(warehouse, subject, located)

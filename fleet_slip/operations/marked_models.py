@@ -32,7 +32,7 @@ def marked_models(warehouse: Warehouse) -> frozenset[str]:
             without[entry["subject"]] = None
         elif entry["event"] == "done":
             without[entry["subject"]] = entry.get("grams_version")
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
     hashes = cache(lambda: _hashes_of_present(warehouse))
     present = cache(lambda name: TrainedDrives.from_hashes(name, hashes()).salted)
@@ -76,7 +76,7 @@ def _may_have_seen(
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
     """Return the model versions that were trained on one of the drives, or may have been."""
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     hashes = hash_names(pa.array(sorted(drives), pa.string()))
     found: list[str] = []
     for name in registry.names():

@@ -245,7 +245,7 @@ def _last_runs(root: Folder, since: str) -> list[dict[str, Any]]:
 def _champions(
     warehouse: Warehouse, logs: Snapshot, grams: Snapshot, now: datetime
 ) -> tuple[tuple[ChampionStatus, ...], list[str]]:
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     found, damaged = [], []
     for name in registry.names():
         try:

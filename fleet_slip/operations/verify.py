@@ -346,7 +346,7 @@ def verify_models(
     warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
 ) -> None:
     """Look for versions that nothing present can have made, and aliases that point at nothing."""
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     for name in registry.names():
         try:
             numbers = registry.versions(name)

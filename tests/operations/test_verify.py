@@ -217,7 +217,7 @@ def decided(warehouse: Warehouse) -> None:
     for car in "ab":
         land(warehouse, car, log_rows(car, random_counts(rng, 30), vehicle_id=f"car-{car}"))
     forget(warehouse, ErasureSubject("vehicle", "car-b"))
-    registry = Registry.of(warehouse)
+    registry = Registry.open(warehouse)
     for number in (1, 2):
         publish(registry, manifest(Fraction(number)))
     registry.hold("sideslip", CHAMPION, "pin")
