@@ -219,6 +219,7 @@ def test_a_root_is_not_asked_for_the_lines_of_another(
 ) -> None:
     line = the_line(fleet)
     other = fleet_slip.open(smoke_root, own_set)
-    with pytest.raises(QuestionError, match=f"the line {line.digest} is not in this data root"):
+    missing = f"the first-stage model {line.digest} is not in this data root"
+    with pytest.raises(QuestionError, match=missing):
         other.warehouse.catalog.first_stage_model(f"tiny_{line.digest}")
     assert fleet.warehouse.catalog.first_stage_model(f"tiny_{line.digest}") == line
