@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from fleet_slip.columns.lowering import operation_of, plain_of, size_of
+from fleet_slip.columns.lowering import size_of
 from fleet_slip.export.program import Program, Steps
 from fleet_slip.export.templating import (
     INDENT,
@@ -61,7 +61,7 @@ class StepWriter:
     def value(self, step: int) -> str:
         """Return the value of a step in C; its statements are written first."""
         if step not in self._values:
-            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            name, plain = self.program.operation(step)
             self._values[step] = _WRITERS.get(name, StepWriter._arithmetic)(self, step, *plain)
         return self._values[step]
 
@@ -72,7 +72,7 @@ class StepWriter:
 
     def word(self, step: int) -> str:
         """Return a step as a state word: `MISSING` if it is missing."""
-        if operation_of(self.program.steps[step]) in _INPUTS:
+        if self.program.operation(step)[0] in _INPUTS:
             return self._input_word(step)
         value = self.value(step)
         return f"(({self.is_present(step)}) ? {value} : MISSING)"
@@ -84,7 +84,7 @@ class StepWriter:
     def _is_root_present(self, root: int) -> str:
         """Return the bool that is false where a step is missing by itself."""
         if root not in self._presence:
-            name = operation_of(self.program.steps[root])
+            name = self.program.operation(root)[0]
             is_input = name in _INPUTS
             present = (
                 f"({self._input_word(root)} != MISSING)" if is_input else _PRESENT[name](self, root)
@@ -93,7 +93,7 @@ class StepWriter:
         return self._presence[root]
 
     def _arithmetic(self, step: int, *operands: int) -> str:
-        name = operation_of(self.program.steps[step])
+        name = self.program.operation(step)[0]
         values = [self.value(operand) for operand in operands]
         if name == "*" and "1" in values:
             return values[values[0] == "1"]
@@ -148,7 +148,7 @@ class StepWriter:
     def _input_word(self, step: int) -> str:
         """Return an input, or a value of an earlier tick, as a word that can be `MISSING`."""
         if step not in self._words:
-            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            name, plain = self.program.operation(step)
             self.counts["within"] += name == "signal"
             word = self._ago(*plain) if name == "ago" else self._inputs[name][plain[0]]
             self._words[step] = self._declare("int32_t", "in", step, word)
@@ -173,7 +173,7 @@ class StepWriter:
             else:
                 self.counts["gather"] += 1
                 self.lines.append(f"gather({both}, {limit}U, {newest});")
-        counts = operation_of(self.program.steps[step]) == "values"
+        counts = self.program.operation(step)[0] == "values"
         return f"(int32_t)state->values_{key}" if counts else f"state->sum_{key}"
 
     def _set(self, step: int, value: str) -> str:
@@ -216,17 +216,17 @@ _OPERATIONS = {
 
 
 def _positive(writer: StepWriter, step: int) -> str:
-    _, divisor = plain_of(writer.program.steps[step])
+    _, divisor = writer.program.operation(step)[1]
     return f"({writer.value(divisor)} > 0)"
 
 
 def _enough(writer: StepWriter, step: int) -> str:
-    a, b = plain_of(writer.program.steps[step])
+    a, b = writer.program.operation(step)[1]
     return f"({writer.value(a)} >= {writer.value(b)})"
 
 
 def _either(writer: StepWriter, step: int) -> str:
-    a, b = plain_of(writer.program.steps[step])
+    a, b = writer.program.operation(step)[1]
     return f"({writer.is_present(a)}) || ({writer.is_present(b)})"
 
 

@@ -23,8 +23,6 @@ from fleet_slip.columns.lowering import (
     GIVEN,
     POWERS,
     operands_of,
-    operation_of,
-    plain_of,
     size_of,
 )
 from fleet_slip.export.program import Program
@@ -185,7 +183,7 @@ class _Writer(Nodes):
 
     def _is_constant(self, step: int) -> bool:
         """Return True if a step has the same value at all ticks at which it is not missing."""
-        name = operation_of(self.program.steps[step])
+        name = self.program.operation(step)[0]
         operands = operands_of(self.program.steps[step])
         values = operands[:1] if name in ("where", "at_least") else operands
         return name == "constant" or (bool(operands) and all(map(self._is_constant, values)))
@@ -193,7 +191,7 @@ class _Writer(Nodes):
     def _value(self, step: int) -> str:
         """Return the value of a step; any value of its range where it is missing."""
         if step not in self._values:
-            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            name, plain = self.program.operation(step)
             self._values[step] = self._computed(step, name, plain)
         return self._values[step]
 
@@ -209,7 +207,7 @@ class _Writer(Nodes):
     def _is_root_present(self, step: int) -> str:
         """Return the node that is false where a step is missing by itself."""
         if step not in self._present:
-            name, plain = operation_of(self.program.steps[step]), plain_of(self.program.steps[step])
+            name, plain = self.program.operation(step)
             if name in ("//", "nearest"):
                 self._present[step] = self.do("Greater", self._value(plain[1]), 0)
             elif name == "at_least":

@@ -25,6 +25,7 @@ from fleet_slip.columns.lowering import (
     VehicleAttribute,
     given_ranges,
     operands_of,
+    operation_of,
     plain_of,
     ranges_of,
     rings_of,
@@ -192,6 +193,10 @@ class Steps:
     facts: tuple[VehicleAttribute, ...]
     numbers: tuple[ParameterCount, ...]
     steps: tuple[Step, ...]
+
+    def operation(self, step: int) -> tuple[str, tuple[int, ...]]:
+        """Return the operation of a step and its arguments."""
+        return operation_of(self.steps[step]), plain_of(self.steps[step])
 
     @cached_property
     def input_ranges(self) -> dict[str, list[Range]]:

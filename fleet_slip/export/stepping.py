@@ -7,7 +7,7 @@ from typing import Any
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
 from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.columns.lowering import operation_of, plain_of, power
+from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
 from fleet_slip.export.compile import compile_program
 from fleet_slip.export.program import Car, Program
@@ -59,7 +59,7 @@ class Estimator:
         properties = _parse_car(manifest, program, car or {})
         self.columns = tuple(signal.column for signal in program.signals)
         self._manifest = manifest
-        steps = [(operation_of(step), plain_of(step)) for step in program.steps]
+        steps = [program.operation(step) for step in range(len(program.steps))]
         car_counts = {
             "fact": properties.fact_counts(program),
             "number": properties.number_counts(program),

@@ -1,1 +1,1 @@
-"""Simulated drives: campaigns, tracks, sensors, and the job that writes what is missing."""
+"""Simulated drives: campaigns, roads, traffic, sensors, and the simulation of logs."""

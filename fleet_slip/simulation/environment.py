@@ -7,7 +7,7 @@ rounding to counts. Importing this module registers the environment.
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, SupportsFloat
 
 import gymnasium
 import numpy as np
@@ -24,15 +24,6 @@ from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Sl
 from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
 
 
-class Moved(NamedTuple):
-    """A car after a step: state, slopes for the next step, and specific force."""
-
-    state: State
-    slopes: Slopes
-    ax: float
-    ay: float
-
-
 @kernel
 def move(
     x: State,
@@ -44,7 +35,10 @@ def move(
     count: int,
     order: float,
 ) -> Any:
-    """Advance a car by `count` steps; `order` is that of the first."""
+    """Advance a car by `count` steps; return state, slopes, and specific force at the start.
+
+    `order` is the order of the first step.
+    """
     ax = ay = 0.0
     for k in range(count):
         d = derivative(x, u, brakes, c)
@@ -52,7 +46,7 @@ def move(
             ax, ay = d.ax, d.ay
         x, slopes = advance(x, d, slopes, c, step_s, order)
         order = SECOND_ORDER
-    return Moved(x, slopes, ax, ay)
+    return x, slopes, (ax, ay)
 
 
 Observation = NDArray[np.float32]
@@ -173,7 +167,7 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         """Advance by 10 ms."""
         demanded = np.clip(np.asarray(action, dtype=float), 0.0, 1.0)
         self._brakes += (demanded - self._brakes) * (1 - math.exp(-TICK_S / BRAKE_LAG_S))
-        moved = move(
+        self._state, self._slopes, self._force = move(
             self._state,
             self._slopes,
             Controls(self.trial.steering_at(self._time_s), 0.0),
@@ -183,8 +177,6 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
             round(TICK_S / STEP_S),
             SECOND_ORDER if self._ticks else FIRST_ORDER,
         )
-        self._state, self._slopes = moved.state, moved.slopes
-        self._force = (moved.ax, moved.ay)
         self._ticks += 1
         slip = self._sideslip
         lost = abs(slip) > LOST_SLIP_RAD or self._state.vx < LOST_SPEED_MPS
