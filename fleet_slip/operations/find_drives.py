@@ -35,7 +35,7 @@ RETENTION_HOURS = 168
 
 @dataclass(frozen=True)
 class VacuumReport:
-    """What was removed, or would be."""
+    """The removed files, or in a dry run those to remove."""
 
     files: tuple[str, ...]
     size_bytes: int
@@ -51,31 +51,31 @@ class VacuumReport:
 def vacuum(
     warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
 ) -> VacuumReport:
-    """Remove what nothing has referred to for some hours."""
+    """Remove the files that nothing has referred to for some hours."""
     warehouse.require()
-    found = find_expired(warehouse, retention_hours)
+    expired = find_expired(warehouse, retention_hours)
     if not dry_run:
-        found = [file for file in found if file.folder.remove(file)]
+        expired = [file for file in expired if file.folder.remove(file)]
     return VacuumReport(
-        files=tuple(path_below(warehouse, file) for file in found),
-        size_bytes=sum(file.size_bytes for file in found),
+        files=tuple(path_below(warehouse, file) for file in expired),
+        size_bytes=sum(file.size_bytes for file in expired),
         dry_run=dry_run,
     )
 
 
 def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
-    """Return the files that `vacuum` removes: of no version of so many hours, and as old."""
-    found, uncommitted = [], find_temporary_files(warehouse)
+    """Return the files that `vacuum` removes: older than some hours, and in no version of these."""
+    candidates, uncommitted = [], find_temporary_files(warehouse)
     for table in warehouse.tables:
         files = find_unreferenced(table)
         snapshot = table.snapshot()
         if snapshot.version is None:  # its Delta log may have been lost, and these be its data
             continue
         expired = snapshot.removed_before(retention_hours)
-        found += [file for file in files if file.path in expired]
+        candidates += [file for file in files if file.path in expired]
         uncommitted += [file for file in files if file.path not in snapshot.removals]
-    found += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
-    return [file for file in found if file.age_hours >= retention_hours]
+    candidates += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
+    return [file for file in candidates if file.age_hours >= retention_hours]
 
 
 def find_unreferenced(table: Table) -> list[StoredFile]:
@@ -104,7 +104,7 @@ def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
 
 
 def find_replaced(warehouse: Warehouse) -> list[StoredFile]:
-    """Return the files that a commit removed from its table, whatever the clock says."""
+    """Return the files that commits removed from their tables, of any age."""
     return [
         file
         for table in warehouse.tables
@@ -128,9 +128,9 @@ def rows_of(rows: pa.Table, subject: ErasureSubject) -> pa.ChunkedArray:
 def quarantined_of(
     rows: pa.Table, subject: ErasureSubject, drives: Collection[str]
 ) -> pa.ChunkedArray:
-    """Return which rows of the quarantine are of a subject, or of drives that are known to be.
+    """Return a mask of the quarantine's rows of a subject or of its drives.
 
-    Rows refused before a cut at a gap name the whole drive.
+    Rows rejected before a cut at a gap have the name of the uncut drive.
     """
     ids = rows["drive_id"].cast(pa.string())
     if subject.kind == "drive":
@@ -148,54 +148,54 @@ def quarantined_of(
 
 @dataclass(frozen=True)
 class Located:
-    """A subject's `drives` by log file, and all `known` log files that have such Gram rows."""
+    """A subject's `drives` by log file, and the `reduced` log files, which have plain Gram rows."""
 
-    known: frozenset[str]
+    reduced: frozenset[str]
     drives: Mapping[str, frozenset[str]]
 
 
 def locate(grams: Snapshot, subject: ErasureSubject) -> Located:
     """Look for a subject's drives in the Gram rows."""
-    known: set[str] = set()
+    reduced: set[str] = set()
     drives: dict[str, set[str]] = {}
     columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
     for file in grams.files:
         rows = grams.table.read(file.path, columns)
-        whole = pc.equal(rows["feature_set"], PLAIN)
-        known.update(rows["file"].filter(whole).unique().to_pylist())
-        found = rows.filter(rows_of(rows, subject))
+        is_plain = pc.equal(rows["feature_set"], PLAIN)
+        reduced.update(rows["file"].filter(is_plain).unique().to_pylist())
+        matches = rows.filter(rows_of(rows, subject))
         for path, drive in zip(
-            found["file"].to_pylist(), found["drive_id"].to_pylist(), strict=True
+            matches["file"].to_pylist(), matches["drive_id"].to_pylist(), strict=True
         ):
             drives.setdefault(path, set()).add(drive)
-    return Located(frozenset(known), {path: frozenset(names) for path, names in drives.items()})
+    return Located(frozenset(reduced), {path: frozenset(names) for path, names in drives.items()})
 
 
 def drives_by_file(
     logs: Snapshot, subject: ErasureSubject, located: Located
 ) -> dict[str, frozenset[str]]:
     """Return the drives concerned by log file, opening only files without Gram rows."""
-    found = {}
+    by_file = {}
     for file in logs.files:
         drives = located.drives.get(file.path, frozenset())
-        if file.path not in located.known:
+        if file.path not in located.reduced:
             names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
             names = names.append_column("day", pa.repeat(file.day, names.num_rows))
             drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
         if drives:
-            found[file.path] = drives
-    return found
+            by_file[file.path] = drives
+    return by_file
 
 
 def remove_uncommitted(
     warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> None:
-    """Delete files with a car, or drives of it, that no version has had: none can land any more.
+    """Delete files with rows of a subject that were never committed: the fence refuses them now.
 
-    Gram rows that landed ahead of a log file are then of one that is gone. Log files go last: they
-    may alone tell a car's drives. Drives before a day are not barred, and may be landing.
+    Log files are deleted last: only they may name a car's drives. Drives before a day may still be
+    committed, and are left.
     """
-    found: list[StoredFile] = []
+    leftovers: list[StoredFile] = []
     for table in warehouse.tables if subject.kind != "before" else ():
         removals = table.snapshot().removals
         for file in find_unreferenced(table):
@@ -205,8 +205,8 @@ def remove_uncommitted(
                 matches = find_in_file(warehouse, table, file, subject, drives)
                 if matches is not None:
                     drives = {*drives, *matches}
-                    found.append(file)
-    for file in reversed(found):
+                    leftovers.append(file)
+    for file in reversed(leftovers):
         file.folder.remove(file)
 
 
@@ -279,8 +279,8 @@ def digests_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) 
         rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
         ids = rows["drive_id"].cast(pa.string())
         for name in sorted(drives[file.path]):
-            mine = rows.filter(pc.equal(ids, name)).combine_chunks()
-            [batch] = mine.to_batches()
+            rows_of_drive = rows.filter(pc.equal(ids, name)).combine_chunks()
+            [batch] = rows_of_drive.to_batches()
             counts = {signal: batch[signal] for signal in signals}
             car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
             yield digest_counts(car, str(file.day), ticks, counts)

@@ -1,10 +1,10 @@
-"""Forgets drives: one car's, a single one, or all that are older than the retention says.
+"""Erases drives: those of a car, a single one, or all that exceed the retention.
 
-Rows leave `quarantine`, `logs` (files are written again, in one commit) and `grams` (reconciled) in
-this order, so that what is left tells an interrupted job what to do. The record
-(`warehouse/erasure_log.py`) is written first, then quarantine and logs are fenced: commits
-that have not seen it conflict. Then Gram rows are fenced, against those that have not seen the new
-logs. What such jobs have written is deleted by them or here.
+Rows are removed from `quarantine`, `logs` (files are rewritten in one commit) and `grams`
+(reconciled) in this order, so that the remaining rows show an interrupted job what to do. The entry
+of the erasure log (`warehouse/erasure_log.py`) is written first, then quarantine and logs are
+fenced: commits of jobs that have not read the entry conflict. Then Gram rows are fenced, against
+jobs that have not read the new logs. Files of such jobs are deleted by them or here.
 """
 
 import shutil
@@ -39,9 +39,9 @@ from fleet_slip.operations.find_drives import (
 from fleet_slip.operations.marked_models import models_trained_on
 from fleet_slip.operations.rewriting import (
     Rewriting,
-    forget_received,
+    erase_onboard_rows,
     rewrite,
-    write_without,
+    write_remaining_rows,
 )
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
@@ -52,12 +52,12 @@ from fleet_slip.warehouse.gram_rows import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 PENDING_SHOWN = 5
-"""So many are named on a line; --json names all."""
+"""Maximum number of files and runs named in the error; --json lists all."""
 
 
 @dataclass(frozen=True)
 class ForgetReport(Answer):
-    """What was done."""
+    """The result of an erasure."""
 
     drives: int
     rows: int
@@ -78,7 +78,7 @@ class ForgetReport(Answer):
         return bool(self.drives or self.old_files_deleted)
 
     def parts(self) -> Iterator[Part]:
-        """Return remarks: what was forgotten, what is left, and which models to train again."""
+        """Return remarks: erased drives, remaining files, and models to train again."""
         if not self.changed:
             yield Remark("nothing to do: it was forgotten before")
             return
@@ -95,7 +95,7 @@ class ForgetReport(Answer):
                 "To delete these now: --now"
             )
         if self.models:
-            names = dict.fromkeys(one.partition("@")[0] for one in self.models)
+            names = dict.fromkeys(model.partition("@")[0] for model in self.models)
             again = ", ".join(f"fleet-slip publish {name}" for name in names)
             yield Remark(f"trained on them: {', '.join(self.models)}. To train again: {again}")
 
@@ -150,17 +150,17 @@ def forget(
         drives |= landed
         models = _begin(warehouse, erasure_log, subject, drives, located)
     if drives:
-        _forget_quarantined(warehouse, subject, drives)
+        _erase_quarantined(warehouse, subject, drives)
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if drives or state:
         warehouse.grams.fence()
-    rows += forget_received(warehouse, subject)
+    rows += erase_onboard_rows(warehouse, subject)
     remove_uncommitted(warehouse, subject, drives)
     reconcile(warehouse)
     replaced = find_replaced(warehouse)
     deleted = sum(file.folder.remove(file) for file in replaced) if now else 0
     look = (drives or state) and subject.kind != "before"  # such drives may be landing
-    tables = list(_tables_with(warehouse, subject, drives)) if look else []
+    tables = list(_find_tables_with(warehouse, subject, drives)) if look else []
     if not tables and (drives or state in ("begun", ALLOWED)):
         erasure_log.end(subject, warehouse.grams.snapshot().version)
     pending: list[str] = []
@@ -178,7 +178,74 @@ def forget(
     )
 
 
-def _tables_with(
+def _require_delta_logs(warehouse: Warehouse) -> None:
+    """Raise `StorageError` if a Delta log was lost: a fence begins a new one."""
+    for table in (warehouse.logs, warehouse.grams):
+        if table.snapshot().version is None and find_unreferenced(table):
+            raise StorageError(
+                f"{table.folder}: files without a Delta log. Restore the log from a backup. If a "
+                "job is writing the first files, wait for its end; if it was killed, delete them."
+            )
+
+
+def _drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
+    """Return a subject's drives in logs, quarantine and Gram rows."""
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    drives: set[str] = set().union(*in_logs.values(), *located.drives.values())
+    for file in warehouse.quarantine.snapshot().files:
+        rows = warehouse.quarantine.read(file.path)
+        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
+        drives.update(names.to_pylist())
+    return frozenset(drives)
+
+
+def _begin(
+    warehouse: Warehouse,
+    erasure_log: ErasureLog,
+    subject: ErasureSubject,
+    drives: Collection[str],
+    located: Located,
+) -> list[str]:
+    registry = Registry.open(warehouse)
+    examined = {name: max(registry.versions(name), default=0) for name in registry.names()}
+    models = models_trained_on(warehouse, drives)
+    digests = () if subject.kind == "before" else digests_of(warehouse, subject, located)
+    erasure_log.begin(subject, len(drives), models, examined, set(digests))
+    return models
+
+
+@retrying
+def _erase_quarantined(
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
+) -> None:
+    snapshot = warehouse.quarantine.snapshot()
+    add, remove = write_remaining_rows(snapshot, lambda rows: quarantined_of(rows, subject, drives))
+    if remove:
+        snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
+
+
+@retrying
+def _rewrite_logs(
+    warehouse: Warehouse, subject: ErasureSubject, located: Located, progress: Progress
+) -> tuple[int, int, int]:
+    logs = warehouse.logs.snapshot()
+    drives = drives_by_file(logs, subject, located)
+    concerned = [file for file in logs.files if file.path in drives]
+    if not concerned:
+        return 0, 0, 0
+    added = rewrite(
+        warehouse,
+        logs,
+        [Rewriting("kept", [file], drives[file.path]) for file in concerned],
+        note={"job": "forget"},
+        data_change=True,
+        progress=progress,
+    )
+    rows = sum(file.rows for file in concerned) - sum(map(rows_in, added))
+    return rows, len(added), len(concerned) - len(added)
+
+
+def _find_tables_with(
     warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> Iterator[str]:
     """Yield the tables whose newest version still has rows of a subject."""
@@ -214,73 +281,6 @@ def _find_pending(
     return [*remains, *temporary, *runs]
 
 
-def _require_delta_logs(warehouse: Warehouse) -> None:
-    """Raise `StorageError` if a Delta log was lost: a fence begins a new one."""
-    for table in (warehouse.logs, warehouse.grams):
-        if table.snapshot().version is None and find_unreferenced(table):
-            raise StorageError(
-                f"{table.folder}: files without a Delta log. Restore the log from a backup. If a "
-                "job is writing the first files, wait for its end; if it was killed, delete them."
-            )
-
-
-def _begin(
-    warehouse: Warehouse,
-    erasure_log: ErasureLog,
-    subject: ErasureSubject,
-    drives: Collection[str],
-    located: Located,
-) -> list[str]:
-    registry = Registry.open(warehouse)
-    judged = {name: max(registry.versions(name), default=0) for name in registry.names()}
-    models = models_trained_on(warehouse, drives)
-    known = () if subject.kind == "before" else digests_of(warehouse, subject, located)
-    erasure_log.begin(subject, len(drives), models, judged, set(known))
-    return models
-
-
-def _drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
-    """Return the drives in the logs and the quarantine, and what interrupted jobs left in grams."""
-    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
-    found: set[str] = set().union(*in_logs.values(), *located.drives.values())
-    for file in warehouse.quarantine.snapshot().files:
-        rows = warehouse.quarantine.read(file.path)
-        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
-        found.update(names.to_pylist())
-    return frozenset(found)
-
-
-@retrying
-def _rewrite_logs(
-    warehouse: Warehouse, subject: ErasureSubject, located: Located, progress: Progress
-) -> tuple[int, int, int]:
-    logs = warehouse.logs.snapshot()
-    drives = drives_by_file(logs, subject, located)
-    concerned = [file for file in logs.files if file.path in drives]
-    if not concerned:
-        return 0, 0, 0
-    kept = rewrite(
-        warehouse,
-        logs,
-        [Rewriting("kept", [file], drives[file.path]) for file in concerned],
-        note={"job": "forget"},
-        data_change=True,
-        progress=progress,
-    )
-    rows = sum(file.rows for file in concerned) - sum(map(rows_in, kept))
-    return rows, len(kept), len(concerned) - len(kept)
-
-
-@retrying
-def _forget_quarantined(
-    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
-) -> None:
-    snapshot = warehouse.quarantine.snapshot()
-    add, remove = write_without(snapshot, lambda rows: quarantined_of(rows, subject, drives))
-    if remove:
-        snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
-
-
 # How long data is kept: `configs/retention.toml`, or a file of the user's own.
 
 
@@ -293,14 +293,14 @@ class Retention(Config):
 
 @dataclass(frozen=True)
 class RetentionReport(Answer):
-    """What was forgotten, and which files were removed."""
+    """The erased drives, and the removed files."""
 
     before: date
     forgotten: ForgetReport
     vacuumed: VacuumReport
 
     def parts(self) -> Iterator[Part]:
-        """Return remarks: what was forgotten and removed."""
+        """Return remarks: the erased drives and the removed files."""
         if self.forgotten.changed:
             yield from self.forgotten.parts()
             yield Remark(
@@ -324,9 +324,9 @@ def retain(
     today: date,
     progress: Progress = no_progress,
 ) -> RetentionReport:
-    """Forget the drives that are older than retention says, then vacuum; `progress` counts files.
+    """Erase the drives that exceed the retention, then vacuum; `progress` counts files.
 
-    Raises `RefusedError` if not one drive would be left, as with a clock that is wrong.
+    Raises `RefusedError` if no drive would remain, as with a wrong clock.
     """
     warehouse.require()
     try:

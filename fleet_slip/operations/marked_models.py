@@ -1,8 +1,8 @@
-"""Which model versions were trained on drives that were forgotten since.
+"""Marks model versions that were trained on drives erased later.
 
-Who forgets judges the versions there are. One published meanwhile, of older Gram rows, counts as
-trained on them until the erasure is done; then if one of its own drives, or an unknown one, has no
-Gram rows any more.
+An erasure examines the versions that exist. A version published during it, on older Gram rows,
+is marked until the erasure has ended; then only if one of its drives has no Gram rows any more, or
+its drives are unknown.
 """
 
 from collections.abc import Callable, Collection
@@ -23,7 +23,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 def marked_models(warehouse: Warehouse) -> frozenset[str]:
     """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
     entries = ErasureLog(warehouse.root).entries()
-    found = {name for entry in entries for name in entry.get("models", ())}
+    marked = {name for entry in entries for name in entry.get("models", ())}
     judged: dict[str, dict[str, int]] = {}
     without: dict[str, int | None] = {}
     for entry in entries:
@@ -37,20 +37,20 @@ def marked_models(warehouse: Warehouse) -> frozenset[str]:
     hashes = cache(lambda: _hashes_of_present(warehouse))
     present = cache(lambda name: TrainedDrives.from_hashes(name, hashes()).salted)
     for subject, numbers in judged.items():
-        found |= {
+        marked |= {
             f"{name}@{number}"
             for name, number in versions
             if number > numbers.get(name, 0)
             and _may_have_seen(registry, name, number, without[subject], present)
         }
-    return frozenset(found)
+    return frozenset(marked)
 
 
 def _hashes_of_present(warehouse: Warehouse) -> Hashes:
     grams = warehouse.grams.snapshot()
     drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
-    found = [hash_names(some.unique()) for some in drives]
-    return np.unique(np.concatenate(found)) if found else np.array([], dtype=np.uint64)
+    hashes = [hash_names(names.unique()) for names in drives]
+    return np.unique(np.concatenate(hashes)) if hashes else np.array([], dtype=np.uint64)
 
 
 def _may_have_seen(
@@ -65,11 +65,11 @@ def _may_have_seen(
         return True
     try:
         manifest = registry.load(name, number).manifest
-        here = manifest.imported_from is None
-        if here and manifest.trained_on.grams_version >= without:
+        trained_here = manifest.imported_from is None
+        if trained_here and manifest.trained_on.grams_version >= without:
             return False
-        made = registry.trained_drives(manifest)
-        return not bool(np.isin(made.salted, present(name)).all())
+        trained = registry.trained_drives(manifest)
+        return not bool(np.isin(trained.salted, present(name)).all())
     except FleetSlipError:
         return True
 
@@ -78,14 +78,14 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
     """Return the model versions that were trained on one of the drives, or may have been."""
     registry = Registry.open(warehouse)
     hashes = hash_names(pa.array(sorted(drives), pa.string()))
-    found: list[str] = []
+    references: list[str] = []
     for name in registry.names():
         for number in registry.versions(name):
             try:
-                made = registry.trained_drives(registry.load(name, number).manifest)
-                trained = bool(made.among(hashes).any())
+                trained = registry.trained_drives(registry.load(name, number).manifest)
+                is_trained = bool(trained.among(hashes).any())
             except FleetSlipError:
-                trained = True
-            if trained:
-                found.append(f"{name}@{number}")
-    return sorted(found)
+                is_trained = True
+            if is_trained:
+                references.append(f"{name}@{number}")
+    return sorted(references)

@@ -1,12 +1,12 @@
-"""Drift: a published model's error on each day since it was trained, on a control chart.
+"""Drift charts: the error of a published model on each day since its training.
 
 Errors are exact, from Gram rows: with v = (coefficients, -1) the sum of squared errors of a day is
-v'Gv. The chart is one of individuals, a day being an individual, since days differ by more than
-their rows would make them (Montgomery, Introduction to Statistical Quality Control, ch. 6). What
-is usual is learned from the training days, each predicted by the model's signals fitted on the
-other training days; so that no day is judged by a model that it made. A new day is within the
-limits mean +- t s sqrt(1 + 1/m), the prediction interval of a normal individual after m others,
-with Student's t for m - 1 degrees of freedom: with few days the limits are as wide as they must be.
+v'Gv. The chart is one of individuals, a day each: days differ more than their rows
+explain (Montgomery, Introduction to Statistical Quality Control, ch. 6). The training days give
+mean and standard deviation. Each is predicted by the model's signals, fitted on the other
+training days: no day is predicted by a model trained on it. The limits of a new day are
+mean +- t s sqrt(1 + 1/m), the prediction interval of a normal individual after m others, with
+Student's t for m - 1 degrees of freedom: few days give wide limits.
 """
 
 import math
@@ -40,7 +40,7 @@ class Limits:
     upper: float
 
     @classmethod
-    def of(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
+    def from_values(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
         """Return the two-sided prediction interval of one more individual."""
         m = len(usual)
         t = student_t_quantile(1 - false_alarms / 2, m - 1)
@@ -50,7 +50,7 @@ class Limits:
     @classmethod
     def above(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
         """Return the upper limit of a positive figure, made on its logarithm: less is no alarm."""
-        logarithms = cls.of([math.log(value) for value in usual], 2 * false_alarms)
+        logarithms = cls.from_values([math.log(value) for value in usual], 2 * false_alarms)
         return cls(math.exp(logarithms.centre), None, math.exp(logarithms.upper))
 
     def beyond(self, value: float) -> bool:
@@ -106,7 +106,7 @@ class Chart(Answer):
             f"{self.model}, drives where {self.cohort}; limits from the training days: "
             f"mean {mean.lower:+.4f} to {mean.upper:+.4f}, std up to {std.upper:.4f} deg",
             "day||drives|rows|RMSE deg|mean deg|std deg|beyond",
-            ({**vars(one), "kind": "training" if one.training else "new"} for one in self.days),
+            ({**vars(day), "kind": "training" if day.training else "new"} for day in self.days),
             "{day}|{kind}|{drives:,}|{rows:,}|{rmse_deg:.4f}|{error_mean_deg:+.4f}|"
             "{error_std_deg:.4f}|{alarms}",
             text_columns=2,
@@ -115,7 +115,7 @@ class Chart(Answer):
 
     @property
     def alarm(self) -> str:
-        """The new days that are beyond a limit, and by what."""
+        """The new days beyond a limit, and the figures that exceed it."""
         return ", ".join(f"{day.day} ({' and '.join(day.alarms)})" for day in self.alarms)
 
     @property
@@ -135,7 +135,7 @@ def monitor(
 
     `predicate` chooses the drives; by default those that satisfy the predicate of its training.
     Days from `since` are new; by default those after the last day of the logs it was trained on.
-    Raises `DataError` if fewer than `min_training_days` are left to learn from.
+    Raises `DataError` for fewer training days than `min_training_days`.
     """
     catalog = warehouse.catalog
     limits, manifest = thresholds(warehouse.configs).monitor, version.manifest
@@ -152,17 +152,17 @@ def monitor(
             "--since."
         )
     models = _models(catalog, manifest, feature_set, grams, training)
-    found = []
-    for day, gram, drives, model, known in zip(
+    charted: list[Day] = []
+    for day, gram, drives, model, is_training in zip(
         days, grams, sums.drives, models, training, strict=True
     ):
         errors = error_sums(model, gram).figures(catalog.input_scales[model.label])
         mean_deg, std_deg = errors.error_mean_deg, errors.error_std_deg
-        found.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, known))
-    usual = [day for day in found if day.training]
-    mean = Limits.of([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
+        charted.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, is_training))
+    usual = [day for day in charted if day.training]
+    mean = Limits.from_values([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
-    judged = tuple(day if day.training else _judged(day, mean, std) for day in found)
+    judged = tuple(day if day.training else _judged(day, mean, std) for day in charted)
     return Chart(version.reference, predicate.text, judged, mean, std, feature_set, sums.left_out)
 
 
@@ -174,19 +174,21 @@ def _models(
     training: Sequence[bool],
 ) -> list[LinearModel]:
     """Return the model that predicts each day: of a training day, the one made without it."""
-    own = [gram for gram, known in zip(grams, training, strict=True) if known]
-    total = sum(own[1:], own[0])
+    of_training = [gram for gram, is_training in zip(grams, training, strict=True) if is_training]
+    total = sum(of_training[1:], of_training[0])
     champion = manifest.counts_model(catalog, feature_set)
     refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
     return [
-        refit(total - gram) if known else champion
-        for gram, known in zip(grams, training, strict=True)
+        refit(total - gram) if is_training else champion
+        for gram, is_training in zip(grams, training, strict=True)
     ]
 
 
 def _judged(day: Day, mean: Limits, std: Limits) -> Day:
     checked = (("mean", mean, day.error_mean_deg), ("std", std, day.error_std_deg))
-    return replace(day, alarms=tuple(name for name, one, value in checked if one.beyond(value)))
+    return replace(
+        day, alarms=tuple(name for name, limits, value in checked if limits.beyond(value))
+    )
 
 
 _SINCE = "fleet-slip monitor {name} --since DAY"

@@ -1,7 +1,7 @@
-"""Writes rows again, to compact the logs, to forget drives, or for another catalog.
+"""Rewrites tables: to compact the logs, to erase drives, or for another catalog.
 
-Log files hold whole drives by name and tick, and dictionaries of what occurs: their bytes follow
-from the drives.
+Log files contain whole drives by name and tick, and dictionaries of the names that occur: their
+bytes depend on the drives only.
 """
 
 import dataclasses
@@ -47,7 +47,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 @dataclass(frozen=True)
 class Rewriting:
-    """Files of one day that become one, named after what is done, without some drives."""
+    """Files of one day to merge into one with the prefix `name`, without some drives."""
 
     name: str
     files: Sequence[TableFile]
@@ -63,13 +63,13 @@ def rewrite(
     data_change: bool,
     progress: Progress = no_progress,
 ) -> list[AddAction]:
-    """Exchange log files and their Gram rows in one commit on a snapshot; return what was added.
+    """Replace log files and their Gram rows in one commit on a snapshot; return the new files.
 
-    Files without kept drives go. `progress` counts rewritings. Raises `ConflictError`, after
-    deleting the new files, and `StorageError`.
+    Files without remaining drives are removed. `progress` counts rewritings. Raises
+    `ConflictError`, after deleting the new files, and `StorageError`.
     """
     new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
-    replaced = [file for one in rewritings for file in one.files]
+    replaced = [file for rewriting in rewritings for file in rewriting.files]
     transactions = rewrite_transactions(logs, replaced)
     logs.commit_or_discard(
         Change(
@@ -87,14 +87,14 @@ def write_again(
     data_change: bool = True,
     progress: Progress = no_progress,
 ) -> list[AddAction]:
-    """Write log files, land their Gram rows ahead; return what to add. Raises as `rewrite`."""
+    """Write log files and commit their Gram rows; return the files to add. Raises as `rewrite`."""
     new: list[AddAction] = []
-    replaced = [file for one in rewritings for file in one.files]
+    replaced = [file for rewriting in rewritings for file in rewriting.files]
     try:
-        for one in rewritings:
-            rows = read_kept_drives(logs.table, one.files, one.without)
+        for rewriting in rewritings:
+            rows = read_kept_drives(logs.table, rewriting.files, rewriting.without)
             if rows.num_rows:
-                action = logs.table.write_file(one.name, rows, one.files[0].day)
+                action = logs.table.write_file(rewriting.name, rows, rewriting.files[0].day)
                 new.append(dataclasses.replace(action, data_change=data_change))
             progress(1, len(rewritings))
         commit_ahead(warehouse, new, replaced)
@@ -131,10 +131,10 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
     for field in table.schema:
         if field.name in table.partition_by:
             continue
-        there = field.name in stored.schema.names
-        if not there and field.name in table.optional:
+        is_stored = field.name in stored.schema.names
+        if not is_stored and field.name in table.optional:
             continue
-        if not there:
+        if not is_stored:
             column = pa.chunked_array([pa.nulls(stored.num_rows, field.type)])
         else:
             column = stored[field.name]
@@ -156,42 +156,42 @@ def _order(rows: pa.Table) -> IntArray:
     return np.lexsort((rows["tick"].to_numpy(), drive))
 
 
-def write_without(
-    snapshot: Snapshot, gone: Callable[[pa.Table], pa.ChunkedArray]
+def write_remaining_rows(
+    snapshot: Snapshot, is_removed: Callable[[pa.Table], pa.ChunkedArray]
 ) -> tuple[list[AddAction], list[TableFile]]:
     """Write the files of a table again that have rows which go; return them, and the old ones."""
     add: list[AddAction] = []
     remove: list[TableFile] = []
     for file in snapshot.files:
         rows = snapshot.table.read(file.path)
-        kept = rows.filter(pc.invert(gone(rows)))
-        if kept.num_rows < rows.num_rows:
+        remaining = rows.filter(pc.invert(is_removed(rows)))
+        if remaining.num_rows < rows.num_rows:
             remove.append(file)
-            add += [snapshot.table.write_file("kept", kept)] if kept.num_rows else []
+            add += [snapshot.table.write_file("kept", remaining)] if remaining.num_rows else []
     return add, remove
 
 
 @retrying
-def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
+def erase_onboard_rows(warehouse: Warehouse, subject: ErasureSubject) -> int:
     """Commit the Gram rows without those that came without a log; return how many rows."""
     snapshot = warehouse.grams.snapshot()
     concerned: list[TableFile] = []
     rows = 0
     for file in snapshot.files:
-        every = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
-        mine = pc.and_(rows_of(every, subject), is_onboard(every))
-        if pc.any(mine).as_py():
+        names = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
+        selected = pc.and_(rows_of(names, subject), is_onboard(names))
+        if pc.any(selected).as_py():
             concerned.append(file)
-            rows += pc.sum(every.filter(mine)["n"]).as_py()
+            rows += pc.sum(names.filter(selected)["n"]).as_py()
     if concerned:
         read = (read_rows(warehouse.grams, file) for file in concerned)
-        kept = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_onboard(r)))) for r in read)
-        add = write_rows(warehouse, kept)
+        remaining = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_onboard(r)))) for r in read)
+        add = write_rows(warehouse, remaining)
         snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
     return rows
 
 
-# Takes drives out of the logs that others replace, or that somebody withdraws.
+# Removal of drives that others replace.
 #
 # They may come again: their files' transactions are withdrawn. Their Gram rows go with the files.
 
@@ -199,7 +199,7 @@ def forget_received(warehouse: Warehouse, subject: ErasureSubject) -> int:
 def build_removal(
     warehouse: Warehouse, name: TableName, snapshot: Snapshot, sources: Collection[SourceRef]
 ) -> Change:
-    """Return the change that takes the drives, or the refused rows, of some origins out."""
+    """Build the change that deletes the drives, or rejected rows, of sources from a table."""
     if name == "quarantine":
         return _without_refused(snapshot, sources)
     drives = drives_in(warehouse, snapshot)
@@ -218,25 +218,25 @@ def build_removal(
     return Change(write_again(warehouse, snapshot, rewritings), concerned, transactions)
 
 
-def _without_refused(snapshot: Snapshot, origins: Collection[SourceRef]) -> Change:
-    def mine(rows: pa.Table) -> pa.ChunkedArray:
+def _without_refused(snapshot: Snapshot, sources: Collection[SourceRef]) -> Change:
+    def is_removed(rows: pa.Table) -> pa.ChunkedArray:
         names = rows["drive_id"].cast(pa.string())
-        some = [n for n in names.unique().drop_null().to_pylist() if is_from(n, origins)]
-        return pc.fill_null(pc.is_in(names, pa.array(some, pa.string())), False)
+        removed = [n for n in names.unique().drop_null().to_pylist() if is_from(n, sources)]
+        return pc.fill_null(pc.is_in(names, pa.array(removed, pa.string())), False)
 
-    add, remove = write_without(snapshot, mine)
-    files = {one for one in origins if one == one.file}
+    add, remove = write_remaining_rows(snapshot, is_removed)
+    files = {source for source in sources if source == source.file}
     return Change(add, remove, Fingerprints(snapshot.transactions).withdraw((), files))
 
 
 def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
     """Return the drives of each log file, opening only files without Gram rows."""
-    found: dict[str, set[str]] = {}
+    by_file: dict[str, set[str]] = {}
     for rows in rows_of_set(warehouse.grams.snapshot(), PLAIN, "file", "drive_id"):
         for row in rows.to_pylist():
-            found.setdefault(row["file"], set()).add(row["drive_id"])
+            by_file.setdefault(row["file"], set()).add(row["drive_id"])
     return {
-        file.path: found.get(file.path) or set(logs.table.read_names(file.path)["drive_id"])
+        file.path: by_file.get(file.path) or set(logs.table.read_names(file.path)["drive_id"])
         for file in logs.files
     }
 
@@ -246,12 +246,12 @@ def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:
 # Gram rows of new files are computed, and land before them; reconciliation drops the old.
 
 TARGET_ROWS = 2_000_000
-"""Rows of a compacted file or fewer. A file of more than half of it is left alone."""
+"""Maximum rows of a compacted file. Files of more than half of them are not compacted."""
 
 
 @dataclass(frozen=True)
 class CompactionReport:
-    """What a run of the job did."""
+    """The result of a compaction."""
 
     days: int
     files_before: int
@@ -330,7 +330,7 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
 
 @dataclass(frozen=True)
 class MigrationReport(Answer):
-    """What a migration did, and the columns of the logs that the catalog has no longer."""
+    """The result of a migration. `retired` are columns that the catalog has no longer."""
 
     added: tuple[str, ...]
     retired: tuple[str, ...]
@@ -344,7 +344,7 @@ class MigrationReport(Answer):
         return bool(self.added or self.sealed)
 
     def parts(self) -> Iterator[Part]:
-        """Return remarks: what was added and written anew."""
+        """Return remarks: the added columns and anchored folders."""
         if not self.changed:
             yield Remark("migrate: nothing to do, the logs agree with the signal catalog")
         if self.added:
@@ -360,27 +360,27 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
     """
     warehouse.require()
     sealed = tuple(folder.path for folder in document_folders(warehouse.root) if folder.seal())
-    found: Evolution | None = None
+    evolution: Evolution | None = None
     for table in (warehouse.quarantine, warehouse.grams, warehouse.logs):
         delta = table.open_delta()
-        found = None
+        evolution = None
         if delta is not None:
-            found = table.require_readable(delta)
-            _add_columns(table, delta, found)
-    if found is None:
+            evolution = table.require_readable(delta)
+            _add_columns(table, delta, evolution)
+    if evolution is None:
         return MigrationReport((), (), None, sealed=sealed)
     version = warehouse.logs.snapshot().version
-    return MigrationReport(found.added, found.retired, version, sealed)
+    return MigrationReport(evolution.added, evolution.retired, version, sealed)
 
 
-def _add_columns(table: Table, delta: DeltaTable, found: Evolution) -> None:
+def _add_columns(table: Table, delta: DeltaTable, evolution: Evolution) -> None:
     fields = {field.name: field for field in Schema.from_arrow(table.schema).fields}
     scales = scales_of(table.schema)
-    if not found.added:
+    if not evolution.added:
         return
     with table.committing():
         delta.alter.set_table_properties(ALL_STATISTICS)
-        delta.alter.add_columns([_with_scale(fields[n], scales) for n in found.added])
+        delta.alter.add_columns([_with_scale(fields[n], scales) for n in evolution.added])
 
 
 def _with_scale(field: Field, scales: Mapping[str, Decimal]) -> Field:

@@ -76,7 +76,7 @@ class ChampionStatus:
 
 @dataclass(frozen=True)
 class WarehouseStatus(Answer):
-    """What there is to know; `problems` says what calls for attention."""
+    """The health of a warehouse; `problems` need attention."""
 
     root: str
     checked_at: datetime
@@ -93,8 +93,8 @@ class WarehouseStatus(Answer):
     problems: tuple[str, ...]
 
     def __repr__(self) -> str:
-        found = "; ".join(self.problems) or "no problem found"
-        return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {found}>"
+        problems = "; ".join(self.problems) or "no problem found"
+        return f"<{type(self).__name__}: {self.root}, newest day {self.newest_day}; {problems}>"
 
     def parts(self) -> Iterator[Part]:
         """Return tables, facts, last runs and champions."""
@@ -102,8 +102,8 @@ class WarehouseStatus(Answer):
             f"{self.root} at {self.checked_at:%Y-%m-%d %H:%M} UTC",
             "table|last commit|version|files|rows|size MB",
             (
-                {"name": name, "size_mb": one.size_bytes / 1e6, **vars(one)}
-                for name, one in self.tables.items()
+                {"name": name, "size_mb": table.size_bytes / 1e6, **vars(table)}
+                for name, table in self.tables.items()
             ),
             "{name}|{committed_at:%Y-%m-%d %H:%M}|{version}|{files:,}|{rows:,}|{size_mb:,.1f}",
             text_columns=2,
@@ -129,8 +129,8 @@ class WarehouseStatus(Answer):
     @property
     def problem(self) -> AlarmError | None:
         """That something calls for attention."""
-        found = pluralize(len(self.problems), "matter")
-        return AlarmError(f"{found} found, see above.") if self.problems else None
+        count = pluralize(len(self.problems), "matter")
+        return AlarmError(f"{count} found, see above.") if self.problems else None
 
 
 def status_of(
@@ -141,8 +141,8 @@ def status_of(
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
     a command whose last run failed or was killed, a disk that is nearly full, a champion that
     cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice.
-    `jobs/last_runs.sql` says which failures are mere mistakes of a person. Raises `StorageError` if
-    there is no data root.
+    `jobs/last_runs.sql` excludes failures by mistakes of a user. Raises `StorageError` if there is
+    no data root.
     """
     now = now or datetime.now(UTC)
     warehouse.require()
@@ -166,7 +166,7 @@ def status_of(
         *_unfit(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
         *dict.fromkeys([*damaged, *find_lost(warehouse.root)]),
-        *(f"{path}: {what}" for path, what in changed),
+        *(f"{path}: {problem}" for path, problem in changed),
     ]
     return WarehouseStatus(
         root=str(warehouse.root),
@@ -185,7 +185,7 @@ def status_of(
 
 
 def _unfit(root: Folder) -> Iterator[str]:
-    """Yield what of this machine, or of an object store, is not fit for the jobs."""
+    """Yield unmet requirements of the jobs: memory, and an object store that creates files once."""
     if memory_bytes() < MIN_MEMORY_BYTES:
         yield "this process may have less than 1 GiB of memory, which large commands take"
     if root.free_bytes() is not None:
@@ -232,7 +232,7 @@ def _from_ms(milliseconds: int | None) -> datetime | None:
 
 
 def _last_runs(root: Folder, since: str) -> list[dict[str, Any]]:
-    # Not through connect(), which fails with a damaged manifest: that is for the status to tell.
+    # Not through connect(), which fails for a damaged manifest, which the status must report.
     with (
         open_database(reading=root) as database,
         database_errors(f"reading the history of runs in {root}"),
@@ -246,7 +246,7 @@ def _champions(
     warehouse: Warehouse, logs: Snapshot, grams: Snapshot, now: datetime
 ) -> tuple[tuple[ChampionStatus, ...], list[str]]:
     registry = Registry.open(warehouse)
-    found, damaged = [], []
+    champions, damaged = [], []
     for name in registry.names():
         try:
             champion = registry.champion(name)
@@ -258,7 +258,7 @@ def _champions(
         if champion is None:
             continue
         trained = champion.manifest.trained_on
-        found.append(
+        champions.append(
             ChampionStatus(
                 model=name,
                 version=champion.version,
@@ -268,7 +268,7 @@ def _champions(
                 grams_behind=(grams.version or 0) - trained.grams_version,
             )
         )
-    return tuple(found), damaged
+    return tuple(champions), damaged
 
 
 def _stale(age: float | None, backlog_age: float | None, limit: float | None) -> list[str]:
@@ -285,7 +285,7 @@ def _stale(age: float | None, backlog_age: float | None, limit: float | None) ->
 
 
 def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[str]:
-    """Yield the erased cars and drives that the tables have again, and what to run."""
+    """Yield a problem for erased cars and drives that the tables have again."""
     try:
         erased = find_erased(warehouse.root, warehouse.grams, snapshots, ended=True)
     except StorageError:  # a lost document, which `find_lost` reports

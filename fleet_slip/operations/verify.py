@@ -1,8 +1,8 @@
-"""Compares everything below a data root with everything else that tells what it must be.
+"""Checks everything below a data root against redundant information.
 
-Data files with the checksums in their names and the Delta log; drives with the rule that they are
-whole; Gram rows with the logs by another path; documents with checksums; model versions with their
-tables; names with the record of what was forgotten. What can be rebuilt is rebuilt on request.
+Data files against the checksums in their names and the Delta log; drives for completeness; Gram
+rows against the logs by another path; documents against checksums; model versions against tables;
+names against the erasure log. `repair` rebuilds Gram rows and checkpoints.
 """
 
 import contextlib
@@ -71,10 +71,10 @@ DamageKind: TypeAlias = Literal[
 
 @dataclass(frozen=True)
 class Damage:
-    """One thing that is not as it must be, or that is worth knowing.
+    """A fault of a data root, or a remark.
 
-    `kind` is where damage is, or a remark: "unreferenced" or "backlog". `path` is a file below the
-    root, a drive or a model version.
+    `kind` is the place of damage, or a remark: "unreferenced" or "backlog". `path` is a file below
+    the root, a drive or a model version.
     """
 
     kind: DamageKind
@@ -89,7 +89,7 @@ class Damage:
 
 @dataclass
 class Verification(Answer):
-    """What was looked at, what was found, and what was rebuilt and compared besides."""
+    """The result of a verification: what was read, found, rebuilt and compared."""
 
     DOCUMENT = (
         "files size_bytes rows log_files_recomputed documents damage remarks rebuilt accepted "
@@ -123,7 +123,7 @@ class Verification(Answer):
         return [finding for finding in self.findings if not finding.damage]
 
     def parts(self) -> Iterator[Part]:
-        """Return what was rebuilt, damage and remarks in tables, and what was read."""
+        """Return remarks on rebuilt parts, tables of damage and remarks, and totals."""
         for path in self.rebuilt:
             yield Remark(f"rebuilt {path}")
         for path in self.accepted:
@@ -144,7 +144,7 @@ class Verification(Answer):
 
     @property
     def problem(self) -> DamageError | None:
-        """That something is damaged, and what to do."""
+        """The error for damage, with what to do."""
         advice = (
             "What is left cannot be rebuilt here: restore these files from a backup. Data files "
             "may be copied below their table under any name; then give the command again."
@@ -154,9 +154,66 @@ class Verification(Answer):
         return DamageError(f"{len(self.damage)} damaged. {advice}") if self.damage else None
 
 
+def verify(
+    warehouse: Warehouse,
+    *,
+    full: bool = False,
+    progress: Progress = no_progress,
+    executor: Executor | None = None,
+) -> Verification:
+    """Verify a data root; `full` computes the Gram rows of all log files again.
+
+    Workers of an executor, or threads, read; `progress` counts bytes. Files that jobs remove
+    meanwhile are looked up again.
+    """
+    warehouse.require()
+    look = partial(_verify, warehouse, full, progress, executor)
+    return retry_if_stale(warehouse.tables, look, lambda report: bool(report.damage))
+
+
+def _verify(
+    warehouse: Warehouse, full: bool, progress: Progress, executor: Executor | None
+) -> Verification:
+    report = Verification()
+    snapshots = _open_tables(warehouse, report)
+    read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
+    logs, grams = ([result.file for result in read.get(table, [])] for table in ("logs", "grams"))
+    verify_names(warehouse, read, report, full)
+    verify_rows(warehouse, logs, grams, report)
+    _report_missing_logs(snapshots, grams, report)
+    if grams:
+        active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
+        verify_grams(warehouse, logs, grams, active, report, full, executor)
+    verify_documents(warehouse.root, report)
+    verify_models(warehouse, snapshots, report)
+    _list_unreferenced(warehouse, snapshots, report)
+    written = any(snapshot.version is not None for snapshot in snapshots.values())
+    if not report.findings and not report.documents and not written:
+        raise StorageError(
+            f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
+            "right folder, and is its disk there? Choose another data root."
+        )
+    return report
+
+
+def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
+    snapshots = {}
+    for table in warehouse.tables:
+        name = table.folder.name
+        try:
+            snapshot = table.snapshot(anew=True)
+            _ = snapshot.files
+            snapshots[name] = snapshot
+            for file, problem in find_commit_faults(snapshot):
+                report.note("log", f"{name}/{LOG}/{file}", problem)
+        except FleetSlipError as error:
+            report.note("log", name, str(error))
+    return snapshots
+
+
 @dataclass(frozen=True)
 class ReadFile:
-    """What was found in a data file: what is wrong with it, or the names in its dictionaries."""
+    """A data file with its problem, or with the names in its dictionaries."""
 
     file: TableFile
     problem: str | None
@@ -166,27 +223,27 @@ class ReadFile:
 def verify_files(
     snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
 ) -> list[ReadFile]:
-    """Return the files of a table that are what they must be."""
+    """Read the files of a table; return those without faults."""
     table = snapshot.table
     read: list[ReadFile] = []
     with LocalThreads(os.cpu_count() or 1) as threads:
         task, files = partial(read_whole, table), snapshot.files
-        for file, found in run_tasks(executor or threads, task, files, lambda f: f.path):
-            read.append(found)
+        for file, result in run_tasks(executor or threads, task, files, lambda f: f.path):
+            read.append(result)
             progress(file.size_bytes, snapshot.size_bytes)
-    read.sort(key=lambda one: one.file.path)
-    for one in read:
-        if one.problem:
-            problem = f"{one.problem} (it held {one.file.rows:,} rows)"
-            report.note("file", f"{table.folder.name}/{one.file.path}", problem)
+    read.sort(key=lambda result: result.file.path)
+    for result in read:
+        if result.problem:
+            problem = f"{result.problem} (it held {result.file.rows:,} rows)"
+            report.note("file", f"{table.folder.name}/{result.file.path}", problem)
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
-    return [one for one in read if not one.problem]
+    return [result for result in read if not result.problem]
 
 
 def read_whole(table: Table, file: TableFile) -> ReadFile:
-    """Read every byte of a data file, and compare it with what tells of it."""
+    """Read every byte of a data file, and compare it with the Delta log."""
     path = f"{table.folder}/{file.path}"
     try:
         content = table.folder.read(file.path)
@@ -247,17 +304,13 @@ def verify_names(
                 report.note("name", f"{table}/{file.file.path}", problem)
 
 
-SAMPLE = 4
-"""Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
-
-
 def verify_rows(
     warehouse: Warehouse,
     logs: Sequence[TableFile],
     grams: Sequence[TableFile],
     report: Verification,
 ) -> None:
-    """Look for drives that are not whole, or stand in several files; for doubled Gram rows."""
+    """Find incomplete drives, drives in several files, and doubled Gram rows."""
     with open_database(reading=warehouse.root) as database, database_errors("verifying rows"):
 
         def ask(table: Table, files: Sequence[TableFile], name: str) -> list[tuple[Any, ...]]:
@@ -278,6 +331,23 @@ def verify_rows(
         report.note("gram", f"logs/{file}", problem)
 
 
+def _report_missing_logs(
+    snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
+) -> None:
+    """Report a table of logs that is gone, as a folder that was not mounted is."""
+    logs, grams = snapshots.get("logs"), snapshots.get("grams")
+    if not logs or not grams or logs.version is not None:
+        return
+    damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
+    if missing := named_files(replace(grams, without=damaged), PLAIN)[1]:
+        problem = f"the table is gone; Gram rows of {pluralize(len(missing), 'file')} remain"
+        report.note("log", "logs", problem)
+
+
+SAMPLE = 4
+"""Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
+
+
 def verify_grams(
     warehouse: Warehouse,
     logs: Sequence[TableFile],
@@ -287,7 +357,7 @@ def verify_grams(
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Look for Gram rows that are missing, left over, or wrong (in a sample, or all).
+    """Find Gram rows that are missing, of removed files, or wrong (in a sample, or all).
 
     `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
     """
@@ -357,7 +427,7 @@ def verify_models(
                 manifest = registry.load(name, number).manifest
                 registry.trained_drives(manifest)
             except (RefusedError, StorageError, DataError, QuestionError) as error:
-                # What is no fault of its format or its drives is reported as a document.
+                # Faults other than of format and drives are reported with the document.
                 if isinstance(error, RefusedError) or "drives" in str(error):
                     report.note("model", f"{name}@{number}", str(error))
                 continue
@@ -381,93 +451,23 @@ def verify_models(
                 report.note("model", f"{name}@{alias}", problem)
 
 
-def verify(
-    warehouse: Warehouse,
-    *,
-    full: bool = False,
-    progress: Progress = no_progress,
-    executor: Executor | None = None,
-) -> Verification:
-    """Verify a data root; `full` computes the Gram rows of all log files again.
-
-    Workers of an executor, or threads, read; `progress` counts bytes. What jobs meanwhile take away
-    is looked for again.
-    """
-    warehouse.require()
-    look = partial(_verify, warehouse, full, progress, executor)
-    return retry_if_stale(warehouse.tables, look, lambda report: bool(report.damage))
-
-
-def _verify(
-    warehouse: Warehouse, full: bool, progress: Progress, executor: Executor | None
-) -> Verification:
-    report = Verification()
-    snapshots = _open_tables(warehouse, report)
-    read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
-    logs, grams = ([one.file for one in read.get(table, [])] for table in ("logs", "grams"))
-    verify_names(warehouse, read, report, full)
-    verify_rows(warehouse, logs, grams, report)
-    _report_missing_logs(snapshots, grams, report)
-    if grams:
-        active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
-        verify_grams(warehouse, logs, grams, active, report, full, executor)
-    verify_documents(warehouse.root, report)
-    verify_models(warehouse, snapshots, report)
-    _list_unreferenced(warehouse, snapshots, report)
-    written = any(snapshot.version is not None for snapshot in snapshots.values())
-    if not report.findings and not report.documents and not written:
-        raise StorageError(
-            f"{warehouse.root}: there is nothing to verify, neither tables nor models. Is it the "
-            "right folder, and is its disk there? Choose another data root."
-        )
-    return report
-
-
-def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
-    found = {}
-    for table in warehouse.tables:
-        name = table.folder.name
-        try:
-            snapshot = table.snapshot(anew=True)
-            _ = snapshot.files
-            found[name] = snapshot
-            for file, problem in find_commit_faults(snapshot):
-                report.note("log", f"{name}/{LOG}/{file}", problem)
-        except FleetSlipError as error:
-            report.note("log", name, str(error))
-    return found
-
-
-def _report_missing_logs(
-    snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
-) -> None:
-    """Report a table of logs that is gone, as a folder that was not mounted is."""
-    logs, grams = snapshots.get("logs"), snapshots.get("grams")
-    if not logs or not grams or logs.version is not None:
-        return
-    damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
-    if gone := named_files(replace(grams, without=damaged), PLAIN)[1]:
-        problem = f"the table is gone; Gram rows of {pluralize(len(gone), 'file')} remain"
-        report.note("log", "logs", problem)
-
-
 def _list_unreferenced(
     warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
 ) -> None:
     for snapshot in snapshots.values():
         try:
-            known, files = snapshot.removals, find_unreferenced(snapshot.table)
-        except StorageError:  # its log is damaged, as is reported: it says of no file what that is
+            removals, files = snapshot.removals, find_unreferenced(snapshot.table)
+        except StorageError:  # a damaged log, reported above, does not state the state of files
             continue
         for file in files:
-            what = "replaced" if file.path in known else "never committed"
+            state = "replaced" if file.path in removals else "never committed"
             then = "fleet-slip compact removes it in time"
             removed_ns = snapshot.removals.get(file.path, 0) * 10**6
             if max(file.modified_ns, removed_ns) > time.time_ns():
                 then = "its date is in the future, so compact keeps it: check the clocks"
             if snapshot.version is None:
                 then = "if the table had a Delta log, restore that from a backup"
-            _remark(warehouse, file, f"{what}; {then}", report)
+            _remark(warehouse, file, f"{state}; {then}", report)
     for file in find_temporary_files(warehouse):
         _remark(warehouse, file, "left by a killed job, or being written", report)
 
@@ -477,13 +477,13 @@ def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verifi
     report.note("unreferenced", where, problem)
 
 
-# Rebuilds what can be rebuilt: Gram rows from the logs, and checkpoints from the commits.
+# Repair: Gram rows are rebuilt from the logs, and checkpoints from the commits.
 #
-# Nothing is deleted. The bytes of a file that stand under another name are put back.
+# Nothing is deleted. A data file that was copied below its table under any name is put back.
 
 
 def repair(warehouse: Warehouse, verification: Verification) -> list[str]:
-    """Rebuild what is damaged; return what, below the root."""
+    """Rebuild damaged parts; return their paths below the root."""
     logs = {finding.path for finding in verification.damage if finding.kind == "log"}
     rebuilt = _sum_up_again(warehouse, logs)
     damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
@@ -491,7 +491,7 @@ def repair(warehouse: Warehouse, verification: Verification) -> list[str]:
     rebuilt += _find_elsewhere(warehouse, damaged)
     lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
     rebuilt += _drop_wrong(warehouse, damaged, wrong)
-    reconcile(warehouse, unreadable=lost)  # also what an interrupted repair has dropped
+    reconcile(warehouse, unreadable=lost)  # also files that an interrupted repair has dropped
     return rebuilt
 
 
@@ -500,8 +500,8 @@ def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
     rebuilt = []
     for table in warehouse.tables:
         name, log = table.folder.name, table.folder / LOG
-        found = damaged & {name, f"{name}/{LOG}/{LATEST}"}
-        commits, faults = check_commits(log) if found else ([], {})
+        lost = damaged & {name, f"{name}/{LOG}/{LATEST}"}
+        commits, faults = check_commits(log) if lost else ([], {})
         if not commits or commits[0].version or faults:
             continue
         for file in log.files():
@@ -511,7 +511,7 @@ def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
         if delta is not None:
             with storage_errors(table.folder):
                 delta.create_checkpoint()
-        rebuilt += sorted(found)
+        rebuilt += sorted(lost)
     return rebuilt
 
 
@@ -555,9 +555,9 @@ def _drop_wrong(warehouse: Warehouse, damaged: Collection[str], wrong: set[str])
 
 def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
     """Return which drives and log files the Gram files name, of those that are whole."""
-    found = {}
+    readable = {}
     for file in warehouse.grams.snapshot().files:
         if read_whole(warehouse.grams, file).problem is None:
             with contextlib.suppress(FleetSlipError):
-                found[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
-    return found
+                readable[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
+    return readable

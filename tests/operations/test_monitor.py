@@ -126,7 +126,7 @@ def test_days_to_learn_from_may_be_chosen_and_must_be_enough(
 
 def test_limits_are_the_prediction_interval_of_one_more_day() -> None:
     usual = [1.0, 2.0, 4.0, 3.5]
-    limits = Limits.of(usual, 0.01)
+    limits = Limits.from_values(usual, 0.01)
     t = stats.t.ppf(0.995, 3)
     half = t * np.std(usual, ddof=1) * math.sqrt(1 + 1 / 4)
     assert (limits.lower, limits.upper) == pytest.approx((2.625 - half, 2.625 + half), rel=1e-12)
@@ -143,7 +143,7 @@ def test_the_share_of_usual_days_beyond_the_limits_is_what_was_asked_for() -> No
     beyond = 0
     for _ in range(2000):
         days = rng.standard_normal(7).tolist()
-        beyond += Limits.of(days[:6], 0.05).beyond(days[6])
+        beyond += Limits.from_values(days[:6], 0.05).beyond(days[6])
     assert beyond / 2000 == pytest.approx(0.05, abs=0.015)  # three standard errors
 
 
