@@ -44,8 +44,8 @@ _GROUP = np.dtype(
         ("kept", "f8"),  # of the last one that is not isolated
         ("latest", "f8"),  # the latest time of the stretch
         ("start", "f8"),  # its first time
-        ("part", "i8"),  # number of the open part
-        ("piece", "i8"),  # which part of the stretch that is
+        ("segment", "i8"),  # number of the open segment
+        ("piece", "i8"),  # index of the segment in its stretch
     ]
 )
 _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
@@ -54,32 +54,32 @@ _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
 class DriveCutter:
     """Assigns every row to a segment, which becomes a drive, and rejects rows out of order.
 
-    A group, such as a car, has stretches, and these have parts: a step in time larger than
-    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a part. A row that far
+    A group, such as a car, has stretches, and these have segments. A step in time larger than
+    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a segment. A row that far
     from both neighbours is `isolated`, so that one wrong time stamp does not cut a drive.
     `time_duplicate` and `time_backwards` are rows not later than all earlier rows of their stretch.
     The result does not depend on the blocks: a row that needs the next one waits for it.
     """
 
     def __init__(self, base: TimeBase, longest_s: float = MAX_DRIVE_S) -> None:
-        """Set the gap that ends a drive, and the maximum duration of a part."""
+        """Set the gap that ends a drive, and the maximum duration of a segment."""
         self._gap_s = base.split_gap_s + TIME_EPSILON_S
         self._longest_s = longest_s
         self._waiting: pl.DataFrame | None = None
-        self._parts = 0
+        self._segments = 0
         self._state = np.empty(0, dtype=_GROUP)
         """The state of each group."""
         self.ended: list[int] = []
-        """Parts that the last block ended, in an order that does not depend on blocks."""
+        """Segments that the last block ended, in an order that does not depend on blocks."""
 
     def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return the rows of a block with their `part`, together; and the misplaced ones."""
+        """Return the rows of a block with their `segment`, together; and the misplaced ones."""
         self.ended = []
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
         if rows.is_empty():
-            return rows.with_columns(pl.lit(0, pl.Int64).alias("part")), no_rows()
+            return rows.with_columns(pl.lit(0, pl.Int64).alias("segment")), no_rows()
         if several:
             rows = rows.sort("group", "time", maintain_order=True)
         elif not rows["group"].is_sorted():
@@ -93,7 +93,7 @@ class DriveCutter:
         unsettled = alone | waiting
         if unsettled.any():
             rows, known_at = rows.filter(pl.Series(~unsettled)), known_at[~unsettled]
-        rows, before = self._number_parts(rows, known_at)
+        rows, before = self._number_segments(rows, known_at)
         if not several:
             time = rows["time"].to_numpy()
             twice, backwards = time == before, time < before
@@ -128,12 +128,14 @@ class DriveCutter:
         known_at[end] = np.inf
         return alone, waiting, np.where(is_far, known_at, number)
 
-    def _number_parts(
+    def _number_segments(
         self, rows: pl.DataFrame, known_at: FloatArray
     ) -> tuple[pl.DataFrame, FloatArray]:
-        """Return the rows with their parts, and the latest earlier time of their stretch.
+        """Return the rows with their segments, and the latest earlier time of their stretch.
 
-        Lists ended parts in the order in which their end is detected.
+        Lists ended segments in the order in which their end is detected. Example for one group,
+        with `split_gap_s` = 1 and `longest_s` = 2: times 0, 1, 2, 3, 9 are in the segments
+        0, 0, 1, 1, 2, since the first one ends after 2 s, and 9 follows a gap.
         """
         group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
@@ -155,22 +157,24 @@ class DriveCutter:
         piece_before[first] = seen["piece"][group[first]]
         begins |= piece != piece_before
         heads = np.flatnonzero(begins | is_first)
-        fresh, open_part = begins[heads], seen["part"][group[heads]]
-        part_of = np.where(fresh, self._parts + np.cumsum(fresh) - 1, open_part)
-        self._parts += int(fresh.sum())
-        before_head = np.where(is_first[heads], open_part, np.concatenate([[-1], part_of[:-1]]))
+        fresh, open_segment = begins[heads], seen["segment"][group[heads]]
+        segment_of = np.where(fresh, self._segments + np.cumsum(fresh) - 1, open_segment)
+        self._segments += int(fresh.sum())
+        before_head = np.where(
+            is_first[heads], open_segment, np.concatenate([[-1], segment_of[:-1]])
+        )
         over = fresh & (before_head >= 0)
         order = np.lexsort((group[heads[over]], known_at[heads[over]]))
         self.ended += before_head[over][order].tolist()
-        parts = np.repeat(part_of, np.diff(np.append(heads, time.size)))
-        now = {"kept": time, "latest": latest, "start": start, "part": parts, "piece": piece}
+        segments = np.repeat(segment_of, np.diff(np.append(heads, time.size)))
+        now = {"kept": time, "latest": latest, "start": start, "segment": segments, "piece": piece}
         for name, values in now.items():
             seen[name][group[end]] = values[end]
-        return rows.with_columns(pl.Series("part", parts)), before
+        return rows.with_columns(pl.Series("segment", segments)), before
 
-    def open_parts(self) -> list[int]:
-        """Return the parts that no block has ended, by group."""
-        return [int(part) for part in self._state["part"] if part >= 0]
+    def open_segments(self) -> list[int]:
+        """Return the segments that no block has ended, by group."""
+        return [int(segment) for segment in self._state["segment"] if segment >= 0]
 
 
 def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
@@ -179,8 +183,8 @@ def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
     bases = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
     intervals_s = {}
     for (number,), base in bases.items():
-        step_s, part = np.diff(base["time"].to_numpy()), base["part"].to_numpy()
-        median = pl.Series(step_s[part[1:] == part[:-1]]).median()
+        step_s, segment = np.diff(base["time"].to_numpy()), base["segment"].to_numpy()
+        median = pl.Series(step_s[segment[1:] == segment[:-1]]).median()
         intervals_s[number] = median if isinstance(median, float) and median else STEP_S
     return intervals_s
 

@@ -12,11 +12,11 @@ import polars as pl
 from fleet_slip.ingest.formats.source import Spool
 
 MAX_OPEN_VALUES = 2**21
-"""Values of drives that have not ended, in memory; all others wait in a temporary file."""
-MAX_PARTS_AT_ONCE = 64
-"""Parts whose rows are taken out of a block at once: thousands of small frames take much memory."""
+"""Maximum values of open drives in memory; the others are in a temporary file."""
+MAX_SEGMENTS_AT_ONCE = 64
+"""Segments taken out of blocks at once: thousands of small frames take much memory."""
 MAX_SINGLE_PIECES, BUNDLED_GROUPS = 512, 128
-"""Maximum number of parts that are spilled one by one; beyond it groups are bundled."""
+"""Maximum number of segments that are spilled one by one; beyond it groups are bundled."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class DriveRows:
 
 
 class OpenDrives:
-    """Rows by part, as long as the part has not ended, few of them in memory.
+    """The rows of open segments, few of them in memory.
 
-    Where hundreds of parts are open at once, their rows are put aside by bundles of groups, and
-    no part is yielded before the last.
+    If hundreds of segments are open at once, their rows are spilled in bundles of groups, and no
+    segment is yielded before the end of the file.
     """
 
     def __init__(self) -> None:
@@ -77,76 +77,76 @@ class OpenDrives:
         self._bundled = False
         self._ended: list[int] = []
         self._group_of: dict[int, int] = {}
-        """The group of each part with spilled rows."""
+        """The group of each segment with spilled rows."""
 
     def add(self, rows: pl.DataFrame) -> None:
-        """Keep rows with their part."""
+        """Keep rows with their segment."""
         if rows.height:
             self._blocks.append(rows)
             self._in_memory += rows.height * rows.width
 
-    def take(self, parts: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
-        """Yield the rows of parts that have any, and let go of them; the last are all."""
+    def take(self, segments: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
+        """Yield the rows of segments and release them; `last` for the end of the file."""
         if not self._bundled:
-            yield from self._take(parts)
+            yield from self._take(segments)
             return
-        self._ended += parts
+        self._ended += segments
         if last:
             yield from self._unbundled()
 
-    def _take(self, parts: Sequence[int]) -> Iterator[DriveRows]:
-        for start in range(0, len(parts), MAX_PARTS_AT_ONCE):
-            chunk = parts[start : start + MAX_PARTS_AT_ONCE]
-            rows_in_memory = self._let_go(chunk)
-            for part in chunk:
-                self._group_of.pop(part, None)
-                put_aside = map(pl.read_ipc_stream, self._spool.take(part))
-                if pieces := [*put_aside, *rows_in_memory[part]]:
+    def _take(self, segments: Sequence[int]) -> Iterator[DriveRows]:
+        for start in range(0, len(segments), MAX_SEGMENTS_AT_ONCE):
+            chunk = segments[start : start + MAX_SEGMENTS_AT_ONCE]
+            rows_in_memory = self._release(chunk)
+            for segment in chunk:
+                self._group_of.pop(segment, None)
+                spilled = map(pl.read_ipc_stream, self._spool.take(segment))
+                if pieces := [*spilled, *rows_in_memory[segment]]:
                     yield DriveRows(_by_base(pieces))
 
-    def _let_go(self, parts: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
-        """Take the rows of parts out of memory."""
-        rows_of_part = defaultdict[int, list[pl.DataFrame]](list)
-        is_taken = pl.col("part").is_in(parts)
+    def _release(self, segments: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
+        """Take the rows of segments out of memory."""
+        rows_of_segment = defaultdict[int, list[pl.DataFrame]](list)
+        is_taken = pl.col("segment").is_in(segments)
         for _ in range(len(self._blocks)):
             rows = self._blocks.pop(0)
-            for run in rows.filter(is_taken).partition_by("part", maintain_order=True):
-                rows_of_part[run["part"][0]].append(run)
+            for run in rows.filter(is_taken).partition_by("segment", maintain_order=True):
+                rows_of_segment[run["segment"][0]].append(run)
             self._in_memory -= rows.height * rows.width
             self.add(rows.filter(~is_taken))
-        return rows_of_part
+        return rows_of_segment
 
     def _unbundled(self) -> Iterator[DriveRows]:
-        """Yield the rows of all parts, bundle by bundle, and in each as the parts ended."""
-        self._put_aside(bundled=True)
+        """Yield the rows of all segments, bundle by bundle, and in each as the segments ended."""
+        self._spill_rows(bundled=True)
         bundles = defaultdict[int, list[int]](list)
-        for part in self._ended:
-            bundles[self._group_of.get(part, 0) // BUNDLED_GROUPS].append(part)
-        for bundle, parts in sorted(bundles.items()):
+        for segment in self._ended:
+            bundles[self._group_of.get(segment, 0) // BUNDLED_GROUPS].append(segment)
+        for bundle, segments in sorted(bundles.items()):
             for piece in self._spool.take(("bundle", bundle)):
                 self.add(pl.read_ipc_stream(piece))
                 if self._in_memory > MAX_OPEN_VALUES:
-                    self._put_aside(bundled=False)
-            if self._blocks:  # hundreds of small frames a part would take much memory
+                    self._spill_rows(bundled=False)
+            if self._blocks:  # hundreds of small frames a segment would take much memory
                 self._blocks = [pl.concat(self._blocks, rechunk=True)]
-            yield from self._take(parts)
+            yield from self._take(segments)
 
     def spill(self) -> None:
-        """Put the rows aside if they are many. Raises `InputError` if the disk is full."""
+        """Spill the rows if they are many. Raises `InputError` if the disk is full."""
         if self._in_memory > MAX_OPEN_VALUES:
-            parts = pl.concat([rows["part"] for rows in self._blocks]).n_unique()
-            self._bundled |= parts > MAX_SINGLE_PIECES
-            self._put_aside(bundled=self._bundled)
+            segments = pl.concat([rows["segment"] for rows in self._blocks]).n_unique()
+            self._bundled |= segments > MAX_SINGLE_PIECES
+            self._spill_rows(bundled=self._bundled)
 
-    def _put_aside(self, *, bundled: bool) -> None:
-        """Put all rows aside, by bundles or by parts."""
+    def _spill_rows(self, *, bundled: bool) -> None:
+        """Spill all rows, by bundles or by segments."""
         if not self._blocks:
             return
         rows = pl.concat(self._blocks)
         self._blocks, self._in_memory = [], 0
-        heads = rows.select("part", "group").unique("part")
-        self._group_of.update(zip(heads["part"], heads["group"], strict=True))
-        key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("part")).alias("key")
+        heads = rows.select("segment", "group").unique("segment")
+        self._group_of.update(zip(heads["segment"], heads["group"], strict=True))
+        key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("segment")).alias("key")
         pieces = rows.with_columns(key).partition_by("key", as_dict=True, include_key=False)
         for (number,), piece in pieces.items():
             content = BytesIO()
@@ -155,12 +155,12 @@ class OpenDrives:
 
 
 def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
-    """Return the rows of each time base, with those columns that have a value there."""
+    """Return the rows of each time base, with the columns that have values in it."""
     if "base" not in pieces[0].columns:
         return {0: pl.concat(pieces)}
     bases = defaultdict[int, list[pl.DataFrame]](list)
     for piece in pieces:
-        for rows in piece.drop("part").partition_by("base", maintain_order=True):
+        for rows in piece.drop("segment").partition_by("base", maintain_order=True):
             filled = rows.select(column for column in rows if column.null_count() < rows.height)
             bases[rows["base"][0]].append(filled)
     return {base: pl.concat(bases[base], how="diagonal") for base in sorted(bases)}

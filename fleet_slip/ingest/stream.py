@@ -147,7 +147,7 @@ class MeasuredStream:
             early.append(block)
             while _reach(early) >= enough:
                 first = _trial(self.mapping, early, enough)
-                has_steps = first["part"].is_duplicated().sum() > MIN_STEPS
+                has_steps = first["segment"].is_duplicated().sum() > MIN_STEPS
                 if has_steps or enough >= MAX_RATE_ROWS:
                     return early, sample_intervals_s(first)
                 enough += RATE_ROWS
@@ -166,8 +166,8 @@ class MeasuredStream:
         rows, misplaced = cutter.cut(block.rows, last=last)
         self._open.add(rows)
         self._refuse(pl.concat([block.refused, misplaced]))
-        parts = [*cutter.ended, *(cutter.open_parts() if last else ())]
-        for ended in self._open.take(parts, last=last):
+        segments = [*cutter.ended, *(cutter.open_segments() if last else ())]
+        for ended in self._open.take(segments, last=last):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
                 self._refuse(describe_refused(ended.frame, None, "too_short"))
             else:
@@ -367,7 +367,7 @@ def _reach(blocks: list[CheckedBlock]) -> int:
 
 
 def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
-    """Return the rows of the first blocks up to a number, cut into parts for `_usual_intervals`."""
+    """Return the first rows, cut into segments, for `_usual_intervals`."""
     rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
     several = "base" in rows.columns
     if several:

@@ -60,15 +60,15 @@ def cut(
     for size in [*sizes, len(rows)]:
         found, bad = cutter.cut(frame.slice(at, size), last=False)
         at += size
-        for part, row in found.select("part", "row").iter_rows():
+        for part, row in found.select("segment", "row").iter_rows():
             parts.setdefault(part, []).append(row)
         refused += list(bad.select("row", "reason").iter_rows())
         order += cutter.ended
     found, bad = cutter.cut(frame.clear(), last=True)
-    for part, row in found.select("part", "row").iter_rows():
+    for part, row in found.select("segment", "row").iter_rows():
         parts.setdefault(part, []).append(row)
     refused += list(bad.select("row", "reason").iter_rows())
-    order += [*cutter.ended, *cutter.open_parts()]
+    order += [*cutter.ended, *cutter.open_segments()]
     return [parts[part] for part in order if part in parts], sorted(refused)
 
 
@@ -201,7 +201,7 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
     monkeypatch.setattr(open_drives, "MAX_OPEN_VALUES", 8 * rows)
-    monkeypatch.setattr(open_drives, "MAX_PARTS_AT_ONCE", parts)
+    monkeypatch.setattr(open_drives, "MAX_SEGMENTS_AT_ONCE", parts)
     monkeypatch.setattr(open_drives, "MAX_SINGLE_PIECES", pieces)
     monkeypatch.setattr(open_drives, "BUNDLED_GROUPS", groups)
     spilled = read_columns(tmp_path, columns, mapping)

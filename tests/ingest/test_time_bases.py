@@ -144,7 +144,7 @@ def read_in(
         patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
         patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(open_drives, "MAX_PARTS_AT_ONCE", 1 + batch % 3))
+        patched.enter_context(mock.patch.object(open_drives, "MAX_SEGMENTS_AT_ONCE", 1 + batch % 3))
         patched.enter_context(mock.patch.object(open_drives, "MAX_OPEN_VALUES", 40 * window))
         patched.enter_context(mock.patch.object(open_drives, "MAX_SINGLE_PIECES", batch % 5))
         patched.enter_context(mock.patch.object(open_drives, "BUNDLED_GROUPS", 1 + batch % 2))
