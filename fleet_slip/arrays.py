@@ -15,9 +15,6 @@ IntArray = NDArray[np.int64]
 
 BoolArray = NDArray[np.bool_]
 
-ObjectArray = NDArray[np.object_]
-"""Python objects, such as integers that never overflow."""
-
 
 Hashes = NDArray[np.uint64]
 """The first 8 bytes of SHA-256 hashes of names."""

@@ -6,7 +6,6 @@ from pathlib import Path
 import duckdb
 
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
-from fleet_slip.models.registry import Registry
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
 from fleet_slip.warehouse.table_views import (
@@ -68,6 +67,8 @@ def open_views(
     if "runs" in views:
         add_runs(database, warehouse.root)
     if "models" in views:
+        from fleet_slip.models.registry import Registry
+
         add_table(database, "models", Registry.open(warehouse).as_table())
     if "dictionary" in views:
         add_table(database, "dictionary", describe_columns(database, warehouse.catalog.signals))
