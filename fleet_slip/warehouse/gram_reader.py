@@ -1,4 +1,4 @@
-"""Opens the Gram rows of a warehouse, once for cohort after cohort."""
+"""Reader of the Gram rows of a warehouse, for one cohort after another."""
 
 import contextlib
 import shlex
@@ -26,17 +26,17 @@ from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
 from fleet_slip.warehouse.warehouse import Warehouse
 
 BATCH_ROWS = 2**13
-"""Gram rows of one batch: some 700 bytes each."""
+"""Gram rows per batch, some 700 bytes each."""
 
 BATCH_NUMBERS = 2**20
-"""Most sums and products of one batch: wide rows come in smaller ones."""
+"""Maximum number of sums and products in a batch."""
 
 
 SUMMED = (
     *("drive_id", "vehicle_id", RECEIVER, "source", "track", "mass_kg", "adhesion"),
     *("speed_factor", "day", "part", "trip", "signals", "n", "sums", "products"),
 )
-"""Columns of a cohort that its sums, and what its folds are made of, need."""
+"""Columns of a cohort for its sums and folds."""
 
 HASHES = ("drive_hash", "vehicle_hash", "trip_hash")
 
@@ -62,7 +62,7 @@ class OpenedGrams:
         return read_sql("jobs", name).format(**values)
 
     def rows(self, predicate: Predicate) -> pa.Table:
-        """Return the Gram rows of a cohort with all that is known of them, sorted."""
+        """Return the sorted Gram rows of a cohort with all metadata."""
         text = self.statement("cohort.sql", predicate)
         with guarded_query(self.database, predicate):
             return self.database.sql(
@@ -70,7 +70,7 @@ class OpenedGrams:
             ).to_arrow_table()
 
     def batches(self, predicate: Predicate, *more: str) -> Iterator[pa.RecordBatch]:
-        """Yield the Gram rows of a cohort, in any order: `SUMMED` and `more` columns of them."""
+        """Yield the Gram rows of a cohort in any order, with the columns `SUMMED` and `more`."""
         columns = ", ".join([*SUMMED, *more])
         feature_set = self.catalog.feature_set(self.catalog.name_of(self.identity))
         rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(feature_set.columns))))
@@ -86,19 +86,19 @@ class OpenedGrams:
             return self.database.sql(query).to_arrow_table()[column].combine_chunks()
 
     def count_left_out(self, predicate: Predicate) -> int:
-        """Return how many drives of a cohort have no Gram rows, since their cars sent no log."""
+        """Return the number of drives of a cohort without Gram rows, whose cars sent no log."""
         if self.identity == self.catalog.identity(PLAIN):
             return 0
         [(count,)] = self._rows(self.statement("count_without_log.sql", predicate), predicate)
         return int(count)
 
     def label_sources(self, predicate: Predicate) -> list[tuple[str, str | None, int]]:
-        """Return source, campaign and number of the rows of a cohort that have the label."""
+        """Return source, campaign and number of the rows of a cohort with the label."""
         statement = self.statement("label_sources.sql", predicate, label=self.catalog.signals.label)
         return [(source, name, int(n)) for source, name, n in self._rows(statement, predicate)]
 
     def files(self, predicate: Predicate) -> set[str]:
-        """Return the log files that have a drive of a cohort."""
+        """Return the log files that contain a drive of a cohort."""
         return {f for (f,) in self._rows(self.statement("cohort_files.sql", predicate), predicate)}
 
     def _rows(self, statement: str, predicate: Predicate) -> list[tuple[Any, ...]]:
@@ -106,17 +106,17 @@ class OpenedGrams:
             return self.database.execute(statement).fetchall()
 
     def course_delays(self, predicate: Predicate) -> Iterator[tuple[str, tuple[int, int]]]:
-        """Yield cars with a course, and the least and largest delay of their Gram rows in ticks."""
+        """Yield cars with a course, and the smallest and largest delay of their Gram rows."""
         statement = self.statement("course_delays.sql", predicate, turned=TURNED)
         for car, least, largest in self._rows(statement, predicate):
             yield car, (least, largest)
 
 
 class GramReader:
-    """The newest Gram rows of a warehouse, for one cohort after another of one thread.
+    """The newest Gram rows of a warehouse, for one cohort after another in one thread.
 
-    What was opened is used again until somebody commits: a cohort then costs its query alone. The
-    next reader of the warehouse takes it over, since DuckDB takes 20 ms to begin.
+    A database is reused until the next commit, so that a cohort costs only its query. The next
+    reader of the warehouse takes it over, since DuckDB takes 20 ms to start.
     """
 
     def __init__(self, warehouse: Warehouse) -> None:
@@ -130,9 +130,9 @@ class GramReader:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind or not self._grams or not self._logs or self._grams.size_bytes > KEPT_BYTES:
+        if kind or not self._grams or not self._logs or self._grams.size_bytes > MAX_REUSED_BYTES:
             self._close()
-        elif self._database and self._uses < USES:
+        elif self._database and self._uses < MAX_USES:
             connection = IdleConnection(self._grams, self._logs, self._database, self._uses)
             self.warehouse.connections.put(connection)
             self._database = None
@@ -140,9 +140,9 @@ class GramReader:
             self._close()
 
     def opened(self, feature_set: str, predicate: Predicate) -> OpenedGrams:
-        """Return the Gram rows of a feature set; they are valid until the next call.
+        """Open the Gram rows of a feature set, which are valid until the next call.
 
-        Raises `DataError` for missing Gram rows, or a set incomplete for a cohort.
+        Raises `DataError` for missing Gram rows, or a feature set incomplete for the cohort.
         """
         grams, logs = gram_snapshots(self.warehouse, self._grams, self._logs)
         if grams is not self._grams or logs is not self._logs:
@@ -181,11 +181,11 @@ class GramReader:
             self._database = None
 
 
-USES = 20
-"""So many readers use a database, which keeps a list of all files that its queries open."""
+MAX_USES = 20
+"""Maximum number of readers of a database, which lists all files that its queries open."""
 
-KEPT_BYTES = 2**27
-"""A database of larger Gram rows waits for no other reader: it may hold them in memory."""
+MAX_REUSED_BYTES = 2**27
+"""Size of Gram rows above which a database is closed: it may have them in memory."""
 
 
 @contextlib.contextmanager
@@ -194,7 +194,7 @@ def open_grams(
     feature_set: str,
     predicate: Predicate,
 ) -> Iterator[OpenedGrams]:
-    """Open the Gram rows of a feature set, anew unless by a reader; see `opened`."""
+    """Open the Gram rows of a feature set by a reader, or by a new one; see `opened`."""
     if isinstance(source, GramReader):
         yield source.opened(feature_set, predicate)
     else:
@@ -232,7 +232,7 @@ def _require_complete(
 
 
 def cohort_files(source: Warehouse | GramReader, predicate: Predicate) -> set[str]:
-    """Return the log files that have a drive of a cohort. Raises `DataError` without one."""
+    """Return the log files that contain a drive of a cohort. Raises `DataError` for none."""
     with open_grams(source, PLAIN, predicate) as opened:
         files = opened.files(predicate)
     if not files:

@@ -1,4 +1,4 @@
-"""Rows of the table `grams` as arrays, and how the table differs from the log files."""
+"""Rows of the table `grams` as arrays, and the difference between the tables `grams` and `logs`."""
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
 
 
 def by_signals(batch: Rows) -> Iterator[tuple[str, Rows, BoolArray]]:
-    """Yield each set of signals in some Gram rows, its rows, and which those are."""
+    """Yield each set of signals in Gram rows, its rows, and their mask."""
     names = batch["signals"].unique().to_pylist()
     if len(names) == 1:
         yield names[0], batch, np.ones(len(batch), dtype=np.bool_)
@@ -29,7 +29,7 @@ def by_signals(batch: Rows) -> Iterator[tuple[str, Rows, BoolArray]]:
 
 
 def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
-    """Return Gram rows, all of the same signals, as arrays."""
+    """Return Gram rows of the same signals as arrays."""
     names = tuple(signals.split(","))
     k = len(names)
     return GramTable(
@@ -42,27 +42,27 @@ def gram_table(signals: str, rows: pa.Table | pa.RecordBatch) -> GramTable:
 
 def _matrix(lists: pa.ChunkedArray | pa.ListArray, width: int) -> IntArray:
     chunks = lists.chunks if isinstance(lists, pa.ChunkedArray) else [lists]
-    parts = [chunk.flatten().to_numpy() for chunk in chunks]
-    values: IntArray = parts[0] if len(parts) == 1 else np.concatenate(parts)
+    arrays = [chunk.flatten().to_numpy() for chunk in chunks]
+    values: IntArray = arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
     return values.reshape(-1, width)
 
 
 def is_onboard(rows: pa.Table) -> pa.ChunkedArray:
-    """Return which rows of `grams` came without a log."""
+    """Return a mask of the Gram rows that cars sent without a log."""
     return pc.starts_with(rows["file"].cast(pa.string()), RECEIVED_FILES)
 
 
 ONBOARD_PREFIX = "received-"
-"""Before the name of a file of rows that cars sent."""
+"""Prefix of the names of files with Gram rows from cars."""
 
 
 def is_onboard_file(file: TableFile) -> bool:
-    """Whether a Gram file holds rows that cars sent."""
+    """Return True for a file of Gram rows from cars."""
     return file.path.startswith(ONBOARD_PREFIX)
 
 
 def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Table]:
-    """Yield the Gram rows of a feature set, file by file; null in columns that came later."""
+    """Yield the Gram rows of a feature set by file; newer columns are null in older files."""
     for file in grams.files:
         mask = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
         if not pc.any(mask).as_py():
@@ -74,37 +74,41 @@ def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Ta
         yield rows.filter(mask)
 
 
-# How the tables `logs` and `grams` differ.
+# Difference between the tables `logs` and `grams`.
 
 BEING_WRITTEN_HOURS = 1.0
-"""A file that no commit ever knew and that is younger may belong to a job that is running."""
+"""Age below which a file without a commit may belong to a running job."""
 
 
 @dataclass(frozen=True)
 class Backlog:
-    """How `grams` and `logs` differ."""
+    """Difference between `grams` and `logs` for a feature set.
+
+    Attributes:
+        missing: active log files without Gram rows of the feature set.
+        stale: paths in `grams`, of any feature set, that are no active or pending log file.
+    """
 
     missing: tuple[TableFile, ...]
     stale: frozenset[str]
-    """Paths in `grams`, of any set, that are no active log file, and none that may become one."""
 
 
 def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
-    """Compare active log files with those that Gram rows of a feature set's `identity` name."""
+    """Compare the active log files with those of the Gram rows of a feature set."""
     done, named = named_files(grams, identity)
     active = {file.path for file in logs.files}
     return Backlog(
         missing=tuple(file for file in logs.files if file.path not in done),
-        stale=frozenset(named - active - _about_to_land(logs, named - active)),
+        stale=frozenset(named - active - _pending_files(logs, named - active)),
     )
 
 
 def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
-    """Return the log files that Gram rows of a feature set name, and those that any name."""
+    """Return the log files of the Gram rows of a feature set, and those of all Gram rows."""
     done: set[str] = set()
     named: set[str] = set()
     for file in grams.files:
-        if is_onboard_file(file):  # of no log
+        if is_onboard_file(file):  # without logs
             continue
         pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
         named.update(pairs["file"].filter(pc.invert(is_onboard(pairs))).to_pylist())
@@ -112,8 +116,8 @@ def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
     return done, named
 
 
-def _about_to_land(logs: Snapshot, paths: Collection[str]) -> set[str]:
-    """Return the log files that a job has written and not committed: their Gram rows land first."""
+def _pending_files(logs: Snapshot, paths: Collection[str]) -> set[str]:
+    """Return log files that a job has written, but not committed: Gram rows are committed first."""
     if not paths:
         return set()
     written = {

@@ -155,11 +155,11 @@ def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
         land_another(warehouse, number)
         assert [len(load_cohort(warehouse).drives) for _ in range(3)] == [number + 1] * 3
         assert len(opened) == number + 1
-    monkeypatch.setattr(gram_reader, "USES", 3)
+    monkeypatch.setattr(gram_reader, "MAX_USES", 3)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 3
-    monkeypatch.setattr(gram_reader, "KEPT_BYTES", 0)
+    monkeypatch.setattr(gram_reader, "MAX_REUSED_BYTES", 0)
     load_cohort(warehouse)
     load_cohort(warehouse)
     assert len(opened) == 4
