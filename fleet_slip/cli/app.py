@@ -8,9 +8,10 @@ import sys
 from collections.abc import Mapping
 from functools import cache, partial
 from importlib import import_module
-from importlib.abc import InspectLoader
+from importlib.abc import InspectLoader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -176,28 +177,49 @@ app = typer.Typer(
 
 def _open(root: str | None, config: str | None) -> "Fleet":
     """Return the fleet of a command when it runs: its help needs no tables."""
-    fleet = fleet_slip.open(root, config)
-    _hide_pandas()
-    return fleet
+    if "pyarrow" in sys.modules:
+        _hide_pandas(sys.modules["pyarrow"])
+    else:
+        sys.meta_path.insert(0, _ArrowWithoutPandas())
+    return fleet_slip.open(root, config)
 
 
-def _hide_pandas() -> None:
+class _ArrowWithoutPandas(MetaPathFinder):
+    """Hides pandas from pyarrow when that is imported."""
+
+    def find_spec(self, name: str, _path: Any = None, _target: Any = None) -> ModuleSpec | None:
+        if name != "pyarrow":
+            return None
+        sys.meta_path.remove(self)
+        spec = find_spec(name)
+        if spec and spec.loader:
+            execute = spec.loader.exec_module
+
+            def execute_without_pandas(module: ModuleType) -> None:
+                execute(module)
+                _hide_pandas(module)
+
+            spec.loader.exec_module = execute_without_pandas  # type: ignore[method-assign]
+        return spec
+
+
+class _WithoutPandas(MetaPathFinder):
+    """Fails to find pandas."""
+
+    def find_spec(self, name: str, _path: Any = None, _target: Any = None) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name, name=name)
+
+
+def _hide_pandas(pyarrow: Any) -> None:
     """Prevent pyarrow from importing pandas with its first array of Python values.
 
     The import takes a quarter of a short command. Data frames still work.
     """
-    import pyarrow as pa
-
-    sys.meta_path.insert(0, _WithoutPandas)
-    pa.array([])
-    sys.meta_path.remove(_WithoutPandas)
-
-
-class _WithoutPandas:
-    @staticmethod
-    def find_spec(name: str, _path: Any = None, _target: Any = None) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError(name, name=name)
+    finder = _WithoutPandas()
+    sys.meta_path.insert(0, finder)
+    pyarrow.array([])
+    sys.meta_path.remove(finder)
 
 
 def _print_version(requested: bool) -> None:
