@@ -277,10 +277,10 @@ def write_program(catalog: Catalog, manifest: Manifest) -> Program:
     lowered, places = Lowering.of([signal.name for signal in signals], columns)
     steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
     ranges = lowered.ranges([(signal.min_count, signal.max_count) for signal in signals])
-    exact = manifest.counts_model(catalog)
+    coefficients, intercept = manifest.counts_coefficients(catalog)
     fixed = fixed_point(
-        exact.intercept * OUTPUT_COUNTS,
-        [slope * OUTPUT_COUNTS for slope in exact.coefficients],
+        intercept * OUTPUT_COUNTS,
+        [coefficient * OUTPUT_COUNTS for coefficient in coefficients.values()],
         [size_of(ranges[place]) for place in places],
     )
     label = catalog.signals[manifest.label.signal]

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
-from xml.sax.saxutils import quoteattr
 
 from fleet_slip.base import sha256_of
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
@@ -121,7 +120,9 @@ def fill_in_version(name: str, version: ModelVersion, program: Program, **words:
 
 @cache
 def _environment() -> "Environment":
-    from jinja2 import Environment, FunctionLoader, StrictUndefined  # noqa: PLC0415 - not for show
+    from xml.sax.saxutils import quoteattr  # noqa: PLC0415 - not for show
+
+    from jinja2 import Environment, FunctionLoader, StrictUndefined  # noqa: PLC0415
 
     environment = Environment(  # noqa: S701 - no HTML; what goes into XML is `quoted`
         loader=FunctionLoader(read_source),

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from hashlib import sha256
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import (
     AfterValidator,
     AliasChoices,
@@ -27,7 +26,6 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.arrays import BoolArray, Hashes
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import (
     Combination,
@@ -39,7 +37,10 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.regression.least_squares import LinearModel
+
+if TYPE_CHECKING:
+    from fleet_slip.arrays import BoolArray, Hashes
+    from fleet_slip.regression.least_squares import LinearModel
 
 MAX_DIGITS = 4000
 """Maximum number of decimal digits of a number in decimal: Python refuses longer texts."""
@@ -356,29 +357,35 @@ class Manifest(Config):
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
 
-    def counts_model(self, catalog: Catalog, feature_set: str | None = None) -> LinearModel:
-        """Return the model as one of counts, exactly.
+    def counts_model(self, catalog: Catalog, feature_set: str | None = None) -> "LinearModel":
+        """Return the model of counts, exactly; see `counts_coefficients`."""
+        from fleet_slip.regression.least_squares import LinearModel  # noqa: PLC0415 - not for show
 
-        For the Gram rows of a feature set of changes it has no intercept, and no column that is a
-        number of the car alone: a change has none.
+        coefficients, intercept = self.counts_coefficients(catalog, feature_set)
+        label = self.label.signal
+        return LinearModel(tuple(coefficients), label, tuple(coefficients.values()), intercept)
+
+    def counts_coefficients(
+        self, catalog: Catalog, feature_set: str | None = None
+    ) -> tuple[dict[str, Fraction], Fraction]:
+        """Return the coefficient of each signal, and the intercept, for counts, exactly.
+
+        For the Gram rows of a feature set of changes there is no intercept, and no column that is a
+        constant of the car: its change is zero.
         """
         changes = feature_set is not None and catalog.feature_set(feature_set).change_ticks
-        # Of the counts as they are now: a signal's scale may have changed since it was published.
+        # The counts are those of today: a signal's scale may have changed since the publication.
         self.require_same_counts(catalog.signals)
         scales = catalog.input_scales
         unit = scales[self.label.signal]
-        terms = [term for term in self.terms if not (changes and term.alone)]
-        return LinearModel(
-            tuple(term.signal for term in terms),
-            self.label.signal,
-            tuple(
-                term.coefficient_exact
-                * (scales[term.signal] if term.logged else term.scale_exact)
-                / unit
-                for term in terms
-            ),
-            Fraction(0) if changes else self.intercept_exact / unit,
-        )
+        coefficients = {
+            term.signal: term.coefficient_exact
+            * (scales[term.signal] if term.logged else term.scale_exact)
+            / unit
+            for term in self.terms
+            if not (changes and term.alone)
+        }
+        return coefficients, Fraction(0) if changes else self.intercept_exact / unit
 
     def columns(self, signals: SignalCatalog) -> tuple[str, ...]:
         """Return the columns in SI units that the model needs, each once, in term order."""
@@ -450,16 +457,20 @@ class TrainedDrives:
     """Sorted hashes of the training drives of a version, salted with its model's name."""
 
     name: str
-    salted: Hashes
+    salted: "Hashes"
 
     @classmethod
-    def from_hashes(cls, name: str, drives: Hashes) -> "TrainedDrives":
+    def from_hashes(cls, name: str, drives: "Hashes") -> "TrainedDrives":
         """Build a set from the hashes of the names of drives."""
+        import numpy as np  # noqa: PLC0415 - not for show
+
         return cls(name, np.sort(_salt(name, drives)))
 
     @classmethod
     def unpacked(cls, name: str, content: bytes) -> "TrainedDrives":
         """Read the content of a file."""
+        import numpy as np  # noqa: PLC0415 - not for show
+
         return cls(name, np.frombuffer(content, dtype=">u8").astype(np.uint64))
 
     @property
@@ -467,8 +478,10 @@ class TrainedDrives:
         """Content of a file: 8 bytes a drive."""
         return self.salted.astype(">u8").tobytes()
 
-    def among(self, drives: Hashes) -> BoolArray:
+    def among(self, drives: "Hashes") -> "BoolArray":
         """Return the mask of drives, by the hashes of their names, that are in the set."""
+        import numpy as np  # noqa: PLC0415 - not for show
+
         unique, place = np.unique(drives, return_inverse=True)
         mask: BoolArray = np.isin(_salt(self.name, unique), self.salted)[place]
         return mask
@@ -479,8 +492,10 @@ def checksum_of_drives(content: bytes) -> str:
     return sha256(content).hexdigest()
 
 
-def _salt(name: str, drives: Hashes) -> Hashes:
+def _salt(name: str, drives: "Hashes") -> "Hashes":
     """Return the salted hash of each drive, in the order of the drives."""
+    import numpy as np  # noqa: PLC0415 - not for show
+
     salt, numbers = _SALT + name.encode(), drives.astype("<u8")
     hashed = np.empty(len(drives), dtype=np.uint64)
     for first in range(0, len(drives), _BATCH_DRIVES):

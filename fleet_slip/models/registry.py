@@ -13,8 +13,6 @@ from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, overload
 
-import numpy as np
-import pyarrow as pa
 from pydantic import Field
 
 from fleet_slip.catalog.catalog import Catalog
@@ -28,6 +26,7 @@ from fleet_slip.storage.folder import Folder
 
 if TYPE_CHECKING:
     import polars as pl
+    import pyarrow as pa
     from numpy import float64
     from numpy.typing import ArrayLike, NDArray
 
@@ -439,11 +438,30 @@ class Registry:
 
         return history.decide(move)
 
-    def as_table(self, name: str | None = None) -> pa.Table:
+    def as_table(self, name: str | None = None) -> "pa.Table":
         """Return all versions of all models, or of one, as rows."""
+        import pyarrow as pa  # noqa: PLC0415 - not for show
+
         names = self.names() if name is None else [name]
         rows = [row for name in names for row in self._rows(name)]
-        return pa.Table.from_pylist(rows, schema=_TABLE_SCHEMA)
+        schema = pa.schema(
+            [
+                ("name", pa.string()),
+                ("version", pa.int64()),
+                ("aliases", pa.string()),
+                ("signals", pa.string()),
+                ("correlation", pa.float64()),
+                ("rmse_deg", pa.float64()),
+                ("error_mean_deg", pa.float64()),
+                ("error_std_deg", pa.float64()),
+                ("cohort", pa.string()),
+                ("drives", pa.int64()),
+                ("rows", pa.int64()),
+                ("published_at", pa.timestamp("us", tz="UTC")),
+                ("sha256", pa.string()),
+            ]
+        )
+        return pa.Table.from_pylist(rows, schema=schema)
 
     def _rows(self, name: str) -> list[Mapping[str, Any]]:
         moves = self.history(name).moves()
@@ -468,25 +486,6 @@ class Registry:
 
     def _versions(self, name: str) -> DocumentFolder:
         return DocumentFolder(self.root, f"{FOLDER}/{name}/versions")
-
-
-_TABLE_SCHEMA = pa.schema(
-    [
-        ("name", pa.string()),
-        ("version", pa.int64()),
-        ("aliases", pa.string()),
-        ("signals", pa.string()),
-        ("correlation", pa.float64()),
-        ("rmse_deg", pa.float64()),
-        ("error_mean_deg", pa.float64()),
-        ("error_std_deg", pa.float64()),
-        ("cohort", pa.string()),
-        ("drives", pa.int64()),
-        ("rows", pa.int64()),
-        ("published_at", pa.timestamp("us", tz="UTC")),
-        ("sha256", pa.string()),
-    ]
-)
 
 
 def _unknown(name: str, label: str, labels: Sequence[int | str]) -> QuestionError:
@@ -589,6 +588,8 @@ def _count_drives(
     registry: Registry, first: ModelVersion, second: ModelVersion
 ) -> tuple[int, int, int] | None:
     """Return the training drives of the first alone, the second alone, and both."""
+    import numpy as np  # noqa: PLC0415 - not for show
+
     if first.manifest.name != second.manifest.name:  # their hashes are salted differently
         return None
     a, b = (registry.trained_drives(version.manifest).salted for version in (first, second))
