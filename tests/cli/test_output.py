@@ -285,7 +285,7 @@ def test_an_evaluation_is_a_screen(shown: Shown) -> None:
     evaluation = Evaluation(content)
     text = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts()))).split())
     assert "nominal ekf 0.100 0.200 2.00" in text
-    assert "Every drive, and all estimators: --all" in text
+    assert "Every drive and estimator: --all" in text
     whole = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts(True)))).split())
     assert "nominal 0.70 0.200 (35%)" in whole
 
