@@ -1,6 +1,6 @@
--- The first of the Gram rows that cars counted whose drive is there already, and how it is called there: it has the same
--- name, or the same counts, under any name, car or day. Rows that vary too little (`is_eventful`) must be of the same car and
--- day. A drive that cars sent may come again with the rows of another feature set.
+-- The first Gram row from a car whose drive is stored already, and the stored name of the drive. A stored drive has the same
+-- name, or the same counts under any name, car or day. Rows with little variation (not `is_eventful`) must also have the same
+-- car and day. A drive from a car may have further rows of other feature sets.
 WITH stored AS (
     SELECT drive_id, feature_set, part, vehicle_id, day, signals, n, sums, products, starts_with(file, '{received}') AS received
     FROM read_parquet(getvariable('gram_files'), union_by_name => true)

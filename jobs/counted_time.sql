@@ -1,5 +1,4 @@
--- The first of the Gram rows that cars counted with which the drives of its car that began on a day have more rows (?) than
--- a day, together with those that are stored.
+-- The first Gram row from a car with which the drives of a day, including the stored ones, have more than ? rows: 24 hours.
 WITH stored AS (
     SELECT vehicle_id, day, feature_set, part, sum(n) AS stored_n
     FROM read_parquet(getvariable('gram_files'), union_by_name => true)

@@ -1,5 +1,5 @@
--- The first of the Gram rows that cars counted which no drive can have, and why; their sums are judged elsewhere.
--- `counted` are the rows, numbered from 1; `known` are the feature sets that cars can count.
+-- The first invalid Gram row from a car, and the reason; `find_impossible` checks sums and products.
+-- `counted` contains the rows, numbered from 1; `known` contains the feature sets that cars can compute.
 WITH named AS (
     SELECT *, CASE WHEN signals = '' THEN [] ELSE string_split(signals, ',') END AS names
     FROM counted
