@@ -68,7 +68,7 @@ def fleet_slip(threads: int) -> Fit:
     def run(paths: list[str]) -> Coefficients:
         logged = pq.read_schema(paths[0]).names
         absent = [name for name in SIGNALS.stored_columns if name not in logged]
-        statement = gram_statement(CATALOG, whole=True, absent=absent)
+        statement = gram_statement(CATALOG, complete=True, absent=absent)
         database = duckdb.connect(config={"threads": threads})
         total = Gram.zero(SIGNALS.gram_signals)
         for first in range(0, len(paths), FILES_PER_QUERY):

@@ -56,7 +56,7 @@ def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
 
 def job_statement(warehouse: Warehouse) -> str:
     """Return the statement with which the Gram job reads the logs."""
-    return gram_statement(CATALOG, whole=True, absent=absent_from(warehouse))
+    return gram_statement(CATALOG, complete=True, absent=absent_from(warehouse))
 
 
 def gram_query(warehouse: Warehouse, threads: int) -> None:

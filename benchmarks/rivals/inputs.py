@@ -60,7 +60,7 @@ class Inputs:
             if one is None:
                 scales.setdefault(term.signal, scale)
                 continue
-            for part in one.parts:
+            for part in one.components:
                 if part not in definitions.values():
                     behind = f"{part.of}_{part.over or 'now'}_{part.ticks}"  # a gate only
                     if behind in scales:

@@ -32,7 +32,8 @@ def root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Path:
     shutil.copytree(smoke_root, folder)
     answer(folder, "publish", "plain", "--cohort", FASTER)
     fleet = fleet_slip.open(folder)
-    options = {"order": "ax,ay,yaw_rate", "ranking": "forward", "folds": 4, "intercept": False}
+    options: dict[str, Any] = {"order": "ax,ay,yaw_rate", "ranking": "forward", "folds": 4}
+    options["intercept"] = False
     fleet.models.publish("ranked", fleet.cohort(FASTER).select(**options))
     return folder
 
@@ -88,7 +89,13 @@ def test_a_saved_list_has_the_winner_of_its_selection(
 
 def test_options_of_earlier_versions_are_read_under_their_old_names(tmp_path: Path) -> None:
     registry = Registry(LocalFolder(tmp_path), CATALOG)
-    stored = {"nested": "ay,ax", "rank": "forward", "worth": "1deg", "most": 3, "by": "day"}
+    stored: dict[str, bool | int | str] = {
+        "nested": "ay,ax",
+        "rank": "forward",
+        "worth": "1deg",
+        "most": 3,
+        "by": "day",
+    }
     chosen = SelectedBy(
         model_list="nested", model="5", reason="best", config_sha256="0", options=stored
     )
