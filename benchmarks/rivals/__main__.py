@@ -104,7 +104,7 @@ def train(
     yield (
         manifest.name,
         Rival(
-            PublishedEstimate(SIGNALS, Predictor.of(SIGNALS, manifest)),
+            PublishedEstimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest)),
             8 * (len(manifest.terms) + 1),
         ),
     )

@@ -66,7 +66,7 @@ class FleetEvaluation:
         QuestionError
             If the predicate is invalid.
         """
-        from fleet_slip.models.score import cohort_of_rows, find_seen, score
+        from fleet_slip.models.score import cohort_of_rows, find_training_overlap, score
         from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
 
         version = self._models.get(model)
@@ -79,14 +79,16 @@ class FleetEvaluation:
             examined = screen_computed_drives(self.warehouse, predicate)
         rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
         with examined.explaining():
-            seen = find_seen(self.warehouse, self._models.registry, version.manifest, rows)
-            result = score(self.warehouse, version.manifest, rows if cohort else seen.others)
-        all_seen = seen.trained == seen.drives
+            overlap = find_training_overlap(
+                self.warehouse, self._models.registry, version.manifest, rows
+            )
+            result = score(self.warehouse, version.manifest, rows if cohort else overlap.unseen)
+        all_seen = overlap.trained == overlap.drives
         return replace(
             result,
-            drives=seen.drives,
-            drives_trained=seen.trained,
-            drives_left_out=0 if cohort or all_seen else seen.trained,
+            drives=overlap.drives,
+            drives_trained=overlap.trained,
+            drives_left_out=0 if cohort or all_seen else overlap.trained,
             examined=str(examined),
             model=version.reference,
             cohort=predicate,

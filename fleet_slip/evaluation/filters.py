@@ -120,7 +120,7 @@ class TrainedModels:
                 },
             )
         bank[version.reference] = (
-            PublishedEstimate(signals, Predictor.of(signals, manifest)),
+            PublishedEstimate(signals, Predictor.from_manifest(signals, manifest)),
             {
                 **common,
                 "published": version.reference,

@@ -212,7 +212,7 @@ class Learner:
         """Train without held-out segments; return the chosen columns and the model."""
         selection = self.choose(held_out, prior)
         manifest = with_straight_intercept(self.warehouse, manifest_of(selection, "left_out"))
-        return [*selection.winner.model.signals], Predictor.of(
+        return [*selection.winner.model.signals], Predictor.from_manifest(
             self.warehouse.catalog.signals, manifest
         )
 

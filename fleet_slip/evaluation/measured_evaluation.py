@@ -64,7 +64,7 @@ from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.publish import recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
-from fleet_slip.models.score import calibrated_cars, find_seen
+from fleet_slip.models.score import calibrated_cars, find_training_overlap
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
@@ -232,8 +232,11 @@ class Competition:
         for version in versions:
             manifest, name = version.manifest, version.reference
             is_label_free = manifest.learned_from is not None
-            if is_label_free or not find_seen(warehouse, registry, manifest, predicate).trained:
-                published[name] = Predictor.of(catalog.signals, manifest)
+            if (
+                is_label_free
+                or not find_training_overlap(warehouse, registry, manifest, predicate).trained
+            ):
+                published[name] = Predictor.from_manifest(catalog.signals, manifest)
             else:
                 recipes[name] = CHOSEN, recipe_of(version)[0]
         learners = {

@@ -46,7 +46,9 @@ def train_competitors(
     bank: EstimatorBank = {}
     for models in trained:
         bank |= models.bank()
-    with_mass = "mass_kg" in Predictor.of(warehouse.catalog.signals, one_car.manifest).plan.facts
+    with_mass = (
+        "mass_kg" in Predictor.from_manifest(warehouse.catalog.signals, one_car.manifest).plan.facts
+    )
     drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     car = load_scenario("nominal", warehouse.configs).car
     return trained, bank | filter_bank(drives, car, executor)

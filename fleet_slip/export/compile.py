@@ -26,7 +26,7 @@ def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
     contradict each other.
     """
     # The kernel compiles the same definitions, and raises for those that it cannot compute.
-    _ = Predictor.of(catalog.signals, manifest).plan.program
+    _ = Predictor.from_manifest(catalog.signals, manifest).plan.program
     return write_program(catalog, manifest)
 
 
@@ -80,7 +80,7 @@ def angles_by_kernel(
     samples: Sequence[Sample],
 ) -> list[int | None]:
     """Compute the angle of each tick from the columns of the kernel, in exact integers."""
-    predictor = Predictor.of(signals, manifest)
+    predictor = Predictor.from_manifest(signals, manifest)
     drive = drive_counts(program, predictor, car, samples)
     return angles_of_columns(program, compute_columns(predictor.plan, drive))
 

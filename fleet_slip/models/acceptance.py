@@ -25,7 +25,7 @@ from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
-from fleet_slip.models.search import searching
+from fleet_slip.models.search import search_procedure
 from fleet_slip.models.select import Selection
 from fleet_slip.regression.choice import RmseGap, Tolerance, compare_paired
 from fleet_slip.regression.figures import error_sums
@@ -225,7 +225,7 @@ def prepare_evaluation(
     by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
     intercept = selection.intercept
     if search is not None:
-        procedure = searching(label, search, len(winner.signals), intercept=intercept)
+        procedure = search_procedure(label, search, len(winner.signals), intercept=intercept)
     else:
         procedure = least_squares(inputs, label, intercept=intercept)
     tolerance = load_thresholds(catalog.configs).tolerance

@@ -44,7 +44,7 @@ class Predictor:
     scales: tuple[float, ...]
 
     @classmethod
-    def of(cls, signals: SignalCatalog, manifest: Manifest) -> "Predictor":
+    def from_manifest(cls, signals: SignalCatalog, manifest: Manifest) -> "Predictor":
         """Return what a manifest publishes, by features of its own.
 
         Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
@@ -186,7 +186,7 @@ def predict(
     signals: SignalCatalog, manifest: Manifest, frame: Any, predictor: Predictor | None = None
 ) -> Any:
     """Return the angle of each row in rad; see `ModelVersion.predict`."""
-    predictor = predictor or Predictor.of(signals, manifest)
+    predictor = predictor or Predictor.from_manifest(signals, manifest)
     opened, plan = open_frame(frame), predictor.plan
     if not plan.signals:
         raise DataError(f"the columns of {manifest.name} use no signal. Publish it again.")

@@ -256,7 +256,7 @@ class ModelVersion:
     def _predictor(self) -> "Predictor":
         from fleet_slip.models.predict import Predictor  # noqa: PLC0415 - numba, not for show
 
-        return Predictor.of(self.catalog.signals, self.manifest)
+        return Predictor.from_manifest(self.catalog.signals, self.manifest)
 
 
 _IDENTIFIER = re.compile(IDENTIFIER_PATTERN)

@@ -410,14 +410,14 @@ class SelectionPlan:
     """A validated selection: what is compared, on which feature set and folds.
 
     Attributes:
-        asked: the request as it was given.
+        original: the request as it was given.
         request: the request with the name of its model list, and the label of the list.
         model_list: the list, None for an order or a search of the request.
         searches: of the request, else of the list.
         tolerance, intercept: of the request, else of the list.
     """
 
-    asked: SelectionRequest
+    original: SelectionRequest
     request: SelectionRequest
     model_list: ModelList | None
     searches: tuple[Search, ...]
@@ -427,10 +427,10 @@ class SelectionPlan:
     intercept: bool
 
     @classmethod
-    def of(cls, catalog: Catalog, asked: SelectionRequest) -> "SelectionPlan":
+    def of(cls, catalog: Catalog, original: SelectionRequest) -> "SelectionPlan":
         """Validate a request. Raises `UsageError`, `QuestionError` and `ConfigError`."""
-        asked.check()
-        request = replace(asked, models=asked.models or _default_list(asked))
+        original.check()
+        request = replace(original, models=original.models or _default_list(original))
         model_list = load_model_list(catalog, request.models) if request.models else None
         if model_list and model_list.label and not request.label:
             request = replace(request, label=model_list.label)
@@ -440,7 +440,7 @@ class SelectionPlan:
         folds = model_list.folds if model_list else Folding()
         feature_set = _feature_set(catalog, request, model_list)
         return cls(
-            asked=asked,
+            original=original,
             request=request,
             model_list=model_list,
             searches=_searches(catalog, request, model_list, feature_set),
@@ -453,7 +453,7 @@ class SelectionPlan:
     @property
     def is_default(self) -> bool:
         """True if the default model list is compared because the request names none."""
-        return self.asked.models is None and self.request.models == DEFAULT_MODELS
+        return self.original.models is None and self.request.models == DEFAULT_MODELS
 
     @property
     def is_nested(self) -> bool:
@@ -469,8 +469,8 @@ class SelectionPlan:
 
     def with_logged_signals(self, catalog: Catalog) -> "SelectionPlan":
         """Return the same plan with the list of logged signals."""
-        plan = SelectionPlan.of(catalog, replace(self.asked, models=LOGGED_MODELS))
-        return replace(plan, asked=self.asked)
+        plan = SelectionPlan.of(catalog, replace(self.original, models=LOGGED_MODELS))
+        return replace(plan, original=self.original)
 
     def compared_list(self, cohort: "Cohort") -> ModelList:
         """Return all that is compared as a model list, which makes the same selection again."""

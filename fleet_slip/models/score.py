@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
@@ -19,7 +20,7 @@ from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
-from fleet_slip.models.summary import remark_without_information
+from fleet_slip.models.summary import remark_skipped_rows
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import sql_text
@@ -53,19 +54,19 @@ class Score(Answer):
     error_p99_deg: float
     error_max_deg: float
     drives: int = 0
-    """Of the cohort, where they were counted; `drives_trained` of them made the model."""
+    """Drives of the cohort; the model was trained on `drives_trained` of them."""
     drives_trained: int = 0
     drives_left_out: int = 0
-    """How many of these are not scored, since no cohort was asked for."""
+    """Training drives that are not scored, since no cohort is named."""
     rows_without: int = 0
-    """Of the cohort, that tell nothing of the model: the label or a signal is missing."""
+    """Rows of the cohort without the label or a signal of the model."""
     examined: str = ""
-    """Which drives were left out for faulty sensors, as a sentence."""
+    """Drives that are left out for faulty sensors, as a sentence."""
     model: str = ""
     cohort: str = ""
 
     def parts(self) -> Iterator[Part]:
-        """Return the figures, and which drives and rows they are not of."""
+        """Return the figures, and the drives and rows that are left out."""
         if self.examined:
             yield Remark(self.examined)
         yield TextTable(
@@ -77,14 +78,14 @@ class Score(Answer):
                 if name.startswith(("error", "rmse", "correlation")) and value is not None
             ),
         )
-        yield from remark_without_information(self.rows_without, self.rows + self.rows_without)
+        yield from remark_skipped_rows(self.rows_without, self.rows + self.rows_without)
         yield from self._trained()
 
     def _trained(self) -> Iterator[Remark]:
-        """Yield which drives made the model: on these its error is that of a fit."""
+        """Yield how many drives trained the model: there its error is a training error."""
         if self.drives_left_out:
-            left = pluralize(self.drives_left_out, "drive")
-            yield Remark(f"left out: {left} of {self.drives:,} that {self.model} was trained on.")
+            count = pluralize(self.drives_left_out, "drive")
+            yield Remark(f"left out: {count} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
@@ -136,7 +137,7 @@ def _estimate_rows(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return estimate and label in rad of the rows of a cohort that have both, and of how many."""
     signals = warehouse.catalog.signals
-    predictor = Predictor.of(signals, manifest)
+    predictor = Predictor.from_manifest(signals, manifest)
     label = manifest.label.signal
     needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
@@ -146,7 +147,7 @@ def _estimate_rows(
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
-    asked = 0
+    total = 0
     unit = float(warehouse.catalog.input_scales[label])
     with (
         connect_tables(warehouse, text) as database,
@@ -159,12 +160,14 @@ def _estimate_rows(
             estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
             truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
-            asked += int(chosen.sum())
-            given = chosen & np.isfinite(estimate) & np.isfinite(truth)
-            estimates.append(estimate[given])
-            truths.append(truth[given])
-    estimate_rad, truth_rad = (np.concatenate([*one, np.empty(0)]) for one in (estimates, truths))
-    return estimate_rad, truth_rad, asked
+            total += int(chosen.sum())
+            complete = chosen & np.isfinite(estimate) & np.isfinite(truth)
+            estimates.append(estimate[complete])
+            truths.append(truth[complete])
+    estimate_rad, truth_rad = (
+        np.concatenate([*parts, np.empty(0)]) for parts in (estimates, truths)
+    )
+    return estimate_rad, truth_rad, total
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:
@@ -193,22 +196,22 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Scor
     )
 
 
-# Which drives of a cohort a version was trained on, and those that it was not.
+# Drives of a cohort that are in the training set of a version, and the others.
 
 
 @dataclass(frozen=True)
-class SeenDrives:
-    """A cohort's drives, those that made a version, the predicate of others."""
+class TrainingOverlap:
+    """Numbers of drives of a cohort and of training drives in it; predicate of the unseen ones."""
 
     drives: int
     trained: int
-    others: Predicate
+    unseen: Predicate
 
 
-def find_seen(
+def find_training_overlap(
     warehouse: Warehouse, registry: Registry, manifest: Manifest, predicate: str | Predicate
-) -> SeenDrives:
-    """Return which drives with a log of a cohort of rows made a version. Raises as `score`."""
+) -> TrainingOverlap:
+    """Find the training drives of a version in a cohort of rows with logs. Raises as `score`."""
     signals = warehouse.catalog.signals
     cohort = cohort_of_rows(signals, predicate)
     view = "log" if cohort.columns - set(drive_columns(signals)) else "drives"
@@ -216,10 +219,10 @@ def find_seen(
     query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, guarded_query(database, cohort):
         names = database.sql(query).to_arrow_table()["drive_id"]
-    seen = registry.trained_drives(manifest).among(hash_names(names))
-    if not seen.any() or seen.all():
-        return SeenDrives(len(names), int(seen.sum()), cohort)
-    kept = [name for name, old in zip(names.to_pylist(), seen, strict=True) if not old]
-    listed = ", ".join(map(sql_text, kept))
-    others = Predicate(cohort.text, f"({cohort.sql} AND drive_id IN ({listed}))")
-    return SeenDrives(len(names), int(seen.sum()), others)
+    is_trained = registry.trained_drives(manifest).among(hash_names(names))
+    trained = int(is_trained.sum())
+    if trained in (0, len(names)):
+        return TrainingOverlap(len(names), trained, cohort)
+    unseen = ", ".join(map(sql_text, names.filter(pa.array(~is_trained)).to_pylist()))
+    predicate = Predicate(cohort.text, f"({cohort.sql} AND drive_id IN ({unseen}))")
+    return TrainingOverlap(len(names), trained, predicate)

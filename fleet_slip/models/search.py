@@ -1,4 +1,4 @@
-"""Which signals of a set: the nested models of a ranking, or the best subset of every size."""
+"""Searches for inputs: nested models of a ranking, best subsets, and stepwise searches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,14 +46,14 @@ ALL_SUBSETS = "all-subsets"
 
 @dataclass(frozen=True)
 class SearchChoice(Record):
-    """How a number of signals was chosen.
+    """Choice of a number of signals.
 
     Attributes:
         rule: ranking (or `ALL_SUBSETS`) and criterion.
-        evidence: what the criterion looked at.
+        evidence: independent evidence behind the criterion.
         nested: the ranked signals with the criterion's values; None for all subsets.
-        subsets: the best subsets of size 0, 1, ..., of which each criterion picks a size.
-        honest: figures of the choice, made again in every training fold; None of two folds.
+        subsets: the best subsets of size 0, 1, ...; each criterion picks a size.
+        honest: figures of the choice, repeated in every training fold; None for two folds.
     """
 
     DOCUMENT = (
@@ -83,8 +83,8 @@ def require_criterion(name: str) -> str:
     if name == "cv":
         return CROSS_VALIDATION
     if name not in (*CRITERIA, CROSS_VALIDATION):
-        known = ", ".join(("cv", *CRITERIA))
-        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {known}.")
+        criteria = ", ".join(("cv", *CRITERIA))
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {criteria}.")
     return name
 
 
@@ -95,7 +95,7 @@ def select_inputs(
     rule: Rule,
     request: SelectionRequest,
 ) -> SearchResult:
-    """Choose a nested model by the rule's ranking, or of the best subsets, on the drives that fit.
+    """Choose a nested model of a ranking, or one of the best subsets, on complete drives.
 
     Raises `DataError` without drives, for dependent inputs or if none is kept, and `QuestionError`
     for an unknown rule.
@@ -131,7 +131,7 @@ def select_inputs(
 def try_distances(
     cohort: Cohort, inputs: Sequence[str], folding: Folding, request: SelectionRequest
 ) -> NestedDistances | str:
-    """Return the distances of the nested models of an order as given, or why there are none."""
+    """Return the distances of the nested models of an order, or why there are none."""
     try:
         unit, intercept = request.cluster, request.intercept
         training, _ = drive_folds(cohort, inputs, folding, cluster=unit, intercept=intercept)
@@ -141,6 +141,7 @@ def try_distances(
 
 
 def _winner(models: Sequence[CrossValidation], size: int, choice: SearchChoice) -> Winner:
+    """Return the model of the size that a criterion keeps. Raises `DataError` for size 0."""
     rule = choice.rule
     if size == 0:
         raise DataError(
@@ -158,14 +159,14 @@ def _winner(models: Sequence[CrossValidation], size: int, choice: SearchChoice) 
 
 @dataclass(frozen=True)
 class SearchedModels:
-    """The models of a search, of sizes 1, 2, ..., cross-validated with the search made again."""
+    """Models of a search, of sizes 1, 2, ...; each training fold repeated the search."""
 
     search: Search
     inputs: tuple[str, ...]
     models: tuple[CrossValidation, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
+        """Return the content of a JSON document."""
         main = self.search.as_dict(include={"method", "max_features", "rule"})
         options = self.search.as_dict(exclude_defaults=True, exclude={"inputs"})
         return {**main, **options, "inputs": len(self.inputs), "sizes": len(self.models)}
@@ -187,12 +188,12 @@ def search_models(
     folds = cohort.complete_cases(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
-        seen = gram if intercept else gram.about_origin()
-        sets = stepwise_order(seen, inputs, label, search.method, search.max_features)
-        nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
-        if sets and nested:
-            return nested_fits(seen, sets[-1], label)[1:]
-        return [fit(seen, chosen, label) for chosen in sets]
+        moments = gram if intercept else gram.about_origin()
+        sets = stepwise_order(moments, inputs, label, search.method, search.max_features)
+        is_nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
+        if sets and is_nested:
+            return nested_fits(moments, sets[-1], label)[1:]
+        return [fit(moments, signals, label) for signals in sets]
 
     chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
@@ -209,13 +210,15 @@ def search_models(
     return SearchedModels(search, tuple(inputs), models)
 
 
-def searching(label: str, found: SearchedModels, size: int, *, intercept: bool) -> Procedure:
-    """Return what searches again in given rows for so many columns, or the most that they allow."""
+def search_procedure(
+    label: str, searched: SearchedModels, size: int, *, intercept: bool
+) -> Procedure:
+    """Return a procedure that repeats a search for at most `size` columns."""
 
     def procedure(gram: Gram) -> LinearModel:
-        seen = gram if intercept else gram.about_origin()
-        sets = stepwise_order(seen, found.inputs, label, found.search.method, size)
-        return fit(seen, sets[-1] if sets else (), label).model
+        moments = gram if intercept else gram.about_origin()
+        sets = stepwise_order(moments, searched.inputs, label, searched.search.method, size)
+        return fit(moments, sets[-1] if sets else (), label).model
 
     return procedure
 
@@ -231,6 +234,6 @@ def choose_by(
     best = max(models, key=lambda model: model.sums.signed_r_squared)
     reason = (
         f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "
-        f"which is the rule of its list; the columns of each size were chosen again in every fold."
+        f"which is the rule of its list; every fold repeated the search."
     )
     return Winner(best, best, reason)

@@ -267,7 +267,7 @@ def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
         inputs = inputs_of(cohort, plan.request.order or WHOLE_SET)
         distances = try_distances(cohort, inputs, plan.folds, plan.request)
         selection = replace(selection, distances=distances)
-    return replace(selection, weighted=weighted, full=full, request=plan.asked)
+    return replace(selection, weighted=weighted, full=full, request=plan.original)
 
 
 def _downweight_outliers(

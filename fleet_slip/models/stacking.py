@@ -51,7 +51,7 @@ def ensure_rows(
     if catalog.stacked_sets.get(plan.feature_set):
         model = _first_stage_model(warehouse, plan, cohort, predicate)
         name = f"{plan.feature_set}_{model.digest}"
-        plan = replace(plan, feature_set=name, asked=replace(plan.asked, features=name))
+        plan = replace(plan, feature_set=name, original=replace(plan.original, features=name))
     if catalog.first_stage_model(plan.feature_set):
         reason = "they contain the first-stage estimate"
         ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)

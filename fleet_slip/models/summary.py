@@ -19,32 +19,32 @@ if TYPE_CHECKING:
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 
-TELLING = 0.01
-"""Part of a cohort's rows without the label or a signal that is worth a remark."""
+MIN_REPORTED_SHARE = 0.01
+"""Minimum share of rows without the label or a signal that is reported."""
 
 
-def remark_without_information(rows: int, of: int) -> Iterator[Remark]:
-    """Yield how many rows of a cohort told nothing, if they are more than windows begin with."""
-    if rows > TELLING * of:
+def remark_skipped_rows(rows: int, total: int) -> Iterator[Remark]:
+    """Yield how many rows lack the label or a signal, if more than the first rows of windows."""
+    if rows > MIN_REPORTED_SHARE * total:
         yield Remark(
-            f"{rows:,} of {pluralize(of, 'row')} skipped: the label or a signal of the model is "
+            f"{rows:,} of {pluralize(total, 'row')} skipped: the label or a signal of the model is "
             "null."
         )
 
 
 def outlier_remarks(drives: Mapping[str, "DownweightedDrive"]) -> Iterator[Remark]:
-    """Yield which drives `robust` counts less, and why."""
-    for drive, one in drives.items():
-        yield Remark(f"{drive}: {one.reason}.")
+    """Yield the drives that `robust` down-weights, with the reason."""
+    for name, drive in drives.items():
+        yield Remark(f"{name}: {drive.reason}.")
 
 
 MANY_SIGNALS = 30
-"""Of more, a table names families."""
+"""A table names families if a model has more signals than this."""
 
 DISTANCES = "contribution A|D to full|expected D"
 
 BEST = 10
-"""So many models are shown unless all are asked for."""
+"""Number of models in a table without --all."""
 CONDITION_WIDTH = 120
 
 
@@ -74,9 +74,11 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
     if isinstance(selection.distances, str):
         yield Remark(f"distances of the nested models unknown: {selection.distances}")
     for name, reason in selection.skipped.items():
-        one, *others = reason.split("; ")
-        more = f"; and {pluralize(len(others), 'relation')} more, see --json." if others else ""
-        yield Remark(f"Skipped model {name}: {one}{more}")
+        first, *relations = reason.split("; ")
+        more = pluralize(len(relations), "relation")
+        more = f"; and {more} more, see --json." if relations else ""
+        noun = "" if name.endswith(")") else "model "
+        yield Remark(f"Skipped {noun}{name}: {first}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
             "with the whole selection repeated inside every fold: correlation "
@@ -92,14 +94,14 @@ def _shortened(predicate: str, everything: bool) -> str:
 
 
 def _models(selection: "Selection", everything: bool) -> TextTable:
-    """Return a table of the models, of many the best; without signals where a table above has them.
+    """Return a table of the models, or of the best; without signals if a table above has them.
 
-    A search changes some columns from size to size: how many there are stands here.
+    For models of a search it has the number of columns: these change from size to size.
     """
     cohort, models, where = selection.cohort, selection.models, selection.cohort.predicate.text
     ranked = sorted(models, key=lambda model: model.pooled.rmse)
-    shown = models if everything else [one for one in models if one in ranked[:BEST]]
-    found = [] if everything else [model for one in selection.searched for model in one.models]
+    shown = models if everything else [model for model in models if model in ranked[:BEST]]
+    searched = [] if everything else [m for s in selection.searched for m in s.models]
     title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
     title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything)}"
     title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.folds.by}"
@@ -118,19 +120,19 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
         )
     rows = (
         {
-            "model": one,
-            "pooled": one.pooled,
-            "signals": pluralize(len(one.signals), "column")
-            if one in found
-            else in_families(cohort.catalog, one.signals),
+            "model": model,
+            "pooled": model.pooled,
+            "signals": pluralize(len(model.signals), "column")
+            if model in searched
+            else in_families(cohort.catalog, model.signals),
         }
-        for one in shown
+        for model in shown
     )
     return TextTable(title, header, rows, row, text_columns=1 + listed)
 
 
 def _label_noise(selection: "Selection") -> Remark:
-    """Return how much of the errors is noise of the label they are measured against."""
+    """Return the share of the label's noise in the errors."""
     noise = selection.label_noise_deg
     if noise is None:
         return Remark("label noise unknown: it is part of every RMSE here.")
@@ -140,17 +142,17 @@ def _label_noise(selection: "Selection") -> Remark:
     )
 
 
-def _without_label(told: "CourseLabelQuality") -> Iterator[Remark]:
-    """Yield what changes of the course tell of the angle, and what they do not."""
-    over = ", ".join(f"{one:g}" for one in told.change_s)
+def _without_label(quality: "CourseLabelQuality") -> Iterator[Remark]:
+    """Yield the quality of a label from course changes, and its limits."""
+    over = ", ".join(f"{seconds:g}" for seconds in quality.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
-    if told.noise_deg is not None:
+    if quality.noise_deg is not None:
         figures += (
-            f", whose noise is {told.noise_deg:.4f} deg on straights; the angle's own error over "
-            f"these times is at most {told.angle_at_most_deg:.3f} deg"
+            f", whose noise is {quality.noise_deg:.4f} deg on straights; the angle's own error "
+            f"over these times is at most {quality.angle_at_most_deg:.3f} deg"
         )
     yield Remark(f"{figures}.")
-    if (side := told.one_way) is not None:
+    if (side := quality.one_way) is not None:
         yield Remark(
             f"nearly all turns are to the {side}: ay and its square cannot be separated, nor can "
             "offsets. Add drives with turns to the other side."
@@ -163,7 +165,7 @@ def _without_label(told: "CourseLabelQuality") -> Iterator[Remark]:
 
 def _left_out(selection: "Selection") -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
-    yield from remark_without_information(selection.rows_without, selection.cohort.rows)
+    yield from remark_skipped_rows(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_onboard_with():
         without = pluralize(without_log, "drive")
         yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
@@ -178,36 +180,40 @@ def _left_out(selection: "Selection") -> Iterator[Remark]:
 
 
 def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
-    """Return the names of signals; of more than `MANY_SIGNALS`, whole families by their own."""
+    """Return the names of signals, or of their families if there are many."""
     if len(signals) <= MANY_SIGNALS:
         return " ".join(signals)
     families = catalog.families(signals).items()
-    told = (f"{name}({count})" if count else name for name, count in families)
-    return f"{len(signals)}: " + " ".join(told)
+    names = (f"{name}({count})" if count else name for name, count in families)
+    return f"{len(signals)}: " + " ".join(names)
 
 
-def _worth(evidence: Evidence) -> str:
+def _evidence_text(evidence: Evidence) -> str:
+    """Return the unit and the effective number of rows of evidence."""
     return f"with {evidence.kind} as independent observations: {evidence.rows:,.0f} effective rows"
 
 
-def _distances(found: NestedDistances) -> Iterator[Part]:
+def _distances(distances: NestedDistances) -> Iterator[Part]:
+    """Yield the distances of nested models."""
     yield TextTable(
-        f"distance D of equation (2) by the number of signals; {_worth(found.evidence)}",
+        "distance D of equation (2) by the number of signals; "
+        f"{_evidence_text(distances.evidence)}",
         f"|added|{DISTANCES}",
-        _distance_rows(found.order, found.evidence),
+        _distance_rows(distances.order, distances.evidence),
         text_columns=2,
     )
-    yield f"without any signal: RMSE {found.null.pooled.rmse_deg:.4f} deg.\n"
+    yield f"without any signal: RMSE {distances.null.pooled.rmse_deg:.4f} deg.\n"
 
 
 def _choice(choice: "SearchChoice") -> Iterator[Part]:
-    worth = _worth(choice.evidence)
+    """Yield the tables of an order, or of best subsets."""
+    evidence = _evidence_text(choice.evidence)
     if (nested := choice.nested) is not None:
         by_folds = choice.rule.criterion == CROSS_VALIDATION
         criterion = "minus correlation" if by_folds else choice.rule.criterion
         rows = zip(_distance_rows(nested.order, nested.evidence), nested.values, strict=True)
         yield TextTable(
-            f"order by {choice.rule.ranking}; {worth}",
+            f"order by {choice.rule.ranking}; {evidence}",
             f"|added|{DISTANCES}|{criterion}",
             (
                 [*line, f"{value:,.4f}{' <' if j == nested.size else '  '}"]
@@ -225,7 +231,7 @@ def _choice(choice: "SearchChoice") -> Iterator[Part]:
             for one in choice.subsets
         )
         yield TextTable(
-            f"best subset of every size; {worth}",
+            f"best subset of every size; {evidence}",
             "size|signals|picked by|R squared|gap to second",
             rows_of_sizes,
             "{best.size}|{best.model.signals}|{picked_by}|{best.r_squared:.6f}|{gap:.2g}",

@@ -24,7 +24,10 @@ from tests.support.catalog import CATALOG, SIGNALS
 @pytest.mark.parametrize("name", MODELS)
 def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) -> None:
     manifest = model_of(MODELS[name], Fraction(-1, 700), name)
-    program, predictor = compile_program(CATALOG, manifest), Predictor.of(SIGNALS, manifest)
+    program, predictor = (
+        compile_program(CATALOG, manifest),
+        Predictor.from_manifest(SIGNALS, manifest),
+    )
     version = ModelVersion(1, manifest, "0" * 64, CATALOG)
     samples = [hostile_drive(program, 250, seed) for seed in range(len(CARS))]
     expected = np.array(
@@ -47,7 +50,10 @@ def test_a_feature_of_one_value_stands_beside_others(monkeypatch: pytest.MonkeyP
     always = Definition(of="always", sql="CASE WHEN ay >= 0 THEN -(1000) END")
     monkeypatch.setitem(DEFINITIONS, "always", always)
     manifest = model_of({"always": Fraction(1, 7), "mean_3": Fraction(1, 9)})
-    program, predictor = compile_program(CATALOG, manifest), Predictor.of(SIGNALS, manifest)
+    program, predictor = (
+        compile_program(CATALOG, manifest),
+        Predictor.from_manifest(SIGNALS, manifest),
+    )
     samples = hostile_drive(program, 50, 1)
     session = open_session(ModelVersion(1, manifest, "0" * 64, CATALOG), "float64")
     found = run_drives(session, program, CARS[:1], in_si(program, samples, "float64")[None])[0]

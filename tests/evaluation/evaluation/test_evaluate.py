@@ -167,7 +167,7 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives(SIGNALS, [load_scenario("nominal", SHIPPED_CONFIGS)])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
-    estimate = PublishedEstimate(SIGNALS, Predictor.of(SIGNALS, manifest))(drive)
+    estimate = PublishedEstimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest))(drive)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 

@@ -21,7 +21,7 @@ NUMBERS = {"yaw_rate_offset": -30, "speed_ratio": 2003, "understeer": 55}
 def drive_of(rows: int, seed: int) -> DriveCounts:
     """Counts of ordinary sizes, some of them missing, with holes between ticks."""
     random = np.random.default_rng(seed)
-    signals = Predictor.of(SIGNALS, MANIFEST).plan.signals
+    signals = Predictor.from_manifest(SIGNALS, MANIFEST).plan.signals
     counts = {name: random.integers(900, 1800, rows).astype(np.int16) for name in signals}
     present = {name: random.random(rows) < 0.999 for name in signals}
     facts = {"mass_kg": 1320.5 + seed, "vehicle_model": "suv" if seed % 2 else "van"}
@@ -31,7 +31,7 @@ def drive_of(rows: int, seed: int) -> DriveCounts:
 
 def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
     """One workspace for drives of several lengths, against a dot product over all columns."""
-    predictor = Predictor.of(SIGNALS, MANIFEST)
+    predictor = Predictor.from_manifest(SIGNALS, MANIFEST)
     workspace = Workspace(predictor.plan)
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
@@ -67,7 +67,7 @@ def frame_of(drive: DriveCounts, name: str) -> pl.DataFrame:
 def test_drives_that_are_mixed_have_the_angles_of_each_alone() -> None:
     version = ModelVersion(1, MANIFEST, "0" * 64, CATALOG)
     drives = {f"drive {seed}": drive_of(rows, seed) for rows, seed in ((1300, 1), (40, 2), (9, 5))}
-    predictor = Predictor.of(SIGNALS, MANIFEST)
+    predictor = Predictor.from_manifest(SIGNALS, MANIFEST)
     expected = np.concatenate([predictor(one) for one in drives.values()])
     together = pl.concat([frame_of(one, name) for name, one in drives.items()])
     found = version.predict(together).to_numpy()
