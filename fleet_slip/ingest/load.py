@@ -345,8 +345,8 @@ def _check_longest(
             mapping.signal_catalog, signals, from_velocities=from_velocities
         ):
             faults.setdefault((fault.kind, fault.signals), []).append((report, fault))
-    for (report, fault), *others in faults.values():
-        also = f", as in {pluralize(len(others), 'other file')}" if others else ""
+    for (report, fault), *repeats in faults.values():
+        also = f", as in {pluralize(len(repeats), 'other file')}" if repeats else ""
         report.suspicions += (dataclasses.replace(fault, figure=fault.figure + also),)
 
 

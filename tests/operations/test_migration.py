@@ -75,7 +75,7 @@ def test_a_new_signal_is_null_in_old_files(warehouse: Warehouse, use: Use) -> No
     before = ask(warehouse.root, "SELECT sums, products FROM grams")
     now = use(NEW_SIGNAL)
     assert ask(now, "SELECT count(*), count(tyre_pressure_pa) FROM log") == [(40, 0)]
-    with pytest.raises(RefusedError, match=r"has not: tyre_pressure.*fleet-slip migrate"):
+    with pytest.raises(RefusedError, match=r"lacks columns .*: tyre_pressure.*fleet-slip migrate"):
         land(now, "new", new_rows(now))
     report = migrate(now)
     assert report.added == ("tyre_pressure",)
