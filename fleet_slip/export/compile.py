@@ -41,7 +41,7 @@ Sample = tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
-class Check:
+class TestVector:
     """A synthetic drive, and the angle at each tick."""
 
     name: str
@@ -57,7 +57,9 @@ class Check:
     """Counts of the program's angle at each tick; None: no angle."""
 
 
-def make_checks(signals: SignalCatalog, manifest: Manifest, program: Program) -> tuple[Check, ...]:
+def make_checks(
+    signals: SignalCatalog, manifest: Manifest, program: Program
+) -> tuple[TestVector, ...]:
     """Return a smooth drive and adversarial ones, with the angle at every tick."""
     hostile = _hostile_car(program)
     drives: dict[str, tuple[Car, Iterable[Sample]]] = {
@@ -127,11 +129,11 @@ def _check(
     name: str,
     car: Car,
     samples: Iterable[Sample],
-) -> Check:
+) -> TestVector:
     ticks = tuple(samples)
     angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
     counts = car.fact_counts(program), car.number_counts(program)
-    return Check(name, car.facts, *counts, ticks, angles)
+    return TestVector(name, car.facts, *counts, ticks, angles)
 
 
 def _smooth(program: Program) -> Iterable[Sample]:
@@ -198,7 +200,7 @@ def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sampl
         )
 
 
-def checks_csv(program: Program, checks: Sequence[Check]) -> str:
+def checks_csv(program: Program, checks: Sequence[TestVector]) -> str:
     """Return a CSV file with a row for each tick: the columns of the SQL statement, and the angle.
 
     An empty cell is a missing value, or no angle.

@@ -14,7 +14,7 @@ from fleet_slip.columns.column_sql import PLAIN_SQL, SqlLayers, attribute_sql
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
-from fleet_slip.export.compile import Check, checks_csv, compile_program, make_checks
+from fleet_slip.export.compile import TestVector, checks_csv, compile_program, make_checks
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program, Target
@@ -36,7 +36,7 @@ class Subject:
 
     version: ModelVersion
     program: Program
-    checks: tuple[Check, ...]
+    checks: tuple[TestVector, ...]
     drives: bytes | None
     """Content of the file with the training drives' hashes; None: unknown."""
     with_gram: bool = False

@@ -21,7 +21,7 @@ from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.errors import ConfigError, StorageError, UsageError
-from fleet_slip.export.compile import Check
+from fleet_slip.export.compile import TestVector
 from fleet_slip.export.files import Subject, document_of, render
 from fleet_slip.export.program import Program
 from fleet_slip.models.manifest import Manifest
@@ -217,7 +217,7 @@ def _signature(mlflow: Any, program: Program) -> Any:
     return mlflow.models.ModelSignature(inputs=types.Schema(inputs), outputs=angle)
 
 
-def _example(program: Program, check: Check) -> Any:
+def _example(program: Program, check: TestVector) -> Any:
     """Return the first ticks of a check in SI units as a frame, for an unknown car."""
     import pandas as pd  # noqa: PLC0415 - optional package
 

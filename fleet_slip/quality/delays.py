@@ -40,7 +40,7 @@ MAX_STANDARD_ERRORS = 4.0
 
 
 @dataclass(frozen=True)
-class Delay:
+class SignalDelay:
     """How late a signal is by others, in s, with its standard error."""
 
     value_s: float
@@ -51,10 +51,10 @@ class Delay:
         return abs(self.value_s) > max(limit_s, MAX_STANDARD_ERRORS * self.error_s)
 
 
-NO_DELAY = Delay(0.0, 0.0)
+NO_DELAY = SignalDelay(0.0, 0.0)
 
 
-def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> Delay | None:
+def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> SignalDelay | None:
     """Return how late values are by inputs; None if the drive does not show it.
 
     `inputs` has the shape (n_inputs, n_ticks); `rows` are those where the inputs are valid.
@@ -83,7 +83,7 @@ def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> D
         return None
     lags_s = STEP_S * np.array(without, dtype=np.float64)
     error_s = math.sqrt((BLOCKS - 1) * float(np.mean((lags_s - lags_s.mean()) ** 2)))
-    return Delay(best * STEP_S, error_s)
+    return SignalDelay(best * STEP_S, error_s)
 
 
 def _averaged(values: FloatArray) -> FloatArray:
@@ -170,6 +170,6 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
     errors = sorted(delay.error_s for delay in delays.values())
     for name, delay in delays.items():
         # The reference itself has no error; that of the others' median stands for it.
-        late = Delay(delay.value_s - middle, max(delay.error_s, errors[len(errors) // 2]))
+        late = SignalDelay(delay.value_s - middle, max(delay.error_s, errors[len(errors) // 2]))
         if late.exceeds(SIGNAL_DELAY.high) and (name not in STEERING or late.value_s > 0):
             yield SIGNAL_DELAY.fault(*WITNESSES[name], delay_s=late.value_s, error_s=late.error_s)
