@@ -150,10 +150,12 @@ class _Builder:
                 return self._call("negative", [operand])
             case ast.UnaryOp(op=ast.UAdd(), operand=operand):
                 return self._step(operand)
-            case ast.BinOp(left=left, op=operator, right=right) if type(operator) in _OPERATORS:
-                return self._call(_OPERATORS[type(operator)], [left, right])
-            case ast.Call(func=ast.Name(id=("abs" | "sign") as function), args=[one], keywords=[]):
-                return self._call(function, [one])
+            case ast.BinOp(left=a, op=operator, right=b) if type(operator) in _OPERATORS:
+                return self._call(_OPERATORS[type(operator)], [a, b])
+            case ast.Call(
+                func=ast.Name(id=("abs" | "sign") as function), args=[argument], keywords=[]
+            ):
+                return self._call(function, [argument])
         raise ValueError("is not integer arithmetic")
 
     def _call(self, function: str, parts: Sequence[ast.expr]) -> tuple[Step, int]:

@@ -134,13 +134,15 @@ class FeatureFile(Config):
         for name, purpose in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):
             if name in self.sets:
                 raise ValueError(f"{name!r} is the set of {purpose}")
-        for name, one in self.sets.items():
-            unknown = [f for f in one.features if f not in self.features]
+        for name, entry in self.sets.items():
+            unknown = [f for f in entry.features if f not in self.features]
             names_of_windows = {*self.windows, *self.gates, *over_time}
-            unknown += [w for w in one.windows if w not in names_of_windows or w in self.calibrated]
-            unknown += [c for c in one.calibrated if c not in self.calibrated]
-            unknown += [one.of] if one.of and one.of not in self.sets else []
-            still = [c for c in one.calibrated if one.change_s and self.calibrated[c].alone]
+            unknown += [
+                w for w in entry.windows if w not in names_of_windows or w in self.calibrated
+            ]
+            unknown += [c for c in entry.calibrated if c not in self.calibrated]
+            unknown += [entry.of] if entry.of and entry.of not in self.sets else []
+            still = [c for c in entry.calibrated if entry.change_s and self.calibrated[c].alone]
             if still:
                 raise ValueError(f"sets.{name}: {', '.join(still)}: a number does not change")
             if unknown:
