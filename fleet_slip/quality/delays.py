@@ -30,9 +30,11 @@ MIN_ROWS = 400
 """Twenty seconds: a shorter manoeuvre fits at many lags."""
 MIN_EXPLAINED = 0.5
 """Share of the variance that must be explained at the best lag, else the signals are unrelated."""
-MIN_IMPROVEMENT, SMALL_S = 1.5, 0.15
-"""Unexplained variance without a lag over that at the best lag, if that is not small. Less shows
-nothing: the drive turns too slowly."""
+SMALL_S = 0.15
+"""No delay below it is reported, so that its standard error is not computed."""
+MIN_IMPROVEMENT = 1.5
+"""Unexplained variance without a lag over that at a best lag that is not small. Less shows nothing:
+the drive turns too slowly."""
 PERIODIC_TOLERANCE = 0.1
 """Share of the variance by which minima may differ: on a sine every period has one."""
 MAX_STANDARD_ERRORS = 4.0
@@ -41,7 +43,7 @@ MAX_STANDARD_ERRORS = 4.0
 
 @dataclass(frozen=True)
 class SignalDelay:
-    """How late a signal is by others, in s, with its standard error."""
+    """How late a signal is by others, in s, with its standard error; 0 of a small one."""
 
     value_s: float
     error_s: float
@@ -73,11 +75,12 @@ def estimate_delay(values: FloatArray, inputs: FloatArray, rows: BoolArray) -> S
     if best is None or total[:, 0, 0].min() < MIN_ROWS:
         return None
     at_best = unexplained[round(best) + MAX_LAG]
-    is_far = abs(best) * STEP_S > SMALL_S
-    if at_best > 1 - MIN_EXPLAINED:
+    is_small = abs(best) * STEP_S <= SMALL_S
+    is_clear = is_small or unexplained[MAX_LAG] >= MIN_IMPROVEMENT * at_best
+    if at_best > 1 - MIN_EXPLAINED or not is_clear:
         return None
-    if is_far and unexplained[MAX_LAG] < MIN_IMPROVEMENT * at_best:
-        return None
+    if is_small:
+        return SignalDelay(best * STEP_S, 0.0)
     without = [_lowest(_unexplained(total - block)) for block in moments]
     if None in without:
         return None
