@@ -140,10 +140,10 @@ class FleetEvaluation:
         configs = self.warehouse.configs
         chosen = tuple(load_scenario(name, configs) for name in scenarios)
         chosen = chosen or load_scenarios(configs)
-        first, *others = self._versions(model, challengers)
+        first, *rivals = self._versions(model, challengers)
         with open_workers(self.warehouse.root, threads) as executor:
             simulate_scenarios(self.warehouse, chosen, executor, total_progress(progress))
-            content = evaluate_scenarios(self.warehouse, chosen, first, others, executor)
+            content = evaluate_scenarios(self.warehouse, chosen, first, rivals, executor)
         return store_evaluation(evaluations_of(self.warehouse), content)
 
     @record_call
@@ -217,9 +217,9 @@ class FleetEvaluation:
         from fleet_slip.evaluation.evaluation_document import Evaluation
         from fleet_slip.evaluation.scenario_evaluation import evaluate_blind
 
-        first, *others = self._versions(model, challengers)
+        first, *rivals = self._versions(model, challengers)
         with open_workers(self.warehouse.root, threads) as executor:
-            return Evaluation(evaluate_blind(self.warehouse, first, others, executor))
+            return Evaluation(evaluate_blind(self.warehouse, first, rivals, executor))
 
     def identify(
         self,

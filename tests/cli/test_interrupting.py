@@ -243,6 +243,28 @@ def test_summaries_are_read_without_running_a_module() -> None:
     assert not {f"fleet_slip.cli.{module}" for module in COMMANDS.values()} & loaded
 
 
+@pytest.mark.parametrize(
+    ("command", "absent"),
+    [
+        (["show", "smoke"], {"numpy", "pyarrow", "duckdb", "deltalake", "flint", "ssl", "rich"}),
+        (["sql", "SELECT 1 FROM drives"], {"pandas", "polars", "flint", "numba", "rich"}),
+    ],
+    ids=["show", "sql"],
+)
+def test_a_short_command_imports_no_large_library_in_vain(
+    smoke_root: Path, command: list[str], absent: set[str]
+) -> None:
+    program = (
+        "import sys; from fleet_slip.cli.main import main\n"
+        "try: main()\n"
+        "except SystemExit as end: print(end.code, *sys.modules, file=sys.stderr)"
+    )
+    words = [sys.executable, "-c", program, "--root", str(smoke_root), *command]
+    code, *modules = run(words).stderr.split()
+    assert code == "0"
+    assert not absent & {*modules}
+
+
 def test_select_and_publish_take_the_options_of_the_api() -> None:
     """Their help names every ranking, criterion and method."""
     options = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
