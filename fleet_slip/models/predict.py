@@ -103,17 +103,17 @@ class Frame:
         missing = [name for name in names if name not in self.names]
         if missing:
             more = len(self.names) - NAMES_SHOWN
-            there = ", ".join(map(str, self.names[:NAMES_SHOWN])) or "no column"
+            available = ", ".join(map(str, self.names[:NAMES_SHOWN])) or "no column"
             raise InputError(
                 f"{wanted_by} needs {', '.join(names)}; the frame lacks {', '.join(missing)}. It "
-                f"has {there}{f' and {more} more' if more > 0 else ''}."
+                f"has {available}{f' and {more} more' if more > 0 else ''}."
             )
-        found = {name: self._numbers(name) for name in names}
-        rows = {name: len(values) for name, values in found.items()}
+        columns = {name: self._numbers(name) for name in names}
+        rows = {name: len(values) for name, values in columns.items()}
         if len(set(rows.values())) > 1:
-            told = ", ".join(f"{name} {n:,}" for name, n in rows.items())
-            raise InputError(f"the columns differ in length: {told}.")
-        return found
+            lengths = ", ".join(f"{name} {n:,}" for name, n in rows.items())
+            raise InputError(f"the columns differ in length: {lengths}.")
+        return columns
 
     def _numbers(self, name: str) -> FloatArray:
         if list(self.names).count(name) > 1:

@@ -122,7 +122,7 @@ class Selection(Answer):
     def searched_winner(self) -> SearchedModels | None:
         """The search that found the winner, if one did."""
         signals = self.winner.model.signals
-        of_search = (s for s in self.searched if signals in [one.signals for one in s.models])
+        of_search = (s for s in self.searched if signals in [model.signals for model in s.models])
         return next(of_search, None)
 
     def as_model_list(self) -> ModelList:
@@ -184,7 +184,7 @@ class Selection(Answer):
         for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
             model["shortfall"] = shortfall.as_dict()
         nested = {"left_out": self.distances} if isinstance(self.distances, str) else self.distances
-        found = {
+        optional = {
             "choice": self.choice,
             "search": self.searched_winner or next(iter(self.searched), None),
             "nested": nested,
@@ -193,11 +193,11 @@ class Selection(Answer):
             "examined": self.examined,
         }
         if self.cohort.prior:
-            found["prior"] = {
+            optional["prior"] = {
                 "campaign": str(self.request.prior),
                 "weight": str(self.cohort.weight),
             }
-        document |= {name: document_of(one) for name, one in found.items() if one}
+        document |= {name: document_of(value) for name, value in optional.items() if value}
         return document
 
 
@@ -343,9 +343,9 @@ def select(
     """
     folds = _labelled_folds(cohort, folding)
     skipped: dict[str, str] = {}
-    candidates = [one for one in candidates if _is_allowed(one, cohort, skipped)]
-    searches_run = [one for one in searches if _has_drives(one, cohort, skipped)]
-    columns = [name for name in inputs if any(one.among([name]) for one in searches_run)]
+    candidates = [c for c in candidates if _is_allowed(c, cohort, skipped)]
+    searches_run = [s for s in searches if _has_drives(s, cohort, skipped)]
+    columns = [name for name in inputs if any(search.among([name]) for search in searches_run)]
     rows = find_complete_cases(folds, cohort.catalog.signals.label, candidates, columns, skipped)
     models = _cross_validate_candidates(rows, cohort.catalog, skipped, intercept=intercept)
     searched: list[SearchedModels] = []
@@ -453,7 +453,9 @@ def find_complete_cases(
             common |= signals
             comparable.add(i)
         elif i < len(candidates):
-            rare = [one for one in sorted(signals) if drives_with([one]) < total] or sorted(signals)
+            rare = [
+                signal for signal in sorted(signals) if drives_with([signal]) < total
+            ] or sorted(signals)
             lost = f"{total - remaining:,} of {pluralize(total, 'drive')}"
             skipped[name] = _missing_signals(folds, label, signals) or (
                 f"not comparable: {lost} lack {', '.join(rare)}, and only a tenth may be left out"
@@ -520,9 +522,9 @@ def _cross_validate_search(
     """Search among the comparable columns; note the others, and why a search has no model."""
     among = search.among(rows.columns)
     if rare := [name for name in search.among(columns) if name not in among]:
-        few, more = rare[:MAX_LISTED_INPUTS], len(rare) - MAX_LISTED_INPUTS
+        names, more = ", ".join(rare[:MAX_LISTED_INPUTS]), len(rare) - MAX_LISTED_INPUTS
         skipped[f"{search.title} (columns)"] = (
-            f"not comparable: more than a tenth of the drives lack {', '.join(few)}"
+            f"not comparable: more than a tenth of the drives lack {names}"
             + (f" and {more} more" if more > 0 else "")
         )
     if not among:
