@@ -218,7 +218,7 @@ def examine(cohort: Cohort, faulty: Mapping[str, Fault] | None = None) -> Qualit
 def _days_and_files(metadata: pa.Table) -> tuple[list[IntArray], IntArray]:
     """Return numberings of drives by day and by file, and by car."""
     sources = [SourceRef.of_drive(drive) for drive in metadata["drive_id"].to_pylist()]
-    files = [one.digest if one else "" for one in sources]
+    files = [source.digest if source else "" for source in sources]
     of_day, of_file, of_car = (
         np.unique(np.array(values, dtype=str), return_inverse=True)[1]
         for values in (metadata["day"].to_pylist(), files, metadata["vehicle_id"].to_pylist())

@@ -193,11 +193,11 @@ def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[
     the mean of left - right is about that ratio times the mean of left * right, in radians. Where
     the sensors of many drives are biased, the ratio shows nothing.
     """
-    left, right = "steer_fl", "steer_fr"
-    if not {left, right} <= set(moments.signals):
+    fl, fr = "steer_fl", "steer_fr"
+    if not {fl, fr} <= set(moments.signals):
         return {}
-    i, j = moments.position(left), moments.position(right)
-    m, scale = moments.matrices, float(signals[left].scale)
+    i, j = moments.position(fl), moments.position(fr)
+    m, scale = moments.matrices, float(signals[fl].scale)
     product = m[:, i, j] * scale**2
     difference = (m[:, 0, i] - m[:, 0, j]) * scale
     ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
@@ -205,7 +205,7 @@ def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[
     if ((np.abs(ratio) > low) & (np.abs(ratio) < high)).mean() < UNBIASED_STEERING:
         return {}
     return {
-        drive: SWAPPED_STEERING.fault(left, right, ratio=ratio[drive])
+        drive: SWAPPED_STEERING.fault(fl, fr, ratio=ratio[drive])
         for drive in np.flatnonzero((-ratio > low) & (-ratio < high)).tolist()
     }
 
