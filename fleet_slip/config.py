@@ -181,7 +181,7 @@ def faults_of(error: ValidationError) -> str:
     wrong: dict[str, list[str]] = {}
     for fault in error.errors(include_input=False, include_url=False):
         reasons = wrong.setdefault(_key_of(fault), [])
-        if (text_of_fault := _said(fault)) not in reasons:
+        if (text_of_fault := _reason_text(fault)) not in reasons:
             reasons.append(text_of_fault)
     faults = [f"{key and f'{key}: '}{', or '.join(reasons)}" for key, reasons in wrong.items()]
     text = "; ".join(
@@ -204,7 +204,7 @@ def _key_of(fault: ErrorDetails) -> str:
     return ".".join(map(str, keys))
 
 
-def _said(fault: ErrorDetails) -> str:
+def _reason_text(fault: ErrorDetails) -> str:
     """Return the reason of a fault: our text, or the message of a validator."""
     words = _SAID.get(fault["type"])
     if words is None:

@@ -78,7 +78,7 @@ class Inputs:
     @cached_property
     def plan(self) -> ColumnPlan:
         """What to compute of a drive."""
-        return ColumnPlan.of(self.names, self.features, self.definitions)
+        return ColumnPlan.from_definitions(self.names, self.features, self.definitions)
 
     def beside(self, signal: str) -> "Inputs":
         """Return the same with a logged signal as the last one."""

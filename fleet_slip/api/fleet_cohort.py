@@ -159,7 +159,7 @@ class FleetCohort:
         from fleet_slip.models.select import run_plan
         from fleet_slip.models.stacking import ensure_rows
 
-        plan = SelectionPlan.of(self.warehouse.catalog, request)
+        plan = SelectionPlan.from_request(self.warehouse.catalog, request)
         screen = self.examine()
         with screen.explaining():
             plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)

@@ -245,9 +245,9 @@ def _jackknife_variance(inputs: FloatArray, products: FloatArray, point: FloatAr
     if drives < 2:
         return math.nan
     unit = np.sqrt(np.einsum("dii->i", inputs))
-    left = (inputs.sum(axis=0) - inputs) / np.outer(unit, unit)
+    remaining = (inputs.sum(axis=0) - inputs) / np.outer(unit, unit)
     right = (products.sum(axis=0) - products) / unit
-    planes = np.einsum("dij,dj->di", np.linalg.pinv(left, hermitian=True), right)
+    planes = np.einsum("dij,dj->di", np.linalg.pinv(remaining, hermitian=True), right)
     values = planes @ (point / unit)
     return float((drives - 1) / drives * ((values - values.mean()) ** 2).sum())
 

@@ -130,7 +130,7 @@ class KnownColumns:
     over_time: dict[str, TimeColumn] = field(default_factory=dict)
     missing: frozenset[str] = frozenset()
 
-    def of(self, name: str) -> Signal | Feature | TimeColumn:
+    def find(self, name: str) -> Signal | Feature | TimeColumn:
         """Return an input by name. Raises `ValueError` if unknown, and `NotYetMadeError`."""
         if name in self.missing:
             raise NotYetMadeError
@@ -142,7 +142,7 @@ class KnownColumns:
 
     def definition(self, name: str) -> Definition:
         """Return the definition of an input. Raises `ValueError` if unknown."""
-        column = self.of(name)
+        column = self.find(name)
         if isinstance(column, TimeColumn):
             return column.definition
         if isinstance(column, Feature):
@@ -217,7 +217,7 @@ class Window(ColumnFamily):
         row = columns.definition(self.of)
         if self.of in columns.over_time and not (row.made and row.of == self.of):
             raise ValueError(f"{self.of} is no input signal or feature")
-        ratio, members = columns.of(self.of).exact_scale / Fraction(self.scale), {}
+        ratio, members = columns.find(self.of).exact_scale / Fraction(self.scale), {}
         for member, ticks in zip(self.names(name), self.ticks or (0,), strict=True):
             definition = Definition(
                 of=row.of,
@@ -253,7 +253,7 @@ class Factor(ColumnFamily):
         base = columns.definition(self.of)
         if base.fact is not None:
             raise ValueError(f"{self.of} has a factor already")
-        ratio = columns.of(self.of).exact_scale / Fraction(self.scale)
+        ratio = columns.find(self.of).exact_scale / Fraction(self.scale)
         fact = AttributeFactor.model_validate(
             {"name": self.fact, "less": self.less, "equals": self.equals, "ratio": ratio},
             context=columns.signals,
@@ -279,7 +279,7 @@ class Calibrated(ColumnFamily):
         """
         base, source, number = (
             columns.definition(self.of),
-            columns.of(self.of),
+            columns.find(self.of),
             CALIBRATION_PARAMETERS[self.number],
         )
         if isinstance(source, Feature):  # the count itself, as it stands in the rows
@@ -317,7 +317,9 @@ class MadeColumn(ColumnFamily):
     unit: SIUnit
     column: Identifier
 
-    def _of(self, name: str, composite: Made, bits: int = LARGEST_BITS) -> dict[str, TimeColumn]:
+    def _single(
+        self, name: str, composite: Made, bits: int = LARGEST_BITS
+    ) -> dict[str, TimeColumn]:
         return {name: self._column(Definition(of=name, made=composite, of_bits=bits, bits=bits))}
 
 
@@ -328,7 +330,7 @@ class EstimateColumn(MadeColumn):
 
     def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
         """Return the estimate of a model that has not been fitted."""
-        return self._of(name, Combination(line=""))
+        return self._single(name, Combination(line=""))
 
 
 class ProductColumn(MadeColumn):
@@ -340,8 +342,12 @@ class ProductColumn(MadeColumn):
     def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
         """Return the product."""
         factors = tuple(map(columns.definition, self.of))
-        scale = math.prod((columns.of(factor).exact_scale for factor in self.of), start=Fraction(1))
-        return self._of(name, Product(of=factors, ratio=scale / Fraction(self.scale)), self.bits)
+        scale = math.prod(
+            (columns.find(factor).exact_scale for factor in self.of), start=Fraction(1)
+        )
+        return self._single(
+            name, Product(of=factors, ratio=scale / Fraction(self.scale)), self.bits
+        )
 
 
 class EquationColumns(Config):
@@ -396,7 +402,7 @@ class SlopeColumn(MadeColumn):
                 "the scales of y and `regressor` have another ratio from one equation to the next"
             )
         ratio = values.pop() / Fraction(self.scale)
-        return self._of(name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio))
+        return self._single(name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio))
 
 
 class GateFamily(ColumnFamily):

@@ -135,13 +135,13 @@ class Code:
     summed: dict[Value, int] = field(default_factory=dict)
     stored: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
-    _known: dict[VectorOperation, int] = field(default_factory=dict)
+    _numbers: dict[VectorOperation, int] = field(default_factory=dict)
 
     def add(self, operation: VectorOperation) -> int:
         """Add an operation if there is no equal one; return its number."""
-        if operation not in self._known:
-            self._known[operation] = self._append(operation)
-        return self._known[operation]
+        if operation not in self._numbers:
+            self._numbers[operation] = self._append(operation)
+        return self._numbers[operation]
 
     def _append(self, operation: VectorOperation) -> int:
         self.operations.append(operation)
@@ -282,7 +282,7 @@ class _Writer:
         self._facts = len(counted.lowered.facts)
         self.value = cache(self._value)
         self.integers = cache(self._integers)
-        self._whole = cache(self._needs_integers)
+        self._is_integer = cache(self._needs_integers)
 
     def _value(self, number: int, guard: int | None = None) -> Value:
         """Return a step in binary64, NaN where missing; `guard` is positive wherever it is used."""
@@ -292,11 +292,11 @@ class _Writer:
             return self._do(FILL, ratio=(float(constant), 1.0, 0.0, inf))
         if name in GIVEN:
             return self._signal_or_car(name, plain[0])
-        if self._whole(number):
+        if self._is_integer(number):
             value = self._do(TO_BINARY64, self.integers(number, guard))
             return self._do(WHERE, value, self._present(number, guard))
         fused = None
-        if not any(self._whole(operand) for operand in operands_of(step)):
+        if not any(self._is_integer(operand) for operand in operands_of(step)):
             fused = self._fused(number, guard)
         return self._plain(number, guard) if fused is None else fused
 
@@ -316,7 +316,7 @@ class _Writer:
 
     def _plain(self, number: int, guard: int | None) -> Value:
         name, plain = operation_of(self._steps[number]), plain_of(self._steps[number])
-        if name == "at_least" and self._whole(plain[0]):
+        if name == "at_least" and self._is_integer(plain[0]):
             # Rounded to binary64, the difference keeps its sign.
             pair = [self.integers(operand, guard) for operand in plain]
             excess = self._do(TO_BINARY64, self._do(INTEGERS + SUBTRACT, *pair))
@@ -383,13 +383,13 @@ class _Writer:
         if any(OPERATIONS[operation_of(self._steps[n])].over_time for n in operands_of(step)):
             return False  # a drive with so many rows is refused
         size = largest_in(step, number, self._ranges)
-        return size >= _EXACT or any(self._whole(operand) for operand in operands_of(step))
+        return size >= _EXACT or any(self._is_integer(operand) for operand in operands_of(step))
 
     def _integers(self, number: int, guard: int | None) -> Value:
         """Return a step in int64; anything where it is missing."""
         if (constant := self._constant(number)) is not None:
             return self._do(INTEGERS + FILL, number=constant)
-        if not self._whole(number):
+        if not self._is_integer(number):
             return self._do(INTEGERS + COPY, self.value(number, guard))
         bindings: dict[str, int] = {}
         name, operands = operation_of(self._steps[number]), operands_of(self._steps[number])
@@ -405,7 +405,7 @@ class _Writer:
         step = self._steps[number]
         parts: list[Value] = []
         for operand in operands_of(step):
-            if self._whole(operand):
+            if self._is_integer(operand):
                 parts.append(self._present(operand, guard))
             elif self._constant(operand) is None:
                 parts.append(self.value(operand, guard))
@@ -522,7 +522,7 @@ class ColumnPlan:
     windows: Mapping[str, Definition]
 
     @classmethod
-    def of(
+    def from_definitions(
         cls,
         names: Sequence[str],
         features: Mapping[str, Definition],
@@ -547,7 +547,7 @@ class ColumnPlan:
         inputs = (*feature_set.signals, *feature_set.features, *feature_set.windows)
         changes = (*inputs, COURSE, YAW_RATE)
         columns = changes if feature_set.change_ticks else feature_set.columns
-        return cls.of(columns, features, catalog.definitions(name, fold))
+        return cls.from_definitions(columns, features, catalog.definitions(name, fold))
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -601,7 +601,7 @@ def _program(
     rows: tuple[tuple[str, Definition], ...],
     windows: tuple[tuple[str, Definition], ...],
 ) -> BlockProgram:
-    counted = CountedColumns.of(dict(rows), dict(windows))
+    counted = CountedColumns.from_definitions(dict(rows), dict(windows))
     writer = _Writer(counted)
     for place in sorted({*counted.places.values(), *counted.times}):
         writer.value(place)

@@ -195,7 +195,7 @@ class CountedColumns:
     times: Mapping[int, int]
 
     @classmethod
-    def of(
+    def from_definitions(
         cls, rows: Mapping[str, Definition], over_time: Mapping[str, Definition]
     ) -> "CountedColumns":
         """Lower columns over time, and `rows`, which include their sources."""
@@ -286,7 +286,7 @@ def with_columns(
     if not features and not over_time:
         return rows
     all_rows = rows_of(features, over_time)
-    counted = CountedColumns.of(all_rows, over_time)
+    counted = CountedColumns.from_definitions(all_rows, over_time)
     signals, facts = list(counted.lowered.signals), list(counted.lowered.facts)
     layers = SqlLayers(
         counted.steps,

@@ -263,10 +263,10 @@ class Lowering:
     steps: dict[Step, int] = field(default_factory=dict)
     facts: dict[VehicleAttribute, int] = field(default_factory=dict)
     numbers: dict[ParameterCount, int] = field(default_factory=dict)
-    _made: dict[int, int] = field(default_factory=dict)
+    _composites: dict[int, int] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_columns(
         cls, signals: Sequence[str], columns: Sequence[Definition]
     ) -> tuple["Lowering", list[int]]:
         """Lower columns; return the lowering and the step of each column."""
@@ -326,9 +326,9 @@ class Lowering:
         """Return the step of a column's source: a signal or a clipped feature or composite."""
         if column.made:
             key = id(column.made)  # shared by several columns
-            if key not in self._made:
-                self._made[key] = self._made_of(column.made)
-            return self.clip(self._made[key], limit_of(column.of_bits))
+            if key not in self._composites:
+                self._composites[key] = self._made_of(column.made)
+            return self.clip(self._composites[key], limit_of(column.of_bits))
         if not column.sql:
             return self.do("signal", self.signals[column.of])
         arithmetic = parse(column.sql)

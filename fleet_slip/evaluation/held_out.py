@@ -169,7 +169,7 @@ class Learner:
         drives: Sequence[HeldOutDrive],
     ) -> "Learner":
         """Prepare a model's recipe for the drives of a cohort. Raises as `load_cohort`."""
-        plan = SelectionPlan.of(warehouse.catalog, request)
+        plan = SelectionPlan.from_request(warehouse.catalog, request)
         cohort = load_cohort(warehouse, predicate, plan.feature_set)
         return cls(plan, cohort, drives, warehouse)
 

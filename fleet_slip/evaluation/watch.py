@@ -276,7 +276,7 @@ def gates_on(
             knots.update(count for count in (gate.low, gate.peak, gate.high) if count is not None)
     if not gates:
         return {}
-    plan = ColumnPlan.of(
+    plan = ColumnPlan.from_definitions(
         tuple(f"gate_{number}" for number in range(len(gates))),
         {},
         {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},

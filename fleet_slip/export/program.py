@@ -274,7 +274,7 @@ def write_program(catalog: Catalog, manifest: Manifest) -> Program:
     """
     signals = _inputs(catalog.signals, manifest)
     columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
-    lowered, places = Lowering.of([signal.name for signal in signals], columns)
+    lowered, places = Lowering.from_columns([signal.name for signal in signals], columns)
     steps, facts, numbers = tuple(lowered.steps), tuple(lowered.facts), tuple(lowered.numbers)
     ranges = lowered.ranges([(signal.min_count, signal.max_count) for signal in signals])
     coefficients, intercept = manifest.counts_coefficients(catalog)

@@ -56,7 +56,9 @@ class Predictor:
             float(signals[term.signal].scale if term.logged else term.scale)
             for term in manifest.terms
         )
-        plan = ColumnPlan.of(manifest.signals, manifest.features, manifest.definitions)
+        plan = ColumnPlan.from_definitions(
+            manifest.signals, manifest.features, manifest.definitions
+        )
         return cls(plan, manifest.intercept, coefficients, scales)
 
     def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
@@ -209,14 +211,14 @@ def predict(
     workspace = Workspace(plan)
     for at in drives if rows else ():
         first = at.start if isinstance(at, slice) else at[0]
-        own = {
+        parameters = {
             name: count
             for name, (values, grain) in numbers.items()
             if np.isfinite(values[first])
             and (count := round_number(Fraction(float(values[first])), grain)) is not None
         }
-        known = {name: values[first].as_py() for name, values in facts.items()}
-        angle[at] = predictor(drive.segment(at, known, own), workspace)
+        attributes = {name: values[first].as_py() for name, values in facts.items()}
+        angle[at] = predictor(drive.segment(at, attributes, parameters), workspace)
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 
@@ -227,16 +229,20 @@ def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]
     runs = pc.run_end_encode(_column(frame, "drive_id").cast(pa.large_string()))
     ends = [0, *runs.run_ends.to_pylist()]
     drives = runs.values.dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
-    found = np.unique(drives)
-    if len(found) == len(drives):
-        return [slice(*one) for one in pairwise(ends)]
+    distinct = np.unique(drives)
+    if len(distinct) == len(drives):
+        return [slice(*bounds) for bounds in pairwise(ends)]
     of_row = np.repeat(drives, np.diff(ends))
-    return [np.flatnonzero(of_row == drive) for drive in found]
+    return [np.flatnonzero(of_row == drive) for drive in distinct]
 
 
 def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
     """Return what a car's drives tell of it, in SI units by row with NaN, and grains."""
-    used = {one.number.name: one.number for one in manifest.definitions.values() if one.number}
+    used = {
+        definition.number.name: definition.number
+        for definition in manifest.definitions.values()
+        if definition.number
+    }
     if missing := [name for name in used if name not in frame.names]:
         raise InputError(
             f"{manifest.name} needs calibrated parameters of the car: {', '.join(missing)}. Run: "

@@ -267,7 +267,7 @@ class ModelList(Config):
 
     @field_serializer("search")
     def _as_written(self, search: tuple[Search, ...]) -> Any:
-        contents = [each.as_dict(exclude_defaults=True) for each in search]
+        contents = [entry.as_dict(exclude_defaults=True) for entry in search]
         return contents[0] if len(contents) == 1 else contents  # the checksum of one search
 
     @field_validator("tolerance")
@@ -427,7 +427,7 @@ class SelectionPlan:
     intercept: bool
 
     @classmethod
-    def of(cls, catalog: Catalog, original: SelectionRequest) -> "SelectionPlan":
+    def from_request(cls, catalog: Catalog, original: SelectionRequest) -> "SelectionPlan":
         """Validate a request. Raises `UsageError`, `QuestionError` and `ConfigError`."""
         original.check()
         request = replace(original, models=original.models or _default_list(original))
@@ -469,7 +469,7 @@ class SelectionPlan:
 
     def with_logged_signals(self, catalog: Catalog) -> "SelectionPlan":
         """Return the same plan with the list of logged signals."""
-        plan = SelectionPlan.of(catalog, replace(self.original, models=LOGGED_MODELS))
+        plan = SelectionPlan.from_request(catalog, replace(self.original, models=LOGGED_MODELS))
         return replace(plan, original=self.original)
 
     def compared_list(self, cohort: "Cohort") -> ModelList:

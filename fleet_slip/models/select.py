@@ -205,7 +205,7 @@ def run_selection(
     warehouse: Warehouse, request: SelectionRequest, predicate: str = TRAINING_DRIVES
 ) -> Selection:
     """Validate a request and run it. Raises as `SelectionPlan.of` and `run_plan`."""
-    return run_plan(warehouse, SelectionPlan.of(warehouse.catalog, request), predicate)
+    return run_plan(warehouse, SelectionPlan.from_request(warehouse.catalog, request), predicate)
 
 
 def run_plan(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:

@@ -112,7 +112,9 @@ def _fit_first_stage(warehouse: Warehouse, about: About, predicate: str) -> Firs
     Raises as `run_plan`, and `QuestionError` if its estimate would not be exact.
     """
     catalog = warehouse.catalog
-    plan = SelectionPlan.of(catalog, SelectionRequest(models=about["models"], group_by="drive"))
+    plan = SelectionPlan.from_request(
+        catalog, SelectionRequest(models=about["models"], group_by="drive")
+    )
     reason = f"model list {about['models']} fits the first-stage model on them"
     ensure_grams(warehouse, plan.feature_set, predicate, reason=reason)
     cohort = load_cohort(warehouse, predicate, plan.feature_set)
@@ -128,15 +130,15 @@ def _fit_first_stage(warehouse: Warehouse, about: About, predicate: str) -> Firs
         for name in signals
     ]
 
-    def whole(model: LinearModel) -> Combination:
+    def to_counts(model: LinearModel) -> Combination:
         slopes = [slope * unit for slope in model.coefficients]
         return integer_combination(model.intercept * unit, slopes, columns)
 
     return FirstStageModel(
         **about,
-        fitted=whole(fit(folds.total, signals, label).model),
+        fitted=to_counts(fit(folds.total, signals, label).model),
         folds={
-            fold: whole(fit(training, signals, label).model)
+            fold: to_counts(fit(training, signals, label).model)
             for fold, (training, _) in zip(folds.names, folds.splits(), strict=True)
         },
         hashed=hashed,

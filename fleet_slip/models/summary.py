@@ -224,11 +224,11 @@ def _choice(choice: "SearchChoice") -> Iterator[Part]:
     if choice.subsets is not None and (picks := choice.picks) is not None:
         rows_of_sizes = (
             {
-                "best": one.best,
-                "picked_by": [name for name, size in picks.items() if size == one.best.size],
-                "gap": one.gap,
+                "best": subset.best,
+                "picked_by": [name for name, size in picks.items() if size == subset.best.size],
+                "gap": subset.gap,
             }
-            for one in choice.subsets
+            for subset in choice.subsets
         )
         yield TextTable(
             f"best subset of every size; {evidence}",

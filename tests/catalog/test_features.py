@@ -150,7 +150,7 @@ def computed_by_kernel(logged: dict[str, Any]) -> dict[str, list[float | None]]:
     known = CATALOG.features
     rows = CATALOG.rows(known)
     drive = DriveCounts(np.arange(len(logged["ay"])), {name: logged[name] for name in INPUTS})
-    columns = compute_columns(ColumnPlan.of(tuple(known), rows, {}), drive)
+    columns = compute_columns(ColumnPlan.from_definitions(tuple(known), rows, {}), drive)
     return {
         name: [None if np.isnan(value) else value for value in column]
         for name, column in zip(known, columns, strict=True)
@@ -328,7 +328,7 @@ def test_what_is_odd_has_the_opposite_columns_in_a_mirrored_drive(name: str) -> 
     windows = {
         name: known.time_columns[name].definition for name in names if name in known.time_columns
     }
-    plan = ColumnPlan.of(names, known.rows(names), windows)
+    plan = ColumnPlan.from_definitions(names, known.rows(names), windows)
 
     def columns(counts: dict[str, np.ndarray], offset: int) -> np.ndarray:
         numbers: dict[str, int] = {
@@ -386,7 +386,7 @@ def weights(gates: list[Gate], at: list[int]) -> FloatArray:
     """Weights by the kernel, shape (gates, counts)."""
     columns = columns_of(gates)
     drive = DriveCounts(np.arange(len(at)), {"ay": np.array(at, dtype=np.int16)})
-    return compute_columns(ColumnPlan.of(list(columns), {}, columns), drive)
+    return compute_columns(ColumnPlan.from_definitions(list(columns), {}, columns), drive)
 
 
 @given(knots)

@@ -90,7 +90,9 @@ def test_each_drive_has_the_estimate_of_a_line_that_was_fitted_without_it(fleet:
     """By numpy's least squares on the rows themselves."""
     line, label = the_line(fleet), SIGNALS.label
     names = (*INNER, label)
-    plan = ColumnPlan.of(names, {}, {n: CATALOG.time_columns[n].definition for n in INNER})
+    plan = ColumnPlan.from_definitions(
+        names, {}, {n: CATALOG.time_columns[n].definition for n in INNER}
+    )
     rows = {
         str(drive.facts["drive_id"]): compute_columns(plan, drive)
         for file in fleet.warehouse.logs.snapshot().files

@@ -233,9 +233,9 @@ def test_weights_halve_with_age() -> None:
 
 def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
     """An evaluation makes it again by the recipe, which names no list."""
-    usual = SelectionPlan.of(CATALOG, SelectionRequest(half_life=90))
+    usual = SelectionPlan.from_request(CATALOG, SelectionRequest(half_life=90))
     assert usual.model_list == load_model_list(CATALOG, "estimator")
-    logged = SelectionPlan.of(CATALOG, SelectionRequest(features="signals", robust=True))
+    logged = SelectionPlan.from_request(CATALOG, SelectionRequest(features="signals", robust=True))
     assert logged.model_list == load_model_list(CATALOG, "table1")
 
 

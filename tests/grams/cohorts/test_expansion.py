@@ -101,7 +101,7 @@ def counts_of_drive(warehouse: Warehouse, drive_id: str, numbers: dict[str, int]
 def plan_of(names: tuple[str, ...]) -> ColumnPlan:
     known = CATALOG
     definitions = {name: one for name in names if (one := known.definition(name)) is not None}
-    return ColumnPlan.of(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
+    return ColumnPlan.from_definitions(names, ColumnPlan.of_set(known, "fleet").rows, definitions)
 
 
 def test_gram_rows_have_the_bits_of_the_rows(filled: Warehouse) -> None:

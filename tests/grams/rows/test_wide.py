@@ -143,7 +143,7 @@ def counts_of_table(table: pa.Table) -> DriveCounts:
 @settings(max_examples=40)
 @given(drives())
 def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
-    plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)
+    plan = ColumnPlan.from_definitions(list(DEFINITIONS), {}, DEFINITIONS)
     blocks = Workspace(plan).blocks(counts_of_table(table))
     found = [(block.copy(), clips.copy()) for _, block, clips in blocks]
     kernel, clipped = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
@@ -165,7 +165,7 @@ def test_a_whole_drive_takes_the_fast_loop_to_the_same_integers() -> None:
     rng = np.random.default_rng(5)
     counts = {n: rng.integers(-32768, 32768, 9000).astype(np.int16) for n in SIGNALS}
     counts["wheel_fl"][:] = 9000
-    plan = ColumnPlan.of(list(DEFINITIONS), {}, DEFINITIONS)
+    plan = ColumnPlan.from_definitions(list(DEFINITIONS), {}, DEFINITIONS)
     facts = {"mass_kg": 1400.0, "vehicle_model": "suv"}
     ticks = np.arange(9000)
     fast = compute_columns(plan, DriveCounts(ticks, counts, {}, facts))
