@@ -1,4 +1,4 @@
-"""What calls of the API share: their record, their progress, and where their tasks run."""
+"""Shared parts of API calls: records, progress, and executors."""
 
 import functools
 import os

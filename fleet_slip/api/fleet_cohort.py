@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.request import Label, SelectionRequest
     from fleet_slip.models.select import Selection
     from fleet_slip.operations.sensor_screen import SensorScreen
-    from fleet_slip.regression.drives import ClusterUnit
+    from fleet_slip.regression.drive_moments import ClusterUnit
     from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -29,7 +29,7 @@ WATCH_PAGE = Path("watch.html")
 
 @dataclass(frozen=True)
 class FleetEvaluation:
-    """What evaluates the published models of a data root; see `Fleet.evaluation`.
+    """Evaluation of the published models of a data root; see `Fleet.evaluation`.
 
     Models are references or versions, as in `FleetModels`, with the same errors.
     """

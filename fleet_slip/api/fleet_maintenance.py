@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Compacted(Answer):
-    """What `FleetMaintenance.compact` did; of a dry run, the files that it would remove."""
+    """Result of `FleetMaintenance.compact`; of a dry run, the files that it would remove."""
 
     compacted: "CompactionReport | None"
     vacuumed: "VacuumReport"
@@ -62,7 +62,7 @@ class Compacted(Answer):
 
 @dataclass(frozen=True)
 class FleetMaintenance:
-    """What looks after a data root; see `Fleet.maintenance`.
+    """Maintenance of a data root; see `Fleet.maintenance`.
 
     Reports return what is wrong; a command ends with an exit code for it.
     """

@@ -1,4 +1,4 @@
-"""What commands print: JSON for machines, texts and tables for people, remarks on stderr."""
+"""Output of commands: JSON for machines, texts and tables for people, remarks on stderr."""
 
 import json
 import logging

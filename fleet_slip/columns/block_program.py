@@ -376,7 +376,7 @@ class _Writer:
         return None
 
     def _needs_integers(self, number: int) -> bool:
-        """Whether an operation on the counts of a row, or what it works on, may reach 2^53."""
+        """Return True if an operation on the counts of a row, or an operand, may reach 2^53."""
         step = self._steps[number]
         if step[0] not in _INTEGERS or self._constant(number) is not None:
             return False
@@ -512,7 +512,7 @@ def _number(numbers: dict[Any, int], key: object) -> int:
 
 @dataclass(frozen=True)
 class ColumnPlan:
-    """What to compute of a drive: columns by `names`, of `rows` (one row each) and `windows`.
+    """Columns to compute of a drive: by `names`, of `rows` (one row each) and `windows`.
 
     `rows` has what is looked back on, too.
     """
@@ -566,7 +566,7 @@ class ColumnPlan:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """What the drives of a car must have determined, or running means stand for."""
+        """Calibration parameters of the car that the columns need."""
         names = (column.number.name for column in self.windows.values() if column.number)
         return tuple(dict.fromkeys(names))
 
@@ -582,7 +582,7 @@ class ColumnPlan:
 
     @cached_property
     def most_rows(self) -> float:
-        """Of how many rows its slopes are exact, and the same on board, which adds up no more."""
+        """Number of rows up to which the slopes are exact, here and on board."""
         composites = (row.made for row in rows_behind(self.windows).values())
         slopes = [
             len(composite.equations) for composite in composites if isinstance(composite, Slope)

@@ -35,7 +35,7 @@ from fleet_slip.grams.folding import (
     require_blocks,
 )
 from fleet_slip.regression.choice import TrainingFolds
-from fleet_slip.regression.drives import (
+from fleet_slip.regression.drive_moments import (
     ClusterUnit,
     DriveMoments,
     complete_cases,

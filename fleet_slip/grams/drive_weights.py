@@ -12,7 +12,7 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Record
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.gram import GramTable
 
 FULL = 16

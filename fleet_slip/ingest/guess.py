@@ -75,7 +75,7 @@ class Guess:
 
     @property
     def component(self) -> Component | None:
-        """Which one of the velocity over ground it is."""
+        """Component of the velocity over ground."""
         return self.keys.get("component")
 
     def because(self, reason: str, **keys: Any) -> "Guess":
@@ -255,7 +255,7 @@ _MIN_RISING_SHARE = 0.95
 
 @dataclass(frozen=True)
 class TimeGuess:
-    """Where time is from."""
+    """Source of the time."""
 
     keys: dict[str, Any]
     reason: str

@@ -26,7 +26,7 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
-from fleet_slip.ingest.drives import MeasuredDrive, drive_id
+from fleet_slip.ingest.drive_cutting import MeasuredDrive, drive_id
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import (
     FILES,

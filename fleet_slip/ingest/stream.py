@@ -21,7 +21,7 @@ from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.drives import (
+from fleet_slip.ingest.drive_cutting import (
     MAX_DRIVE_S,
     DriveCutter,
     MeasuredDrive,

@@ -1,4 +1,4 @@
-"""What there is to know about a model's fit to a cohort: errors, collinearity, stability."""
+"""Diagnosis of a model's fit to a cohort: errors, collinearity, stability."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from fleet_slip.grams.drive_weights import DownweightedDrive
 from fleet_slip.models.select import outlier_drives
 from fleet_slip.models.summary import outlier_remarks
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drives import ClusterUnit
+from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.inference import (
     INTERCEPT,
     Evidence,

@@ -170,7 +170,7 @@ def open_frame(frame: Any) -> Frame:
 
 
 def _is_of(library: str, kind: str, frame: Any) -> bool:
-    """Whether a value is of a class of a library, which need not be installed for that."""
+    """Return True if a value is of a class of a library, without importing the library."""
     module = sys.modules.get(library)
     return module is not None and isinstance(frame, getattr(module, kind))
 

@@ -50,7 +50,7 @@ from fleet_slip.models.search import (
 )
 from fleet_slip.models.summary import summarize
 from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winner
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,

@@ -1,4 +1,4 @@
-"""What people are shown of a selection: the winner and why, the best models, what was left out."""
+"""Text of a selection: the winner and the reason, the best models, the excluded drives."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING

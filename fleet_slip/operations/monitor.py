@@ -120,7 +120,7 @@ class Chart(Answer):
 
     @property
     def problem(self) -> AlarmError | None:
-        """That a new day is beyond a limit."""
+        """Alarm of a new day that is beyond a limit."""
         text = f"the error of {self.model} is beyond its limits on {self.alarm}"
         return AlarmError(text) if self.alarms else None
 

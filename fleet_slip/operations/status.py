@@ -128,7 +128,7 @@ class WarehouseStatus(Answer):
 
     @property
     def problem(self) -> AlarmError | None:
-        """That something calls for attention."""
+        """Problem of a data root that calls for attention; None without one."""
         count = pluralize(len(self.problems), "matter")
         return AlarmError(f"{count} found, see above.") if self.problems else None
 

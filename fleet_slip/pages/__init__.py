@@ -1,1 +1,1 @@
-"""What every page shares: its look, its drawings, its tables and its templates."""
+"""Shared parts of HTML pages: styles, drawings, tables and templates."""

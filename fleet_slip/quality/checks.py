@@ -49,7 +49,7 @@ class Fault:
 
 
 class Scope(StrEnum):
-    """What a check compares."""
+    """Scope of a comparison."""
 
     ROW = "row"
     """Rows of a log, each by itself or with the next."""
@@ -62,7 +62,7 @@ class Scope(StrEnum):
 
 
 class Data(StrEnum):
-    """What a check reads."""
+    """Data that a check reads."""
 
     LOG = "log"
     """A log, while it is read: `ingest`."""

@@ -13,7 +13,7 @@ import numpy as np
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,

@@ -16,7 +16,7 @@ import numpy as np
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, hash_fold
 from fleet_slip.errors import DataError
-from fleet_slip.regression.drives import missing_signals_error
+from fleet_slip.regression.drive_moments import missing_signals_error
 from fleet_slip.regression.figures import ErrorSums, Figures, error_sums
 from fleet_slip.regression.gram import Gram, GramTable, require_signals
 from fleet_slip.regression.least_squares import LinearModel, Scales, condition_number, fit

@@ -17,7 +17,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.figures import student_t_two_sided
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments

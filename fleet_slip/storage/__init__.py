@@ -1,1 +1,1 @@
-"""Where tables and documents lie: folders, object stores, Delta tables, runs."""
+"""Storage of tables and documents: folders, object stores, Delta tables, runs."""

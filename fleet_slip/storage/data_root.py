@@ -1,4 +1,4 @@
-"""Where a warehouse is: a folder of a file system, or the URL of an object store."""
+"""Location of a data root: a folder of a file system, or the URL of an object store."""
 
 import os
 import re

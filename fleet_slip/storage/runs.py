@@ -91,7 +91,7 @@ def _intact_records(root: Folder, since: str) -> Iterator[dict[str, Any]]:
 
 
 def _ends(line: bytes) -> bool:
-    """Whether a line ends as a line with a checksum does, but for one byte."""
+    """Return True if a line ends like a line with a checksum, except for one byte."""
     tail = line[-len(_END) :]
     if len(tail) < len(_END):
         return False

@@ -43,7 +43,7 @@ SubjectKind: TypeAlias = Literal["vehicle", "drive", "before"]
 
 @dataclass(frozen=True)
 class ErasureSubject:
-    """What to erase: a vehicle, a drive, or every drive before a day."""
+    """Subject of an erasure: a vehicle, a drive, or every drive before a day."""
 
     kind: SubjectKind
     value: str

@@ -184,7 +184,7 @@ COMMON = "common"
 
 
 class ColumnDescription(Config):
-    """What a column means."""
+    """Description of a column."""
 
     description: str = Field(min_length=1)
     unit: str = ""

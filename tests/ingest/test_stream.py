@@ -16,7 +16,7 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import load, open_drives, stream
-from fleet_slip.ingest.drives import DriveCutter, MeasuredDrive
+from fleet_slip.ingest.drive_cutting import DriveCutter, MeasuredDrive
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget

@@ -15,7 +15,7 @@ import pytest
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import load
-from fleet_slip.ingest.drives import MeasuredDrive
+from fleet_slip.ingest.drive_cutting import MeasuredDrive
 from fleet_slip.ingest.load import ingest_files
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects

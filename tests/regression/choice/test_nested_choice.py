@@ -13,7 +13,7 @@ from fleet_slip.regression.choice import (
     nested_fits,
     select_nested,
 )
-from fleet_slip.regression.drives import DriveMoments
+from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
 from fleet_slip.regression.inference import Evidence
