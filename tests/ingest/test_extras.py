@@ -182,7 +182,10 @@ def test_a_data_root_of_before_takes_what_has_no_extras_and_asks_to_migrate_for_
     extended = a_mapping(name="two", signals={**PLAIN, **only("steer")})
     late = {**columns_of(), "ax": ["x", *columns_of()["ax"][1:]]}
     (tmp_path / "c.csv").write_text(csv_text(late), encoding="utf-8")
-    with pytest.raises(RefusedError, match=r"has not: steer\. Add them with: fleet-slip migrate"):
+    with pytest.raises(
+        RefusedError,
+        match=r"lacks columns of the signal catalog: steer\. Add them with: fleet-slip migrate",
+    ):
         ingest_file(now, tmp_path / "c.csv", extended)
     assert ask(now.root, "SELECT count(*) FROM quarantine") == [(0,)]
     migrate(now)
