@@ -119,8 +119,11 @@ UV = Path(sys.executable).with_name("uv")
 @pytest.mark.parametrize("extra", PROJECT["project"]["optional-dependencies"])
 def test_an_extra_installs_under_the_constraints(tmp_path: Path, extra: str) -> None:
     assert run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path)]).exit_code == 0
-    install = [str(UV), "pip", "install", "--dry-run", "--python", str(tmp_path / "bin/python")]
+    python = str(tmp_path / "bin/python")
     constraints = ["--constraint", str(REPOSITORY / "constraints.txt")]
-    done = run([*install, *constraints, f"{REPOSITORY}[{extra}]"])
+    install = [str(UV), "pip", "install", "--python", python, *constraints]
+    done = run([*install, f"{REPOSITORY}[{extra}]"])
     assert done.exit_code == 0, done.stderr
     assert "yanked" not in done.stderr
+    assert run([str(UV), "pip", "check", "--python", python]).exit_code == 0
+    assert run([str(tmp_path / "bin/fleet-slip"), "--version"]).exit_code == 0
