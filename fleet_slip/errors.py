@@ -40,7 +40,7 @@ def _without_user(match: re.Match[str]) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text on one line for a terminal or log, with escapes such as `\x1b`.
+    r"""Return text on one line for a terminal or log, with escapes such as `\x1b`.
 
     Names from outside may contain line breaks, which forge lines, or escape sequences.
     """

@@ -141,11 +141,16 @@ the number of cars: (3 x 1.2533 x 1.4826)^2 for normal deviates."""
 class Roads:
     """Roads of a fleet.
 
-    Attributes:
-        banked: True unless bends are certainly flat.
-        lean: camber as lateral acceleration of every car, m/s^2; None if unknown.
-        uncertainty: standard error of the camber.
-        cars: number of cars that determined it.
+    Attributes
+    ----------
+    banked
+        True unless bends are certainly flat.
+    lean
+        Camber as lateral acceleration of every car, m/s^2; None if unknown.
+    uncertainty
+        Standard error of the camber.
+    cars
+        Number of cars that determined it.
     """
 
     banked: bool
@@ -224,11 +229,16 @@ by noise and from wheel slip. In banked bends, a body that rolls by 2 to 6 degre
 class CalibratedParameter:
     """Calibration parameter of a car.
 
-    Attributes:
-        value: in SI units; the exact rational, rounded once.
-        count: multiple of the grain that models and boards use.
-        uncertainty: standard error in SI units; None if no car has two drives.
-        drives, rows: amount of data.
+    Attributes
+    ----------
+    value
+        In SI units; the exact rational, rounded once.
+    count
+        Multiple of the grain that models and boards use.
+    uncertainty
+        Standard error in SI units; None if no car has two drives.
+    drives, rows
+        Amount of data.
     """
 
     value: float
@@ -431,12 +441,18 @@ def three_digits(value: float) -> float:
 class Calibration(Answer):
     """Calibration parameters of the cars of a cohort.
 
-    Attributes:
-        cars: the parameters of each car by `vehicle_id`, as far as its drives determine them.
-        missing: reasons for missing parameters, by car.
-        logs_version, grams_version: versions of the Delta tables that were read.
-        evidence: sums and variances that the parameters follow from.
-        receivers: delays of satellite receivers, from the Gram rows of `delay`.
+    Attributes
+    ----------
+    cars
+        The parameters of each car by `vehicle_id`, as far as its drives determine them.
+    missing
+        Reasons for missing parameters, by car.
+    logs_version, grams_version
+        Versions of the Delta tables that were read.
+    evidence
+        Sums and variances that the parameters follow from.
+    receivers
+        Delays of satellite receivers, from the Gram rows of `delay`.
     """
 
     cars: Mapping[str, Mapping[CalibrationParameterName, CalibratedParameter]]

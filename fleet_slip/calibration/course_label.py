@@ -63,14 +63,20 @@ circuit."""
 class CourseLabelQuality(Record):
     """Error of a model that was learned from changes of the course; None if not estimable.
 
-    Attributes:
-        change_s: durations of the changes.
-        error_deg: cross-validated error of changes, including the noise of two fixes.
-        noise_deg, noise_uncertainty_deg: noise of a change on straight road; jackknife over drives.
-        angle_at_most_deg: upper bound of the error of the angle over these durations: `error_deg`
-            without noise, shared by two independent errors.
-        turn_balance: mean of the angles turned over their root mean square: 1 for constant left
-            turns, -1 for constant right turns.
+    Attributes
+    ----------
+    change_s
+        Durations of the changes.
+    error_deg
+        Cross-validated error of changes, including the noise of two fixes.
+    noise_deg, noise_uncertainty_deg
+        Noise of a change on straight road; jackknife over drives.
+    angle_at_most_deg
+        Upper bound of the error of the angle over these durations: `error_deg`
+        without noise, shared by two independent errors.
+    turn_balance
+        Mean of the angles turned over their root mean square: 1 for constant left
+        turns, -1 for constant right turns.
     """
 
     change_s: tuple[float, ...]

@@ -52,13 +52,19 @@ GRAIN_RAD = Fraction(1, 10**9)
 class InterceptEstimate:
     """Intercept of a model and its dependence on the sensor offsets of a car.
 
-    Attributes:
-        intercept: rad. Mean over cars by rows; with `MIN_CARS` cars that of the median car, with
-            `slopes` that of a car without offsets.
-        slopes: rad per count of the offset, by calibrated column; empty for few or similar cars.
-        uncertainty: rad, from the scatter of drives or cars; None for a single drive.
-        std_between_cars: rad, what the slopes do not explain.
-        cars: number of cars.
+    Attributes
+    ----------
+    intercept
+        Rad. Mean over cars by rows; with `MIN_CARS` cars that of the median car, with
+        `slopes` that of a car without offsets.
+    slopes
+        Rad per count of the offset, by calibrated column; empty for few or similar cars.
+    uncertainty
+        Rad, from the scatter of drives or cars; None for a single drive.
+    std_between_cars
+        Rad, what the slopes do not explain.
+    cars
+        Number of cars.
     """
 
     intercept: Fraction = Fraction(0)

@@ -123,10 +123,14 @@ class VectorOperation:
 class Code:
     """Operations in order, equal ones once, and what they number.
 
-    Attributes:
-        signals, of_car: what the program reads of a drive and its car, with their numbers.
-        summed, stored: the values that are summed, and stored, over a drive.
-        kinds: windows of different lengths in ticks.
+    Attributes
+    ----------
+    signals, of_car
+        What the program reads of a drive and its car, with their numbers.
+    summed, stored
+        The values that are summed, and stored, over a drive.
+    kinds
+        Windows of different lengths in ticks.
     """
 
     operations: list[VectorOperation] = field(default_factory=list)

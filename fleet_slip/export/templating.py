@@ -50,7 +50,7 @@ def field_names(program: Steps) -> dict[str, tuple[str, ...]]:
 
 
 def distinct(names: Sequence[str], max_length: int | None = None) -> tuple[str, ...]:
-    """Number repeated names, so that all are distinct; none is longer than `max_length`."""
+    """Return distinct names: repeated ones get a number, none is longer than `max_length`."""
     unique: list[str] = []
     for name in names:
         count, candidate = 1, name[:max_length]

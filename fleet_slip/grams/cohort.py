@@ -73,17 +73,27 @@ class Cohort:
     A drive has several rows if a signal is missing in some of its log rows, or if its feature set
     divides drives into blocks.
 
-    Attributes:
-        catalog: definitions of the columns.
-        predicate: SQL predicate on the view `drives`.
-        logs_version, grams_version, feature_set: the data that were read.
-        left_out: number of drives without such Gram rows because their cars sent no log.
-        drives: metadata of each Gram row: drive, car, signals, number of rows.
-        tables: the Gram rows in the order of `drives`, by signals; empty if only `sums` were read.
-        sums, folding: the Gram of each fold and the division into folds, if only these were read.
-        source: warehouse or reader of the Gram rows.
-        prior, weight: Gram rows of simulated drives that belong to the training set of every fold,
-            and the weight of their rows; rows of the cohort have the weight 1.
+    Attributes
+    ----------
+    catalog
+        Definitions of the columns.
+    predicate
+        SQL predicate on the view `drives`.
+    logs_version, grams_version, feature_set
+        The data that were read.
+    left_out
+        Number of drives without such Gram rows because their cars sent no log.
+    drives
+        Metadata of each Gram row: drive, car, signals, number of rows.
+    tables
+        The Gram rows in the order of `drives`, by signals; empty if only `sums` were read.
+    sums, folding
+        The Gram of each fold and the division into folds, if only these were read.
+    source
+        Warehouse or reader of the Gram rows.
+    prior, weight
+        Gram rows of simulated drives that belong to the training set of every fold,
+        and the weight of their rows; rows of the cohort have the weight 1.
     """
 
     catalog: Catalog

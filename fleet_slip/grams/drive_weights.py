@@ -28,9 +28,12 @@ MAX_ROUNDS = 50
 class DownweightedDrive(Record):
     """A drive with a robust weight below 1.
 
-    Attributes:
-        weight: from 0 to 1.
-        times: root mean square of its residuals over that of the median drive.
+    Attributes
+    ----------
+    weight
+        From 0 to 1.
+    times
+        Root mean square of its residuals over that of the median drive.
     """
 
     DOCUMENT = "weight times"

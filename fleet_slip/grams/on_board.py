@@ -92,14 +92,22 @@ MAX_COLUMNS = 512
 class OnboardFeatureSet:
     """A feature set that cars can compute.
 
-    Attributes:
-        name, identity: of the feature set.
-        ranges: smallest and largest count of each column, in order.
-        signals: source signals, in the order of the catalog.
-        times: durations of changes in ticks; empty for a feature set of the columns themselves.
-        blocks: names of the blocks of a drive; None for an undivided drive.
-        in_time: True if the course is corrected for its delay.
-        definition: number of the feature set in C code.
+    Attributes
+    ----------
+    name, identity
+        Of the feature set.
+    ranges
+        Smallest and largest count of each column, in order.
+    signals
+        Source signals, in the order of the catalog.
+    times
+        Durations of changes in ticks; empty for a feature set of the columns themselves.
+    blocks
+        Names of the blocks of a drive; None for an undivided drive.
+    in_time
+        True if the course is corrected for its delay.
+    definition
+        Number of the feature set in C code.
     """
 
     name: str

@@ -234,13 +234,20 @@ def _update_set(
 class _Work:
     """Difference between the Gram rows of a feature set and the log files.
 
-    Attributes:
-        grams, logs: the snapshots that were compared.
-        identity: of the feature set.
-        files: log files to read: those without Gram rows, and the outdated ones.
-        outdated: paths of log files whose Gram rows have another course delay than their cars.
-        stale: paths in `grams` that are no active log file.
-        delays: course delay of each car, for feature sets that are corrected for it.
+    Attributes
+    ----------
+    grams, logs
+        The snapshots that were compared.
+    identity
+        Of the feature set.
+    files
+        Log files to read: those without Gram rows, and the outdated ones.
+    outdated
+        Paths of log files whose Gram rows have another course delay than their cars.
+    stale
+        Paths in `grams` that are no active log file.
+    delays
+        Course delay of each car, for feature sets that are corrected for it.
     """
 
     grams: Snapshot

@@ -218,9 +218,12 @@ _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "co
 class MeasuredDrive:
     """An uninterrupted segment of a file on ticks.
 
-    Attributes:
-        metadata: values by column of `logs`.
-        counts: an int16 array for each signal.
+    Attributes
+    ----------
+    metadata
+        Values by column of `logs`.
+    counts
+        An int16 array for each signal.
     """
 
     drive_id: str

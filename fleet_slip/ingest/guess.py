@@ -50,13 +50,20 @@ Keys: TypeAlias = Mapping[str, Any]
 class Guess:
     """A channel as a signal.
 
-    Attributes:
-        keys: of the signal in a mapping, without the column: unit, negate, sign …
-        reasons: texts for people.
-        is_weak: True if its name may mean another signal.
-        doubts: reasons against it.
-        rivals: other signals that its name and unit fit.
-        readings: the possible units, if the file has none.
+    Attributes
+    ----------
+    keys
+        Of the signal in a mapping, without the column: unit, negate, sign …
+    reasons
+        Texts for people.
+    is_weak
+        True if its name may mean another signal.
+    doubts
+        Reasons against it.
+    rivals
+        Other signals that its name and unit fit.
+    readings
+        The possible units, if the file has none.
     """
 
     signal: str

@@ -148,9 +148,12 @@ class Preview(FileReport, Answer):
 class WrittenFile:
     """A file of a batch after writing: its report and its fingerprints.
 
-    Attributes:
-        same: sources with its fingerprints, whether their rows still exist or not.
-        replaced: the sources that it replaces.
+    Attributes
+    ----------
+    same
+        Sources with its fingerprints, whether their rows still exist or not.
+    replaced
+        The sources that it replaces.
     """
 
     log: Path

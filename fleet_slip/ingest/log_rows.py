@@ -259,7 +259,7 @@ def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> Row
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    """A signal in SI units. Its range is checked on the count that it will become."""
+    """Return a signal in SI units; its range is checked on the count that it becomes."""
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
@@ -346,10 +346,14 @@ class CheckedBlock(NamedTuple):
 class RowChecker:
     """Checks the rows of a file and counts them.
 
-    Attributes:
-        rows: read so far.
-        left_out: of these, those that do not meet the mapping's conditions.
-        keys: the metadata of each number in the column `group`.
+    Attributes
+    ----------
+    rows
+        Read so far.
+    left_out
+        Of these, those that do not meet the mapping's conditions.
+    keys
+        The metadata of each number in the column `group`.
     """
 
     def __init__(self, file: Path, mapping: Mapping) -> None:

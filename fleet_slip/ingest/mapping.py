@@ -351,7 +351,7 @@ class Mapping(Config):
         return PlainNumbers(columns, tuple(float(text) for text in self.missing if is_number(text)))
 
     def canonical_json(self) -> str:
-        """The mapping as JSON that does not depend on the order or layout of its TOML file."""
+        """Return JSON of the mapping that does not depend on the layout of its TOML file."""
         return canonical_ascii(self.model_dump(mode="json"))
 
 

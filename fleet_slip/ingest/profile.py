@@ -178,13 +178,19 @@ _SAMPLE_TEXTS = 200
 class Profile:
     """One channel of a file.
 
-    Attributes:
-        rate_hz: of its time base, where the file has a clock.
-        values: those looked at as numbers, NaN where there is none; of times, seconds since 1970
-            or midnight; empty for other texts.
-        texts: some of its texts, all that are no numbers among numbers.
-        keys: where it has texts or whole numbers, a number for each; else empty.
-        time_format: of texts that are times; empty for a type that is a time.
+    Attributes
+    ----------
+    rate_hz
+        Of its time base, where the file has a clock.
+    values
+        Those looked at as numbers, NaN where there is none; of times, seconds since 1970
+        or midnight; empty for other texts.
+    texts
+        Some of its texts, all that are no numbers among numbers.
+    keys
+        Where it has texts or whole numbers, a number for each; else empty.
+    time_format
+        Of texts that are times; empty for a type that is a time.
     """
 
     channel: Channel

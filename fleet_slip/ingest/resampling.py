@@ -166,9 +166,12 @@ def choose_method(time_s: FloatArray, interval_s: float) -> Method:
 class Resampler:
     """Brings the signals of one drive onto its ticks.
 
-    Attributes:
-        ticks: the drive's ticks, shape (n_ticks,).
-        start_s: time of tick 0.
+    Attributes
+    ----------
+    ticks
+        The drive's ticks, shape (n_ticks,).
+    start_s
+        Time of tick 0.
     """
 
     time_s: FloatArray

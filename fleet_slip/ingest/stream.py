@@ -64,10 +64,14 @@ MAX_TICKS_PER_ROW = 1000
 class IngestCounts:
     """Counts of a file's rows: each row read is left out, kept or quarantined.
 
-    Attributes:
-        rows_left_out: rows that do not meet the mapping's conditions.
-        quarantined: refused rows by reason.
-        ticks: rows of the result; equal to `rows_kept` where nothing was resampled.
+    Attributes
+    ----------
+    rows_left_out
+        Rows that do not meet the mapping's conditions.
+    quarantined
+        Refused rows by reason.
+    ticks
+        Rows of the result; equal to `rows_kept` where nothing was resampled.
     """
 
     rows_read: int = 0

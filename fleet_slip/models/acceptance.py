@@ -87,12 +87,18 @@ MAX_GROUPS = 20
 class Comparison:
     """A challenger and published versions on the same held-out rows.
 
-    Attributes:
-        by: what was held out, vehicle or drive.
-        challenger: refitted without each group that it is tested on.
-        incumbents: the champion, and the best champion so far if it is another version.
-        gaps: RMSE gap of the challenger to each incumbent.
-        unseen: True if no incumbent was trained on these rows.
+    Attributes
+    ----------
+    by
+        What was held out, vehicle or drive.
+    challenger
+        Refitted without each group that it is tested on.
+    incumbents
+        The champion, and the best champion so far if it is another version.
+    gaps
+        RMSE gap of the challenger to each incumbent.
+    unseen
+        True if no incumbent was trained on these rows.
     """
 
     by: FoldKey
@@ -149,13 +155,20 @@ class Comparison:
 class ChallengerEvaluation:
     """How to refit a challenger without held-out groups, and the incumbents to compare it with.
 
-    Attributes:
-        name: the challenger's.
-        signals: inputs of the challenger and all incumbents.
-        by: what is held out, vehicle or drive.
-        procedure: fits the challenger; searches its columns again if a search found them.
-        incumbents: published models in counts, by reference.
-        tolerance: RMSE gap that is no reason to refuse the challenger.
+    Attributes
+    ----------
+    name
+        The challenger's.
+    signals
+        Inputs of the challenger and all incumbents.
+    by
+        What is held out, vehicle or drive.
+    procedure
+        Fits the challenger; searches its columns again if a search found them.
+    incumbents
+        Published models in counts, by reference.
+    tolerance
+        RMSE gap that is no reason to refuse the challenger.
     """
 
     catalog: Catalog
@@ -429,11 +442,16 @@ def gain_on_outliers_only(
 class Review:
     """Result of a review.
 
-    Attributes:
-        problems: reasons to refuse the challenger.
-        compared: the comparison as a phrase.
-        best: number of an earlier champion that is better, None if none is.
-        is_significantly_worse: True if the champion is better, though not by a refusable gap.
+    Attributes
+    ----------
+    problems
+        Reasons to refuse the challenger.
+    compared
+        The comparison as a phrase.
+    best
+        Number of an earlier champion that is better, None if none is.
+    is_significantly_worse
+        True if the champion is better, though not by a refusable gap.
     """
 
     problems: tuple[str, ...]

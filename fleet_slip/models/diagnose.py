@@ -27,14 +27,22 @@ from fleet_slip.rendering import Answer, Part, Remark, TextTable
 class Diagnosis(Answer):
     """One model on one cohort; coefficients are in SI units, and None is what was not asked for.
 
-    Attributes:
-        fitted: exact fit, in counts.
-        cluster: what is independent in `robust` and `evidence`; rows of a single drive.
-        inflation: variance inflation of each input.
-        condition_number: of the inputs' correlation matrix.
-        evidence: effective rows and design effect.
-        units: of the inputs and the intercept, by name.
-        weighed: the drives that `robust` of a selection would count less, by name.
+    Attributes
+    ----------
+    fitted
+        Exact fit, in counts.
+    cluster
+        What is independent in `robust` and `evidence`; rows of a single drive.
+    inflation
+        Variance inflation of each input.
+    condition_number
+        Of the inputs' correlation matrix.
+    evidence
+        Effective rows and design effect.
+    units
+        Of the inputs and the intercept, by name.
+    weighed
+        The drives that `robust` of a selection would count less, by name.
     """
 
     DOCUMENT = (

@@ -382,11 +382,16 @@ def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossVali
 class Publication(Answer):
     """Result of publishing.
 
-    Attributes:
-        version: the new version, or the champion if nothing changed.
-        new: True if there is a new version.
-        reason: the comparison, as a sentence.
-        candidate: True if the version waits for `promote`.
+    Attributes
+    ----------
+    version
+        The new version, or the champion if nothing changed.
+    new
+        True if there is a new version.
+    reason
+        The comparison, as a sentence.
+    candidate
+        True if the version waits for `promote`.
     """
 
     DOCUMENT = (
@@ -449,12 +454,18 @@ def publish_challenger(
 class DryRun(Answer):
     """Result that publishing would have.
 
-    Attributes:
-        model: name of the model.
-        publishes: True if there would be a new version, as champion or as candidate.
-        reason: the comparison, or why nothing would be published.
-        candidate: True if the version would wait for `promote`.
-        refused: True if `publish_challenger` would raise `RefusedError`.
+    Attributes
+    ----------
+    model
+        Name of the model.
+    publishes
+        True if there would be a new version, as champion or as candidate.
+    reason
+        The comparison, or why nothing would be published.
+    candidate
+        True if the version would wait for `promote`.
+    refused
+        True if `publish_challenger` would raise `RefusedError`.
     """
 
     model: str
@@ -505,12 +516,18 @@ def would_publish(
 class _Decision:
     """Decision on a challenger.
 
-    Attributes:
-        reason: the comparison, as a sentence.
-        champion: the champion if it stays, and nothing is published.
-        waits: True if the challenger becomes the candidate.
-        held: the move that holds the champion.
-        best: number of the best champion so far, for `AliasHistory.move`.
+    Attributes
+    ----------
+    reason
+        The comparison, as a sentence.
+    champion
+        The champion if it stays, and nothing is published.
+    waits
+        True if the challenger becomes the candidate.
+    held
+        The move that holds the champion.
+    best
+        Number of the best champion so far, for `AliasHistory.move`.
     """
 
     reason: str

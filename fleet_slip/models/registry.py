@@ -508,10 +508,13 @@ _LONGEST_SHOWN = 40
 class Difference(Answer):
     """Differences of two versions.
 
-    Attributes:
-        facts: values of both by the path of the entry; None where an entry is missing.
-        drives: training drives of the first alone, the second alone, and both; None if the
-            versions are of two models.
+    Attributes
+    ----------
+    facts
+        Values of both by the path of the entry; None where an entry is missing.
+    drives
+        Training drives of the first alone, the second alone, and both; None if the
+        versions are of two models.
     """
 
     first: ModelVersion

@@ -409,12 +409,18 @@ GIVEN = "given"
 class SelectionPlan:
     """A validated selection: what is compared, on which feature set and folds.
 
-    Attributes:
-        original: the request as it was given.
-        request: the request with the name of its model list, and the label of the list.
-        model_list: the list, None for an order or a search of the request.
-        searches: of the request, else of the list.
-        tolerance, intercept: of the request, else of the list.
+    Attributes
+    ----------
+    original
+        The request as it was given.
+    request
+        The request with the name of its model list, and the label of the list.
+    model_list
+        The list, None for an order or a search of the request.
+    searches
+        Of the request, else of the list.
+    tolerance, intercept
+        Of the request, else of the list.
     """
 
     original: SelectionRequest

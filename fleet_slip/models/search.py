@@ -48,12 +48,18 @@ ALL_SUBSETS = "all-subsets"
 class SearchChoice(Record):
     """Choice of a number of signals.
 
-    Attributes:
-        rule: ranking (or `ALL_SUBSETS`) and criterion.
-        evidence: independent evidence behind the criterion.
-        nested: the ranked signals with the criterion's values; None for all subsets.
-        subsets: the best subsets of size 0, 1, ...; each criterion picks a size.
-        honest: figures of the choice, repeated in every training fold; None for two folds.
+    Attributes
+    ----------
+    rule
+        Ranking (or `ALL_SUBSETS`) and criterion.
+    evidence
+        Independent evidence behind the criterion.
+    nested
+        The ranked signals with the criterion's values; None for all subsets.
+    subsets
+        The best subsets of size 0, 1, ...; each criterion picks a size.
+    honest
+        Figures of the choice, repeated in every training fold; None for two folds.
     """
 
     DOCUMENT = (

@@ -65,23 +65,40 @@ from fleet_slip.warehouse.warehouse import Warehouse
 class Selection(Answer):
     """All candidates with their figures, in the order of the list, and the winner.
 
-    Attributes:
-        models: figures on the rows that all candidates can use.
-        winner: the winner, fitted to all rows that it can use.
-        skipped: candidates that were not compared, with the reason.
-        choice: choice of an order or a subset; None for a list of models.
-        searched: the models of each search, which are among `models`.
-        distances: of an order's nested models from the full and the true one, or why unknown.
-        intercept: False if models go through the origin.
-        model_list, config_sha256: name of what was compared, such as `table1`, and its checksum.
-        compared: what was compared, as a model list.
-        weighted: the drives that `robust` down-weights, the most unusual first.
-        full: how many times a row of full weight counts.
-        without_label: how good the winner is, if changes of the course alone trained it.
-        label_noise_deg: of the label, which every error has in it; None where it is not known.
-        request, asked_condition: what was asked for, and of which drives.
-        remark: why another list than the usual one was compared.
-        examined: which drives were left out for faulty sensors, as a sentence.
+    Attributes
+    ----------
+    models
+        Figures on the rows that all candidates can use.
+    winner
+        The winner, fitted to all rows that it can use.
+    skipped
+        Candidates that were not compared, with the reason.
+    choice
+        Choice of an order or a subset; None for a list of models.
+    searched
+        The models of each search, which are among `models`.
+    distances
+        Of an order's nested models from the full and the true one, or why unknown.
+    intercept
+        False if models go through the origin.
+    model_list, config_sha256
+        Name of what was compared, such as `table1`, and its checksum.
+    compared
+        What was compared, as a model list.
+    weighted
+        The drives that `robust` down-weights, the most unusual first.
+    full
+        How many times a row of full weight counts.
+    without_label
+        How good the winner is, if changes of the course alone trained it.
+    label_noise_deg
+        Of the label, which every error has in it; None where it is not known.
+    request, asked_condition
+        What was asked for, and of which drives.
+    remark
+        Why another list than the usual one was compared.
+    examined
+        Which drives were left out for faulty sensors, as a sentence.
     """
 
     cohort: Cohort
@@ -408,10 +425,14 @@ def _has_drives(search: Search, cohort: Cohort, skipped: dict[str, str]) -> bool
 class ComparedRows:
     """The rows on which all candidates are compared.
 
-    Attributes:
-        folds: rows that have the signals of all candidates and all columns.
-        candidates: the comparable candidates, in their order.
-        columns: the comparable columns of searches, in their order.
+    Attributes
+    ----------
+    folds
+        Rows that have the signals of all candidates and all columns.
+    candidates
+        The comparable candidates, in their order.
+    columns
+        The comparable columns of searches, in their order.
     """
 
     folds: CohortFolds

@@ -62,9 +62,12 @@ class Limits:
 class Day:
     """Errors of one day.
 
-    Attributes:
-        training: the day made the model; its errors are those of the model without it.
-        alarms: figures beyond their limits, of a new day.
+    Attributes
+    ----------
+    training
+        The day made the model; its errors are those of the model without it.
+    alarms
+        Figures beyond their limits, of a new day.
     """
 
     day: date
@@ -81,9 +84,11 @@ class Day:
 class Chart(Answer):
     """A control chart of a model version.
 
-    Attributes:
-        drives_left_out: drives of the cohort without Gram rows of the model's feature set, since
-            their cars sent no log.
+    Attributes
+    ----------
+    drives_left_out
+        Drives of the cohort without Gram rows of the model's feature set, since
+        their cars sent no log.
     """
 
     model: str

@@ -54,13 +54,19 @@ MAX_INSPECTED = 20
 class QualityReport(Answer):
     """Faulty sensors and labels of a cohort.
 
-    Attributes:
-        drives: number of drives that are long enough to be checked.
-        compared: those among them with enough peers to be compared with.
-        findings: one for each faulty drive, by day and drive.
-        systematic: faults of most of the drives whose rows were checked. No drive shows what is
-            right, so that none is left out of training; `publish` refuses a first champion.
-        inspected: number of drives whose rows were checked.
+    Attributes
+    ----------
+    drives
+        Number of drives that are long enough to be checked.
+    compared
+        Those among them with enough peers to be compared with.
+    findings
+        One for each faulty drive, by day and drive.
+    systematic
+        Faults of most of the drives whose rows were checked. No drive shows what is
+        right, so that none is left out of training; `publish` refuses a first champion.
+    inspected
+        Number of drives whose rows were checked.
     """
 
     drives: int

@@ -64,11 +64,16 @@ CHECK_ROWS = 20_000_000
 class SensorScreen:
     """The result of checking the drives of a cohort.
 
-    Attributes:
-        cohort: the predicate without the faulty drives.
-        drives: number of drives that were long enough to be checked.
-        faults_by_hash: the fault of each faulty drive, by its hash.
-        missing: number of measured drives without Gram rows, which were not checked.
+    Attributes
+    ----------
+    cohort
+        The predicate without the faulty drives.
+    drives
+        Number of drives that were long enough to be checked.
+    faults_by_hash
+        The fault of each faulty drive, by its hash.
+    missing
+        Number of measured drives without Gram rows, which were not checked.
     """
 
     cohort: str

@@ -25,11 +25,16 @@ KINDS = {
 class Fault:
     """A relation that a drive or a log contradicts.
 
-    Attributes:
-        kind: such as stuck, reversed, swapped, scaled, biased, late; see `CHECKS`.
-        signals: those in doubt.
-        figure: the evidence.
-        remedy: what to change in the mapping, or what to do.
+    Attributes
+    ----------
+    kind
+        Such as stuck, reversed, swapped, scaled, biased, late; see `CHECKS`.
+    signals
+        Those in doubt.
+    figure
+        The evidence.
+    remedy
+        What to change in the mapping, or what to do.
     """
 
     kind: str
@@ -76,16 +81,26 @@ class Data(StrEnum):
 class Check:
     """A relation that sound data satisfy.
 
-    Attributes:
-        name: unique.
-        kind: of the faults that it reports.
-        scope: what it compares.
-        data: what it reads.
-        message: evidence of a fault, with fields for figures; {low} and {high} are the threshold.
-        threshold: lowest and highest value of sound data.
-        unit: of the threshold.
-        remedy: what to change.
-        source: where the threshold is from, if not from here.
+    Attributes
+    ----------
+    name
+        Unique.
+    kind
+        Of the faults that it reports.
+    scope
+        What it compares.
+    data
+        What it reads.
+    message
+        Evidence of a fault, with fields for figures; {low} and {high} are the threshold.
+    threshold
+        Lowest and highest value of sound data.
+    unit
+        Of the threshold.
+    remedy
+        What to change.
+    source
+        Where the threshold is from, if not from here.
     """
 
     name: str

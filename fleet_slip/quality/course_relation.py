@@ -41,13 +41,20 @@ MIN_EXPLAINED, MAX_EXPLAINED_NOISE_MPS = 0.15, 0.8
 class CourseRelation:
     """The relation of a course's changes to those of the other signals.
 
-    Attributes:
-        scale: of the course's change to the yaw rate's integral.
-        lever_m, compliance: l in m and K in rad per m/s².
-        slip: standard deviation of the slip that they predict, over that of a usual car.
-        slip_error: standard error of `slip`.
-        noise_mps: of one fix, across the car.
-        explained: share that they explain of the variance that the yaw rate leaves.
+    Attributes
+    ----------
+    scale
+        Of the course's change to the yaw rate's integral.
+    lever_m, compliance
+        L in m and K in rad per m/s².
+    slip
+        Standard deviation of the slip that they predict, over that of a usual car.
+    slip_error
+        Standard error of `slip`.
+    noise_mps
+        Of one fix, across the car.
+    explained
+        Share that they explain of the variance that the yaw rate leaves.
     """
 
     scale: float

@@ -40,9 +40,12 @@ class InspectedDrive:
 class Inspection:
     """Drives whose rows were checked.
 
-    Attributes:
-        drives: one of each car first, the longest first.
-        measured: number of measured drives of the cohort.
+    Attributes
+    ----------
+    drives
+        One of each car first, the longest first.
+    measured
+        Number of measured drives of the cohort.
     """
 
     drives: tuple[InspectedDrive, ...]

@@ -21,9 +21,12 @@ BATCH = 2**12
 class MeanMoments:
     """Mean of u u' over each drive's rows, with u = (1, counts).
 
-    Attributes:
-        signals: k names.
-        matrices: shape (drives, k+1, k+1).
+    Attributes
+    ----------
+    signals
+        K names.
+    matrices
+        Shape (drives, k+1, k+1).
     """
 
     signals: tuple[str, ...]
@@ -69,9 +72,12 @@ class MeanMoments:
 class DriveBatches:
     """The mean moments of some drives of a table, in batches.
 
-    Attributes:
-        table: Gram rows, which are half as large as the matrices.
-        rows: positions of the drives in the table.
+    Attributes
+    ----------
+    table
+        Gram rows, which are half as large as the matrices.
+    rows
+        Positions of the drives in the table.
     """
 
     table: "GramTable"

@@ -47,14 +47,21 @@ class StatusThresholds(Config):
 class QualityThresholds(Config):
     """Thresholds of `quality`.
 
-    Attributes:
-        min_rows: shorter drives are not checked.
-        min_drives: smallest number of sound drives of a vehicle model to compare others with.
-        min_correlation: a sign of turning contradicts the others below minus this.
-        limit: largest distance of a figure from the cohort's median, in standard deviations.
-        offset_floor_counts, gain_floor, noise_floor: smallest standard deviation of the figures
-            between drives; noise_floor is of the logarithm of the noise.
-        max_saturated_per_row: largest number of values at the end of their range, per row.
+    Attributes
+    ----------
+    min_rows
+        Shorter drives are not checked.
+    min_drives
+        Smallest number of sound drives of a vehicle model to compare others with.
+    min_correlation
+        A sign of turning contradicts the others below minus this.
+    limit
+        Largest distance of a figure from the cohort's median, in standard deviations.
+    offset_floor_counts, gain_floor, noise_floor
+        Smallest standard deviation of the figures
+        between drives; noise_floor is of the logarithm of the noise.
+    max_saturated_per_row
+        Largest number of values at the end of their range, per row.
     """
 
     min_rows: int = Field(gt=0)
@@ -70,9 +77,12 @@ class QualityThresholds(Config):
 class MonitorThresholds(Config):
     """Thresholds of `monitor`.
 
-    Attributes:
-        min_training_days: smallest number of days to learn usual figures from.
-        false_alarms_per_day: probability that a usual day is beyond a figure's limits.
+    Attributes
+    ----------
+    min_training_days
+        Smallest number of days to learn usual figures from.
+    false_alarms_per_day
+        Probability that a usual day is beyond a figure's limits.
     """
 
     min_training_days: int = Field(ge=3)
@@ -105,10 +115,14 @@ ROUNDS = 5
 class Prediction:
     """The cohort's prediction of some signals, and the figures of its drives.
 
-    Attributes:
-        targets: positions in u of the signals that are predicted.
-        weights: shape (targets, k+1): the prediction is weights @ u.
-        median, scale: of each figure over the cohort's drives, shape (targets, 3).
+    Attributes
+    ----------
+    targets
+        Positions in u of the signals that are predicted.
+    weights
+        Shape (targets, k+1): the prediction is weights @ u.
+    median, scale
+        Of each figure over the cohort's drives, shape (targets, 3).
     """
 
     targets: NDArray[np.intp]

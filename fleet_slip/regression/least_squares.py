@@ -385,7 +385,7 @@ class ExactSums:
     """Sums of products of terms over the rows of a Gram, as fractions."""
 
     def __init__(self, gram: Gram, terms: Terms) -> None:
-        """Raises `DataError` for a column that the Gram lacks."""
+        """Sum up the products of terms. Raises `DataError` for a column that the Gram lacks."""
         self._factors = {
             name: lcm(*(weight.denominator for weight in weights.values()))
             for name, weights in terms.items()

@@ -84,9 +84,12 @@ BEING_WRITTEN_HOURS = 1.0
 class Backlog:
     """Difference between `grams` and `logs` for a feature set.
 
-    Attributes:
-        missing: active log files without Gram rows of the feature set.
-        stale: paths in `grams`, of any feature set, that are no active or pending log file.
+    Attributes
+    ----------
+    missing
+        Active log files without Gram rows of the feature set.
+    stale
+        Paths in `grams`, of any feature set, that are no active or pending log file.
     """
 
     missing: tuple[TableFile, ...]

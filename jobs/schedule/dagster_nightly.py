@@ -1,4 +1,4 @@
-"""The night as a Dagster asset with a schedule: dagster dev -f dagster_nightly.py
+"""Run the night as a Dagster asset with a schedule: `dagster dev -f dagster_nightly.py`.
 
 A command that calls for attention (exit code 10) fails the run and is not given again; what another
 process or the network caused is, and ends where it would have ended.
@@ -26,7 +26,7 @@ class Night(dagster.Config):
 
 @dagster.asset
 def champion(context: dagster.AssetExecutionContext, config: Night) -> dagster.MaterializeResult:
-    """The model version in use after the night."""
+    """Return the model version in use after the night."""
     words = ["--inbox", config.inbox, "--mapping", config.mapping, "--model", config.model]
     done = subprocess.run(
         [PROGRAM, "nightly", *words, "--json"], capture_output=True, text=True, check=False

@@ -367,10 +367,11 @@ def log_of(program: Program, car: Car, values: Sequence[Sequence[Sequence[float]
 )
 def test_a_feature_that_can_be_defined_can_be_exported(text: str, divisor: int) -> None:
     try:
-        one = Feature(
-            counts=text, divided_by=str(divisor) if divisor else None, scale=Decimal(1), unit="1",
-            column="any_feature", description="any",
-        )  # fmt: skip
+        one = Feature.model_validate(
+            {"counts": text, "divided_by": str(divisor) if divisor else None, "scale": 1}
+            | {"unit": "1", "column": "any_feature", "description": "any"},
+            context=CATALOG.signals,
+        )
     except ValidationError:
         return
     value = Fraction(1, 10**6)

@@ -39,11 +39,16 @@ _BINARY = {
 class FileFormats:
     """Parameters of a file's format that the file does not contain.
 
-    Attributes:
-        csv: separator and decimal sign of text.
-        can: the database of a CAN trace.
-        name: the mapping, for messages.
-        plain_numbers: columns of text that are numbers wherever they are used.
+    Attributes
+    ----------
+    csv
+        Separator and decimal sign of text.
+    can
+        The database of a CAN trace.
+    name
+        The mapping, for messages.
+    plain_numbers
+        Columns of text that are numbers wherever they are used.
     """
 
     csv: CsvFormat = field(default_factory=CsvFormat)

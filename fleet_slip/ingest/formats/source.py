@@ -40,11 +40,16 @@ _SHOWN_COLUMNS = 30
 class Channel:
     """A column that a file has.
 
-    Attributes:
-        name: its name in a mapping.
-        unit: its unit in the file, empty if there is none.
-        base: its time base; channels of one base form a table.
-        title: its meaning, where the format defines that by the name.
+    Attributes
+    ----------
+    name
+        Its name in a mapping.
+    unit
+        Its unit in the file, empty if there is none.
+    base
+        Its time base; channels of one base form a table.
+    title
+        Its meaning, where the format defines that by the name.
     """
 
     name: str
