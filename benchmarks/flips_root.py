@@ -44,7 +44,10 @@ _CAMPAIGN = (
     ("laps = 0.5", "laps = 0.03"),
     ("rows_per_file = 15_000", "rows_per_file = 1_500"),
 )
-_SEARCH = (("most = 14", "most = 2"), ("most = 24", "most = 3"))
+_SEARCH = (
+    ("max_features = 14", "max_features = 2"),
+    ("max_features = 24", "max_features = 3"),
+)
 _INPUTS = re.compile(r"(?s)inputs = \[.*?\]\n")
 _WINDOWS = re.compile(r'(?s)(\[sets\.windows\].*?windows = \[).*?"yaw_rate_bias",.*?\]')
 

@@ -74,7 +74,7 @@ def kinds() -> dict[str, Kind]:
 
 def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]:
     """Yield the drives of a kind."""
-    drivers = load_config(SHIPPED_CONFIGS.file("blind.toml"), BlindSet).drivers
+    drivers = load_config(SHIPPED_CONFIGS.file("blind.toml"), BlindSet, SHIPPED_CONFIGS).drivers
     for number in range(roads):
         road = one.roads[number % len(one.roads)]
         drawn = random_generator(seed, "goals", kind, str(number))

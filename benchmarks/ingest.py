@@ -43,10 +43,11 @@ SIGNALS = {
 
 _INGEST = """
 from fleet_slip.ingest.load import ingest_files
+from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
-mapping = load_mapping({mapping!r})
+mapping = load_mapping({mapping!r}, load_catalog())
 warehouse = Warehouse(LocalFolder(Path({root!r})))
 list(ingest_files(warehouse, [Path({small!r})], mapping))
 start = clocks()

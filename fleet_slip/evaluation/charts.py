@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.patches import Patch
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
@@ -143,11 +144,10 @@ def _draw_block(figure: FigureBase, block: DriveBlock, reach_deg: float) -> None
         label, tone = SHADES[section.name]
         for stretch in find_stretches(block.run.drive, section.rows):
             for axes in panels:
-                area = axes.axvspan(
+                axes.axvspan(
                     stretch.from_s, stretch.until_s, color=colour(tone), alpha=0.16, linewidth=0
                 )
-        area.set_label(label)
-        lines.append(area)
+        lines.append(Patch(color=colour(tone), label=label))
     angle.legend(
         handles=lines,
         ncols=len(lines),

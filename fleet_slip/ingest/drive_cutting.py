@@ -1,7 +1,7 @@
 """Checks the order of time and cuts rows, block by block, into drives: uninterrupted stretches."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property, partial
 from typing import Any
@@ -231,6 +231,8 @@ class MeasuredDrive:
     method: Method
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
+    grid_values: dict[str, int] = field(default_factory=dict)
+    """Values of each signal on the ticks, before labels at low speed were dropped."""
 
     @cached_property
     def counts_digest(self) -> str:
@@ -274,6 +276,7 @@ def to_ticks(
         counts[signal] = round_chunks(values, mapping.signal_catalog[signal])
     if COURSE in mapping.signals:
         counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
+    grid_values = {signal: len(array) - array.null_count for signal, array in counts.items()}
     counts |= place_label(mapping, counts)
     counts |= {
         wheel: round_chunks(
@@ -293,7 +296,7 @@ def to_ticks(
     metadata = _metadata(name, metadata_of_drive, start_s, mapping)
     if len(ticks):
         metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
-    return MeasuredDrive(name, metadata, method, ticks, counts)
+    return MeasuredDrive(name, metadata, method, ticks, counts, grid_values)
 
 
 def _fixes(

@@ -224,7 +224,8 @@ class MeasuredStream:
                 if signal in base_rows.columns
             )
             self._samples[signal] += sum(column.count() for column in columns)
-            self._values[signal] += len(values) - values.null_count
+            present = len(values) - values.null_count
+            self._values[signal] += drive.grid_values.get(signal, present)
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
         if drive.metadata["started_at"] is not None:

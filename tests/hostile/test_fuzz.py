@@ -42,4 +42,4 @@ def test_whatever_comes_is_answered_or_refused(name: str, examples: int, sandbox
                 assert str(error).isprintable()
 
     attack()
-    assert {entry.name for entry in sandbox.iterdir()} <= {"template"}
+    assert {entry.name for entry in sandbox.iterdir()} <= {"template", "list.toml"}

@@ -103,3 +103,15 @@ def test_a_label_at_standstill_is_not_stored(tmp_path: Path) -> None:
     query = "SELECT count(*) AS rows, count(sideslip_rad) AS labels FROM log"
     done = run_on(root, "sql", query, "--json")
     assert done.json == [{"rows": 6000, "labels": 4000}]
+
+
+def test_a_log_of_a_standing_car_is_stored_without_its_label(tmp_path: Path) -> None:
+    """Its label is on the ticks, and is left out because of the speed alone."""
+    (car,) = drives(1)
+    rng = np.random.default_rng(4)
+    car = {name: 1e-3 * rng.normal(size=1000) for name in car}
+    car["sideslip"] = rng.normal(0, 0.35, 1000)
+    root = tmp_path / "root"
+    run_on(root, *write_drives(tmp_path, car))
+    query = "SELECT count(*) AS rows, count(sideslip_rad) AS labels FROM log"
+    assert run_on(root, "sql", query, "--json").json == [{"rows": 1000, "labels": 0}]
