@@ -16,7 +16,7 @@ from benchmarks.interleave_roots import ADDED, CAR, FIRST_DAY, ROWS
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.models.registry import ModelVersion, Registry
-from fleet_slip.operations.marked_models import marked_models
+from fleet_slip.operations.forget import marked_models
 from fleet_slip.operations.verify import verify
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit

@@ -1,13 +1,20 @@
-"""SQL views of a data root: its tables, the models and the history of runs."""
+"""SQL views of a data root, of one moment: its tables, the models and the history of runs."""
 
 import re
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self, TypeVar
 
 import duckdb
+import pyarrow as pa
 
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.errors import QueryGoesOnError, QuestionError
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
+from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
 from fleet_slip.warehouse.table_views import (
     TABLE_VIEWS,
     add_table,
@@ -86,3 +93,61 @@ def needed_views(query: str) -> frozenset[str]:
         return VIEWS
     views = views_in(query, VIEWS)
     return VIEWS if not views and _READS_TABLE.search(query) else views
+
+
+# Queries.
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Session:
+    """A connection with the views of one moment, for one thread; `Fleet.session` opens one.
+
+    Close it, or use it in a `with` block. Queries raise `QuestionError` if invalid or, unless it is
+    `unlocked`, writing.
+    """
+
+    database: duckdb.DuckDBPyConnection
+    unlocked: bool = False
+
+    def sql(self, query: str) -> duckdb.DuckDBPyRelation:
+        """Return the answer as a relation; what is made of it keeps the connection open."""
+        text = query if self.unlocked else one_query(self.database, query)
+        with database_errors("the query"):
+            relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)
+        if relation is None:
+            raise QuestionError("the query is empty.")
+        return relation
+
+    def table(self, query: str) -> pa.Table:
+        """Return the answer as an Arrow table; see `compute`."""
+        return self.compute(query, duckdb.DuckDBPyRelation.to_arrow_table)
+
+    def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
+        """Do work with the answer to a query; Ctrl-C ends it within a second.
+
+        Raises `StorageError` if a file that was read is not what its checksum says.
+        """
+
+        def answer() -> Result:
+            with reading_files(self.database, "the query"):
+                return work(self.sql(query))
+
+        return interruptible(self.database, answer)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.database.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: types.TracebackType | None,
+    ) -> None:
+        if not isinstance(error, QueryGoesOnError):
+            self.close()

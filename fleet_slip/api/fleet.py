@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.fleet_evaluation import FleetEvaluation
     from fleet_slip.api.fleet_maintenance import FleetMaintenance
     from fleet_slip.api.fleet_models import FleetModels
-    from fleet_slip.api.session import Session
-    from fleet_slip.api.training import LearnReport, RunReport
+    from fleet_slip.api.pipelines import LearnReport, RunReport
     from fleet_slip.grams.on_board import OnboardImport
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.load import IngestReport, Preview
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.night import NightReport
     from fleet_slip.simulation.campaign import Campaign
     from fleet_slip.simulation.simulate import SimulationReport
+    from fleet_slip.views import Session
     from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -154,8 +154,7 @@ class Fleet:
         StorageError
             If there is no data root.
         """
-        from fleet_slip.api.session import Session
-        from fleet_slip.views import open_views
+        from fleet_slip.views import Session, open_views
 
         database = open_views(self.warehouse, query, threads, unlocked=unlocked)
         return Session(database, unlocked)
@@ -466,7 +465,7 @@ class Fleet:
         FleetSlipError
             What `simulate`, `gram`, `FleetCohort.select` and `FleetModels.publish` raise.
         """
-        from fleet_slip.api.training import RunReport, Training
+        from fleet_slip.api.pipelines import RunReport, Training
         from fleet_slip.models.manifest import require_model_name
         from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
         from fleet_slip.simulation.campaign import load_campaign
@@ -536,7 +535,7 @@ class Fleet:
         FleetSlipError
             What `ingest`, `gram` and `FleetCohort.select` raise.
         """
-        from fleet_slip.api.training import LearnReport, Training
+        from fleet_slip.api.pipelines import LearnReport, Training
         from fleet_slip.errors import InputError
         from fleet_slip.models.manifest import require_model_name
 
@@ -635,8 +634,7 @@ class Fleet:
         StorageError
             If the night cannot be recorded.
         """
-        from fleet_slip.api.nightly import NightlyPipeline
-        from fleet_slip.api.training import Training
+        from fleet_slip.api.pipelines import NightlyPipeline, Training
         from fleet_slip.models.manifest import require_model_name
         from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
 

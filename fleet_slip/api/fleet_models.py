@@ -56,7 +56,7 @@ class FleetModels:
             One row per version. `trained_on_forgotten` is true if a training drive of the version
             was erased since.
         """
-        from fleet_slip.operations.marked_models import marked_models
+        from fleet_slip.operations.forget import marked_models
 
         self.warehouse.require()
         if name is not None:

@@ -19,8 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 import fleet_slip
-from fleet_slip.cli.output import say
-from fleet_slip.cli.streams import Streams, configure_remarks
+from fleet_slip.cli.output import Streams, configure_remarks, say
 from fleet_slip.errors import (
     INTERRUPTED,
     FleetSlipError,
@@ -53,7 +52,7 @@ GROUPS = {
     "Data": {
         "simulate": "data_commands",
         "gram": "data_commands",
-        "features": "feature_commands",
+        "features": "data_commands",
     },
     "Models": {
         "select": "selection_commands",

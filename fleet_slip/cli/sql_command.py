@@ -22,7 +22,7 @@ from fleet_slip.errors import QuestionError, StorageError, UsageError
 from fleet_slip.warehouse.database import limit_memory, split_statements
 
 if TYPE_CHECKING:
-    from fleet_slip.api.session import Session
+    from fleet_slip.views import Session
 
 SCREEN_ROWS = 40
 UNLIMITED = 2**31 - 1

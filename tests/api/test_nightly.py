@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.api import nightly
-from fleet_slip.api.nightly import NightlyPipeline
+from fleet_slip.api import pipelines
+from fleet_slip.api.pipelines import NightlyPipeline
 from fleet_slip.errors import StorageError, UsageError
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport
 from fleet_slip.regression.gram import Gram
@@ -71,7 +71,7 @@ def forgiving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         champions_by(own, "tolerance_deg = 0.025", "tolerance_deg = 1.0  "),
         pytest.MonkeyPatch.context() as patch,
     ):
-        patch.setattr(nightly, "SAMPLE_FILES", 1)
+        patch.setattr(pipelines, "SAMPLE_FILES", 1)
         yield
 
 

@@ -117,7 +117,7 @@ def test_a_gram_job_that_was_interrupted_goes_on(smoke_copy: Path) -> None:
 BEGUN = "the query has begun"
 SAYS_SO = f"""
 import sys
-from fleet_slip.api.session import Session
+from fleet_slip.views import Session
 from fleet_slip.cli.main import main
 
 ask = Session.sql

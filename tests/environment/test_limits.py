@@ -138,7 +138,7 @@ def test_a_reader_that_has_enough_is_no_failure(tmp_path: Path) -> None:
 def test_a_closed_stream_is_not_taken_by_a_data_file(tmp_path: Path) -> None:
     """The first file that a process opens gets the number of a stream that is closed."""
     code = (
-        "import os, sys; from fleet_slip.cli.streams import Streams; Streams(); "
+        "import os, sys; from fleet_slip.cli.output import Streams; Streams(); "
         "data = os.open(sys.argv[1], os.O_WRONLY | os.O_CREAT); assert data > 2, data; "
         "print('result', flush=True); print('remark', file=sys.stderr, flush=True)"
     )

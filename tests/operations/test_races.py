@@ -24,8 +24,7 @@ from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
 from fleet_slip.operations import rewriting
 from fleet_slip.operations.find_drives import find_expired
-from fleet_slip.operations.forget import forget
-from fleet_slip.operations.marked_models import marked_models
+from fleet_slip.operations.forget import forget, marked_models
 from fleet_slip.operations.rewriting import compact
 from fleet_slip.operations.verify import repair, verify
 from fleet_slip.resources import SHIPPED_CONFIGS

@@ -14,8 +14,7 @@ from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import CANDIDATE, Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
-from fleet_slip.operations.forget import forget
-from fleet_slip.operations.marked_models import models_trained_on
+from fleet_slip.operations.forget import forget, models_trained_on
 from fleet_slip.regression.choice import ZERO_TOLERANCE
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
