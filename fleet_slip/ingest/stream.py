@@ -37,19 +37,7 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
-from fleet_slip.quality.checks import (
-    ASSUMED_RATE,
-    MANY_REFUSED,
-    OVERLAPPING_ROWS,
-    REFUSED_INFINITE,
-    REFUSED_RANGE,
-    REFUSED_TEXTS,
-    REFUSED_TIMES,
-    REFUSED_VALUES,
-    UNUSED_CARS,
-    Check,
-    Fault,
-)
+from fleet_slip.quality.checks import CHECKS, Check, Fault
 from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
@@ -312,10 +300,10 @@ class MeasuredStream:
         counts, time = self.counts, self.mapping.time
         faults = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
-            faults.append(OVERLAPPING_ROWS.fault("time", count=twice))
+            faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
         faults += _unmapped_cars(self.file, self.mapping, counts.drives)
         if time.assumed:
-            faults.append(ASSUMED_RATE.fault("rate_hz", rate_hz=time.rate_hz))
+            faults.append(CHECKS["assumed rate"].fault("rate_hz", rate_hz=time.rate_hz))
         return tuple(faults)
 
 
@@ -387,9 +375,9 @@ def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataF
 
 MIN_REFUSED = 10
 _REFUSED: dict[str, Check] = {
-    "out_of_range": REFUSED_RANGE,
-    "not_a_number": REFUSED_TEXTS,
-    "not_finite": REFUSED_INFINITE,
+    "out_of_range": CHECKS["values out of range"],
+    "not_a_number": CHECKS["texts in place of numbers"],
+    "not_finite": CHECKS["values that are not finite"],
 }
 _OF_TIME = ("time", "isolated", "too_short", "not_a_time")
 MAX_NAMES, MIN_ROWS_PER_NAME = 1000, 20
@@ -402,10 +390,10 @@ def find_refusals(
 
     `refused` are rows by signal and reason, `reasons` all refused rows by reason.
     """
-    limit = max(rows * MANY_REFUSED.high, MIN_REFUSED)
+    limit = max(rows * CHECKS["refused rows"].high, MIN_REFUSED)
     several = {key: count for key, count in refused.items() if count > limit}
     for (name, reason), count in several.items():
-        check = _REFUSED.get(reason, REFUSED_VALUES)
+        check = _REFUSED.get(reason, CHECKS["refused values"])
         yield check.fault(name, count=count, rows=rows, reason=reason)
     remaining = Counter(reasons)
     for (_, reason), count in several.items():
@@ -417,9 +405,9 @@ def find_refusals(
     if reason.startswith(_OF_TIME):
         is_mixed = reason in {"time_duplicate", "time_backwards"}
         mixed = ", and set vehicle_id or drive.column if the file mixes cars or trips"
-        yield REFUSED_TIMES.fault("time", mixed=mixed if is_mixed else "", **figures)
+        yield CHECKS["refused times"].fault("time", mixed=mixed if is_mixed else "", **figures)
     else:
-        yield MANY_REFUSED.fault("rows", **figures)
+        yield CHECKS["refused rows"].fault("rows", **figures)
 
 
 def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]:
@@ -442,12 +430,14 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
                 if name in used or names.count(name) > 1 or not is_called(words, name):
                     continue
                 values, runs = _values_and_runs(batch[name] for batch in source.batches([name]))
-                if values > UNUSED_CARS.high and (
+                if values > CHECKS["unused column of cars or trips"].high and (
                     key == "vehicle_id" or runs > values or values > drives
                 ):
                     where = f"column = {json.dumps(name, ensure_ascii=False)}"
                     where = f"{key} = {{ {where} }}" if key != "column" else where
-                    yield UNUSED_CARS.fault(name, count=values, where=where)
+                    yield CHECKS["unused column of cars or trips"].fault(
+                        name, count=values, where=where
+                    )
 
 
 def _values_and_runs(pieces: Iterable[pl.Series]) -> tuple[int, int]:
@@ -471,6 +461,6 @@ def _overlaps(under_way: list[tuple[float, float]]) -> int:
     ordered = sorted(under_way)
     latest = accumulate((end for _, end in ordered), max)
     return sum(
-        start < end - OVERLAPPING_ROWS.high
+        start < end - CHECKS["one car twice at a time"].high
         for (start, _), end in zip(ordered[1:], latest, strict=False)
     )

@@ -20,7 +20,7 @@ from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.course_relation import relate
-from fleet_slip.quality.inspection import inspect_drives
+from fleet_slip.quality.plausibility import inspect_drives
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse

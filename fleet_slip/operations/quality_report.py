@@ -17,12 +17,12 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.ingest.recordings import SourceRef
-from fleet_slip.quality.checks import SATURATED, Fault
+from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.course_relation import relate
-from fleet_slip.quality.inspection import inspect_drives
+from fleet_slip.quality.drive_signals import DriveBatches
 from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
-from fleet_slip.quality.moments import DriveBatches
 from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
+from fleet_slip.quality.plausibility import inspect_drives
 from fleet_slip.quality.turning import check_moments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, TextTable
@@ -274,7 +274,7 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
     clipped = np.array([count or 0 for count in metadata["saturated"].to_pylist()])
     fraction = clipped / table.n
     return {
-        int(drive): SATURATED.fault(count=clipped[drive])
+        int(drive): CHECKS["saturation"].fault(count=clipped[drive])
         for drive in np.flatnonzero(fraction > limits.max_saturated_per_row)
     }
 

@@ -1,19 +1,20 @@
-"""The relation of a course to the motion of a car, from sums over its changes."""
+"""The relation of a course to the motion of a car, in a drive or in sums over its changes."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.course import COURSE, TURNED, YAW_RATE
-from fleet_slip.quality.checks import (
-    COURSE_NOISE,
-    COURSE_PLACE,
-    COURSE_SCALE,
-    COURSE_SENSE,
-    COURSE_SLIP,
-    COURSE_STILL,
-    Fault,
+from fleet_slip.catalog.course import COURSE, LARGEST_RAD, SATELLITE_SPEED, TURNED, YAW_RATE
+from fleet_slip.catalog.signals import SAMPLE_TIME_S
+from fleet_slip.quality.checks import CHECKS, Fault
+from fleet_slip.quality.drive_signals import (
+    MIN_CORRELATION,
+    TICKS_PER_S,
+    Signals,
+    slope_of,
+    wrap_angle,
 )
 
 # Over some seconds the course changes by the integral of the yaw rate, `TURNED`, and by the change
@@ -32,9 +33,9 @@ USUAL_LEVER_M, USUAL_COMPLIANCE = 1.35, 0.006
 """Of a passenger car: l in m and K in rad per m/s²."""
 FEWEST_CHANGES = 100
 LEAST_TURNED_RAD = 0.05
-LEVERS_M = (COURSE_PLACE.low, COURSE_PLACE.high)
+LEVERS_M = (CHECKS["place of the antenna"].low, CHECKS["place of the antenna"].high)
 MIN_EXPLAINED, MAX_EXPLAINED_NOISE_MPS = 0.15, 0.8
-"""A relation that explains less may have no more noise than `COURSE_NOISE` allows."""
+"""A relation that explains less may have no more noise than "noise of the course" allows."""
 
 
 @dataclass(frozen=True)
@@ -69,27 +70,27 @@ class CourseRelation:
     def fault(self) -> Fault | None:
         """Return the first relation of cars that the course contradicts."""
         scale = {"scale": self.scale}
-        max_noise = COURSE_NOISE.high
+        max_noise = CHECKS["noise of the course"].high
         if self.explained >= MIN_EXPLAINED:
             max_noise = MAX_EXPLAINED_NOISE_MPS
-        if self.scale < COURSE_SENSE.low:
-            return COURSE_SENSE.fault(COURSE, **scale)
-        if abs(self.scale) < COURSE_STILL.low:
-            return COURSE_STILL.fault(COURSE, **scale)
+        if self.scale < CHECKS["sense of the course"].low:
+            return CHECKS["sense of the course"].fault(COURSE, **scale)
+        if abs(self.scale) < CHECKS["course that stands still"].low:
+            return CHECKS["course that stands still"].fault(COURSE, **scale)
         if self.noise_mps > max_noise:
-            return COURSE_NOISE.fault(COURSE, noise_mps=self.noise_mps)
-        if not COURSE_SCALE.low < self.scale < COURSE_SCALE.high:
-            return COURSE_SCALE.fault(YAW_RATE, COURSE, **scale)
-        if self.slip + 2 * self.slip_error < COURSE_SLIP.low:
-            return COURSE_SLIP.fault(COURSE, slip=self.slip)
+            return CHECKS["noise of the course"].fault(COURSE, noise_mps=self.noise_mps)
+        if not CHECKS["scale of the course"].passes(self.scale):
+            return CHECKS["scale of the course"].fault(YAW_RATE, COURSE, **scale)
+        if self.slip + 2 * self.slip_error < CHECKS["heading in place of a course"].low:
+            return CHECKS["heading in place of a course"].fault(COURSE, slip=self.slip)
         return None
 
     @property
     def misplaced(self) -> Fault | None:
         """Return a fault if the course is that of a place that is no car's centre of gravity."""
-        if COURSE_PLACE.low <= self.lever_m <= COURSE_PLACE.high:
+        if CHECKS["place of the antenna"].passes(self.lever_m):
             return None
-        return COURSE_PLACE.fault(COURSE, lever_m=self.lever_m)
+        return CHECKS["place of the antenna"].fault(COURSE, lever_m=self.lever_m)
 
 
 def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
@@ -128,3 +129,51 @@ def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
         float(np.sqrt(residual / 2)) * abs(speed),
         1 - residual / turning if turning > 0 else 0.0,
     )
+
+
+# The course changes as the car turns and slips.
+
+COURSE_CHANGE_TICKS = 4 * TICKS_PER_S
+MIN_COURSE_MPS = 3.0
+"""Below, fixes of receivers are too noisy."""
+
+
+def check_course(signals: Signals) -> Iterator[Fault]:
+    """Compare a course with the yaw rate, and with how a car slips; the first fault is decisive."""
+    if not {"course", "yaw_rate"} <= set(signals):
+        return
+    course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
+    change = wrap_angle(course[TICKS_PER_S:] - course[:-TICKS_PER_S])
+    scale, correlation = slope_of(
+        change, turned[TICKS_PER_S:] - turned[:-TICKS_PER_S], np.isfinite(change)
+    )
+    if correlation:
+        if correlation < -MIN_CORRELATION:
+            yield CHECKS["sense of the course"].fault(COURSE, scale=scale)
+        elif correlation < CHECKS["course of another car"].low:
+            yield CHECKS["course of another car"].fault(COURSE, correlation=correlation)
+        elif not CHECKS["unit of the course"].passes(scale):
+            yield CHECKS["unit of the course"].fault(COURSE, scale=scale)
+    fast = signals.get(SATELLITE_SPEED, np.zeros(0)) > MIN_COURSE_MPS
+    share = 1 - float(np.isfinite(course[fast]).mean()) if fast.any() else 0.0
+    if share > CHECKS["repeated fixes"].high:
+        yield CHECKS["repeated fixes"].fault(COURSE, share=share)
+    relation = _relation(signals, turned)
+    if relation and (fault := relation.fault or relation.misplaced):
+        yield Fault(fault.kind, (COURSE,), fault.figure, fault.remedy)
+    elif relation and not CHECKS["scale of the gyroscope"].passes(relation.scale):
+        yield CHECKS["scale of the gyroscope"].fault(COURSE, scale=relation.scale)
+
+
+def _relation(signals: Signals, turned: FloatArray) -> CourseRelation | None:
+    """Return the relation of changes over some seconds, by the receiver's own speed."""
+    if not {"ay", SATELLITE_SPEED} <= set(signals):
+        return None
+    yaw_rate, speed = signals["yaw_rate"], signals[SATELLITE_SPEED]
+    fast = np.where(speed > MIN_COURSE_MPS, speed, np.nan)
+    series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
+    changes = series[:, COURSE_CHANGE_TICKS:] - series[:, :-COURSE_CHANGE_TICKS]
+    changes[4] = wrap_angle(changes[4] - changes[3])
+    sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(LARGEST_RAD))
+    rows = np.vstack([np.ones(int(sound.sum())), changes[:, sound]])
+    return relate(rows @ rows.T)

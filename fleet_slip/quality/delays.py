@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.quality.checks import MUTUAL_DELAY, SIGNAL_DELAY, Fault
+from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.drive_signals import TICKS_PER_S, Signals
 from fleet_slip.quality.turning import MIN_WITNESSES, WITNESSES
 
@@ -154,15 +154,13 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
     for name, values in witnesses.items():
         if delay := estimate_delay(np.asarray(values), x, rows & np.isfinite(x[0])):
             delays[name] = delay
-    if len(delays) < 2:
-        return
     if len(delays) == 2:
-        second = next(name for name in delays if name != reference)
-        late = delays[second]
-        if late.exceeds(MUTUAL_DELAY.high) and (second not in STEERING or late.value_s > 0):
+        second, late = list(delays.items())[1]
+        check = CHECKS["delay between two signals"]
+        if _is_late(second, late, check.high):
             pair = (second, reference) if late.value_s > 0 else (reference, second)
             names = [signal for name in pair for signal in WITNESSES[name]]
-            yield MUTUAL_DELAY.fault(*names, delay_s=abs(late.value_s), error_s=late.error_s)
+            yield check.fault(*names, delay_s=abs(late.value_s), error_s=late.error_s)
         return
     # All angles of the steering are one witness: its first.
     steering = [name for name in delays if name in STEERING]
@@ -171,8 +169,13 @@ def find_delays(signals: Signals, rows: BoolArray) -> Iterator[Fault]:
         return
     middle = float(np.median(lags_s))
     errors = sorted(delay.error_s for delay in delays.values())
+    check = CHECKS["delay of a signal"]
     for name, delay in delays.items():
         # The reference itself has no error; that of the others' median stands for it.
         late = SignalDelay(delay.value_s - middle, max(delay.error_s, errors[len(errors) // 2]))
-        if late.exceeds(SIGNAL_DELAY.high) and (name not in STEERING or late.value_s > 0):
-            yield SIGNAL_DELAY.fault(*WITNESSES[name], delay_s=late.value_s, error_s=late.error_s)
+        if _is_late(name, late, check.high):
+            yield check.fault(*WITNESSES[name], delay_s=late.value_s, error_s=late.error_s)
+
+
+def _is_late(name: str, delay: SignalDelay, limit_s: float) -> bool:
+    return delay.exceeds(limit_s) and (name not in STEERING or delay.value_s > 0)

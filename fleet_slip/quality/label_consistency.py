@@ -16,14 +16,8 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.drive_sources import RECEIVED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.quality.checks import (
-    LABEL_GAIN,
-    LABEL_GAIN_SIGN,
-    LABEL_OFFSET,
-    REPEATED,
-    Fault,
-)
-from fleet_slip.quality.moments import DriveBatches
+from fleet_slip.quality.checks import CHECKS, Fault
+from fleet_slip.quality.drive_signals import DriveBatches
 from fleet_slip.quality.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
@@ -52,9 +46,9 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
     if gains is None:
         return {}
     return {
-        int(drive): LABEL_GAIN_SIGN.fault(label, gain=gain)
+        int(drive): CHECKS["sign among labels"].fault(label, gain=gain)
         for drive, gain in zip(drives.rows, gains, strict=True)
-        if gain < LABEL_GAIN_SIGN.low
+        if gain < CHECKS["sign among labels"].low
     }
 
 
@@ -144,7 +138,11 @@ def find_odd_days(
         return {}
     # The gain comes first: it decides where a group differs in both.
     scale = float(signals[label].scale)
-    bounds = {GAIN: math.log(LABEL_GAIN.high), OFFSET: math.radians(LABEL_OFFSET.high) / scale}
+    max_offset_rad = math.radians(CHECKS["zero of a day or file"].high)
+    bounds = {
+        GAIN: math.log(CHECKS["scale of a day or file"].high),
+        OFFSET: max_offset_rad / scale,
+    }
     faults: dict[int, Fault] = {}
     usual = in_order.copy()
     while usual.sum() >= limits.min_drives:
@@ -196,8 +194,9 @@ def _odd_drives(
 
 def _fault(label: str, column: int, difference: float, reference: str) -> Fault:
     if column == GAIN:
-        return LABEL_GAIN.fault(label, gain=math.exp(difference), others=reference)
-    return LABEL_OFFSET.fault(label, offset=difference, others=reference)
+        gain = math.exp(difference)
+        return CHECKS["scale of a day or file"].fault(label, gain=gain, others=reference)
+    return CHECKS["zero of a day or file"].fault(label, offset=difference, others=reference)
 
 
 def _odd_groups(
@@ -243,7 +242,7 @@ def find_repeated(drives: pa.Table) -> dict[str, Fault]:
     """
     parameters = {
         "received": RECEIVED,
-        "least_s": REPEATED.high,
+        "least_s": CHECKS["drives at once"].high,
         "sample_time_s": float(SAMPLE_TIME_S),
     }
     with open_scratch() as database:
@@ -251,6 +250,6 @@ def find_repeated(drives: pa.Table) -> dict[str, Fault]:
         query = read_sql("jobs", "repeated_drives.sql")
         overlaps = database.execute(query, parameters).fetchall()
     return {
-        drive: REPEATED.fault(overlap_s=overlap_s, other=other)
+        drive: CHECKS["drives at once"].fault(overlap_s=overlap_s, other=other)
         for drive, overlap_s, other in overlaps
     }

@@ -10,15 +10,7 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.quality.checks import (
-    LABEL_DELAY,
-    LABEL_MAGNITUDE,
-    LABEL_SCALE,
-    LABEL_SIGN,
-    LABEL_ZERO,
-    NEGATE,
-    Fault,
-)
+from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.delays import estimate_delay
 from fleet_slip.quality.drive_signals import MIN_TICKS, Signals, fit, speed_mps
 
@@ -56,17 +48,17 @@ def check_label(
     if speed is not None:
         large = np.abs(angle[(speed > FAST_MPS) & np.isfinite(angle)])
         median_deg = float(np.degrees(np.median(large))) if large.size >= MIN_TICKS else 0.0
-        if median_deg > LABEL_MAGNITUDE.high:
-            yield LABEL_MAGNITUDE.fault(label, median_deg=median_deg)
+        if median_deg > CHECKS["size of the label"].high:
+            yield CHECKS["size of the label"].fault(label, median_deg=median_deg)
             return
         with np.errstate(divide="ignore", invalid="ignore"):
             curvature = curvature / speed
     inputs = np.array([curvature, *([signals["ay"]] if "ay" in signals else [])])
     rows = moving & np.isfinite(inputs).all(axis=0)
     delay = estimate_delay(angle, inputs, rows)
-    if delay is not None and delay.exceeds(LABEL_DELAY.high):
+    if delay is not None and delay.exceeds(CHECKS["delay of the label"].high):
         delayed = "the delay_s of vx and vy" if from_velocities else "its delay_s"
-        yield LABEL_DELAY.fault(
+        yield CHECKS["delay of the label"].fault(
             label, delay_s=delay.value_s, error_s=delay.error_s, delayed=delayed
         )
     elif speed is not None and len(inputs) == 2:
@@ -82,7 +74,7 @@ def is_yaw_rate_reversed(label: str, signals: Signals, moving: BoolArray) -> boo
     if speed is None or not {label, "yaw_rate", "ay"} <= set(signals):
         return None
     lever_m, _, explained = _fit_lever(signals[label], signals, speed, moving)
-    if explained <= MIN_EXPLAINED or abs(lever_m) < -LABEL_SIGN.low:
+    if explained <= MIN_EXPLAINED or abs(lever_m) < -CHECKS["sign of the label"].low:
         return None
     return lever_m < 0
 
@@ -128,31 +120,33 @@ def _lever(
 ) -> Iterator[Fault]:
     """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
     lever_m, zero, explained = _fit_lever(signals[label], signals, speed, moving)
-    low, high = LABEL_SCALE.threshold
+    check = CHECKS["scale of the label"]
+    low, high = check.low, check.high
     if explained:
         high = min(high, MAX_WHEELBASE_SHARE * _wheelbase_m(signals, speed, moving))
-        is_reversed = explained > MIN_EXPLAINED and lever_m < LABEL_SIGN.low
+        is_reversed = explained > MIN_EXPLAINED and lever_m < CHECKS["sign of the label"].low
         is_large = explained > MIN_EXPLAINED and lever_m > SLIDING_M and sliding
         is_scaled = explained > MIN_SURE_EXPLAINED and not low < lever_m < high
     else:
         lever_m, mean_square, explained = _fit_one_speed(signals[label], signals, speed, moving)
         low -= MAX_COMPLIANCE * mean_square
-        is_reversed = explained > MIN_SURE_EXPLAINED and lever_m < min(low, 0) + LABEL_SIGN.low
+        limit_m = min(low, 0) + CHECKS["sign of the label"].low
+        is_reversed = explained > MIN_SURE_EXPLAINED and lever_m < limit_m
         is_large = explained > MIN_SURE_EXPLAINED and lever_m > SLIDING_M
         is_scaled = explained > MIN_SURE_EXPLAINED and 0 < lever_m < low
     bounds: dict[str, Any] = {"lever_m": lever_m, "low": low, "high": high}
     if is_reversed:
-        negate = "Negate vy, or both ay and yaw_rate." if from_velocities else NEGATE
-        yield LABEL_SIGN.fault(label, negate=negate, **bounds)
+        negate = "Negate vy, or both ay and yaw_rate."
+        negate = negate if from_velocities else "Write negate = true."
+        yield CHECKS["sign of the label"].fault(label, negate=negate, **bounds)
     elif is_large or is_scaled:
         units = "its unit, degrees or radians, its factor"
         units = "the units of vx and vy" if from_velocities else units
-        yield LABEL_SCALE.fault(label, units=units, **bounds)
-    elif (
-        explained > MIN_SURE_EXPLAINED
-        and not LABEL_ZERO.low <= (zero_deg := float(np.degrees(zero))) <= LABEL_ZERO.high
+        yield CHECKS["scale of the label"].fault(label, units=units, **bounds)
+    elif explained > MIN_SURE_EXPLAINED and not CHECKS["zero of the label"].passes(
+        zero_deg := math.degrees(zero)
     ):
-        yield LABEL_ZERO.fault(label, zero_deg=zero_deg, offset_rad=-zero)
+        yield CHECKS["zero of the label"].fault(label, zero_deg=zero_deg, offset_rad=-zero)
 
 
 def _wheelbase_m(signals: Signals, speed: FloatArray, moving: BoolArray) -> float:

@@ -21,16 +21,8 @@ from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.config import Config, load_config
-from fleet_slip.quality.checks import (
-    EXCHANGED,
-    PEERS_NOISE,
-    PEERS_OFFSET,
-    PEERS_SCALE,
-    PEERS_SIGN,
-    UNEXPLAINED,
-    Fault,
-)
-from fleet_slip.quality.moments import DriveBatches, MeanMoments
+from fleet_slip.quality.checks import CHECKS, Fault
+from fleet_slip.quality.drive_signals import DriveBatches, MeanMoments
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import Configs
 
@@ -231,12 +223,13 @@ class Peers:
         for drive in range(len(moments)):
             after = [float(worst[drive]) for worst in exchanged]
             if after and min(after) <= self.limits.limit:
-                faults.append(EXCHANGED.fault(*pairs[int(np.argmin(after))]))
+                faults.append(CHECKS["exchanged signals"].fault(*pairs[int(np.argmin(after))]))
                 continue
             is_explained = np.array([worst[drive] for worst in without]) <= self.limits.limit
             if not is_explained.any():
                 worst = int(scores[drive].argmax())
-                faults.append(UNEXPLAINED.fault(signals[worst], score=scores[drive, worst]))
+                score = scores[drive, worst]
+                faults.append(CHECKS["several signals"].fault(signals[worst], score=score))
                 continue
             # The sensor that explains all others, and is itself furthest off.
             target = int(np.where(is_explained, scores[drive], -np.inf).argmax())
@@ -252,16 +245,16 @@ class Peers:
         w = self.full.weights[target]
         m = moments.matrices[drive]
         square = m[target + 1, target + 1]
-        if gain < PEERS_SIGN.low:
-            return PEERS_SIGN.fault(name, gain=gain)
+        if gain < CHECKS["sign among drives"].low:
+            return CHECKS["sign among drives"].fault(name, gain=gain)
         without_offset = np.exp(2 * log_noise)
         without_factor = square - gain**2 * (w @ m @ w)
         max_noise = usual * np.exp(2 * self.limits.limit * self.limits.noise_floor)
         if min(without_offset, without_factor) > max_noise:
-            return PEERS_NOISE.fault(name, noise=noise, gain=gain)
+            return CHECKS["noise among drives"].fault(name, noise=noise, gain=gain)
         if without_factor < without_offset:
-            return PEERS_SCALE.fault(name, gain=gain)
-        return PEERS_OFFSET.fault(name, offset=offset)
+            return CHECKS["scale among drives"].fault(name, gain=gain)
+        return CHECKS["offset among drives"].fault(name, offset=offset)
 
 
 def settle(

@@ -3,38 +3,24 @@
 The values are all well formed. Axes and signs are ISO 8855.
 """
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
-from typing import TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from itertools import islice
+from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.catalog.course import COURSE, LARGEST_RAD, SATELLITE_SPEED
+from fleet_slip.catalog.course import SATELLITE_SPEED
+from fleet_slip.catalog.drive_sources import MEASURED
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.quality.checks import (
-    CONSTANT,
-    COURSE_REPEATS,
-    COURSE_SENSE,
-    COURSE_SIZE,
-    COURSE_UNRELATED,
-    GYROSCOPE_SCALE,
-    LABEL_ONE_SIDED,
-    LABEL_ZERO,
-    LONGITUDINAL_SIGN,
-    NO_VALUE,
-    ONE_SIDED,
-    SATELLITE_SPEEDS,
-    SIZE,
-    SPEEDS,
-    SWAPPED_AXLES,
-    WHEEL_SPEED,
-    Fault,
-)
-from fleet_slip.quality.course_relation import CourseRelation, relate
+from fleet_slip.quality.checks import CHECKS, Fault
+from fleet_slip.quality.course_relation import check_course
 from fleet_slip.quality.delays import find_delays
 from fleet_slip.quality.drive_signals import (
+    MIN_CORRELATION,
     MIN_TICKS,
     RADIUS_M,
     SIGNED,
@@ -42,24 +28,24 @@ from fleet_slip.quality.drive_signals import (
     TICKS_PER_S,
     TRACK_M,
     WHEELS,
+    MeanMoments,
     Signals,
     is_moving,
     slope_of,
     speed_mps,
+    to_regular_grid,
     wheel_speed_mps,
-    wrap_angle,
 )
 from fleet_slip.quality.label_motion import check_label, is_yaw_rate_reversed
-from fleet_slip.quality.moments import MeanMoments
 from fleet_slip.quality.turning import (
     MIN_MEAN_RATIO,
     WITNESSES,
     find_reversed_or_swapped,
     find_swapped_axes,
 )
-
-MIN_CORRELATION = 0.6
-"""Of two signals whose sizes are compared; a sound drive on a winding road has 0.9."""
+from fleet_slip.warehouse.predicate import Predicate, guarded_query
+from fleet_slip.warehouse.table_views import connect_tables
+from fleet_slip.warehouse.warehouse import Warehouse
 
 
 def check_plausibility(
@@ -75,8 +61,7 @@ def check_plausibility(
     moving = is_moving(sound)
     one_sided = list(find_one_sided(sound, moving, catalog.label))
     faults += (fault for fault in one_sided if catalog.label not in fault.signals)
-    turning = _turning(_without(sound, faults), moving, catalog.label)
-    faults += turning
+    faults += _turning(_without(sound, faults), moving, catalog.label)
     faults += find_delays(_without(sound, faults), moving)
     wrong_speeds = list(_speeds(sound, moving))
     faults += wrong_speeds
@@ -84,16 +69,15 @@ def check_plausibility(
     if speed is not None:
         faults += _sizes(_without(sound, faults), speed, moving)
         faults += _axles(_without(sound, faults), speed, moving)
+    remaining = _without(sound, faults)
     label = list(
-        check_label(
-            catalog.label, _without(sound, faults), speed, moving, from_velocities=from_velocities
-        )
+        check_label(catalog.label, remaining, speed, moving, from_velocities=from_velocities)
     )
     if one_sided and catalog.label in one_sided[-1].signals:
         # A biased label is on one side, too.
-        label = label if any(fault.kind == LABEL_ZERO.kind for fault in label) else one_sided[-1:]
+        label = label if any(fault.kind == "biased" for fault in label) else one_sided[-1:]
     faults += label
-    return [*faults, *itertools.islice(_course(_without(sound, faults)), 1)]
+    return [*faults, *islice(check_course(_without(sound, faults)), 1)]
 
 
 def _without(signals: Signals, faults: Sequence[Fault]) -> Signals:
@@ -106,9 +90,10 @@ def _without_change(catalog: SignalCatalog, signals: Signals) -> Iterator[Fault]
     for name, values in signals.items():
         present = values[np.isfinite(values)]
         if not present.size:
-            yield NO_VALUE.fault(name)
+            yield CHECKS["no value"].fault(name)
         elif present.size >= MIN_TICKS and present.min() == present.max():
-            yield CONSTANT.fault(name, value=f": {present[0]:g} {catalog[name].unit}")
+            value = f": {present[0]:g} {catalog[name].unit}"
+            yield CHECKS["constant signal"].fault(name, value=value)
 
 
 # Signals that stay on one side of zero, though the car turns to both sides. Some buses send the
@@ -135,7 +120,7 @@ def find_one_sided(signals: Signals, moving: BoolArray, label: str) -> Iterator[
         if ratios and np.median(ratios) > MIN_MEAN_RATIO:
             continue
         sign, minutes = ("negative" if side > 0 else "positive"), signals[name].size / 6000
-        check = LABEL_ONE_SIDED if name == label else ONE_SIDED
+        check = CHECKS["lost sign of the label" if name == label else "lost sign"]
         yield check.fault(name, evidence=f"it is never {sign} in {minutes:.0f} min")
 
 
@@ -154,9 +139,9 @@ def _side(values: FloatArray, rows: BoolArray) -> int:
     low, high = np.quantile(present, [0.001, 0.999])
     if max(-low, high) <= 0:
         return 0
-    if low >= -ONE_SIDED.low * high:
+    if low >= -CHECKS["lost sign"].low * high:
         return 1
-    return -1 if high <= -ONE_SIDED.low * low else 0
+    return -1 if high <= -CHECKS["lost sign"].low * low else 0
 
 
 def _turning(signals: Signals, moving: BoolArray, label: str) -> list[Fault]:
@@ -222,12 +207,14 @@ def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
         return
     for name in (name for name in WHEELS if name in signals):
         ratio = _ratio(signals[name] * RADIUS_M, wheels, moving)
-        if ratio and not WHEEL_SPEED.low <= ratio <= WHEEL_SPEED.high:
-            yield WHEEL_SPEED.fault(name, ratio=ratio, hint=_hint(ratio, WHEEL_FACTORS))
+        if ratio and not CHECKS["speed of one wheel"].passes(ratio):
+            hint = _hint(ratio, WHEEL_FACTORS)
+            yield CHECKS["speed of one wheel"].fault(name, ratio=ratio, hint=hint)
     for name in (name for name in SPEEDS_OF_CAR if name in signals):
-        check = SATELLITE_SPEEDS if name == SATELLITE_SPEED else SPEEDS
+        is_receiver = name == SATELLITE_SPEED
+        check = CHECKS["speed of the receiver" if is_receiver else "speeds of the car"]
         ratio = _ratio(signals[name], wheels, moving)
-        if ratio and not check.low <= ratio <= check.high:
+        if ratio and not check.passes(ratio):
             named = [wheel for wheel in WHEELS if wheel in signals]
             of_wheels = _turns_at(wheels, signals, moving)
             of_speed = _turns_at(signals[name], signals, moving)
@@ -244,15 +231,13 @@ def _turns_at(speed: FloatArray, signals: Signals, moving: BoolArray) -> bool:
     if not {"ay", "yaw_rate"} <= set(signals):
         return False
     slope, correlation = slope_of(signals["ay"], signals["yaw_rate"] * speed, moving)
-    return abs(correlation) > MIN_CORRELATION and SPEEDS.low <= abs(slope) <= SPEEDS.high
+    return abs(correlation) > MIN_CORRELATION and CHECKS["speeds of the car"].passes(abs(slope))
 
 
-Comparison: TypeAlias = tuple[tuple[str, ...], str, float, float]
-"""Signals; what predicts the first; its ratio to that, and its correlation with it."""
-
-
-def _compared(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Comparison]:
-    """Yield pairs of quantities of a moving car that must have the same size."""
+def _compared(
+    signals: Signals, speed: FloatArray, moving: BoolArray
+) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
+    """Yield signals, what predicts the first, its ratio to that, and their correlation."""
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
@@ -276,12 +261,14 @@ def _compared(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterato
 def _sizes(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Fault]:
     """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
     for names, expected, slope, correlation in _compared(signals, speed, moving):
-        if names == ("ax",) and correlation < LONGITUDINAL_SIGN.low:
-            yield LONGITUDINAL_SIGN.fault(*names, correlation=correlation)
+        if names == ("ax",) and correlation < CHECKS["sign of ax"].low:
+            yield CHECKS["sign of ax"].fault(*names, correlation=correlation)
             continue
         ratio = slope if correlation > 0 else -slope
-        if abs(correlation) > MIN_CORRELATION and not SIZE.low <= ratio <= SIZE.high:
-            yield SIZE.fault(*names, ratio=ratio, expected=expected, hint=_hint(ratio, FACTORS))
+        check = CHECKS["size of a signal"]
+        if abs(correlation) > MIN_CORRELATION and not check.passes(ratio):
+            hint = _hint(ratio, FACTORS)
+            yield check.fault(*names, ratio=ratio, expected=expected, hint=hint)
 
 
 MAX_BEND_MPS, MIN_BEND_PER_M = 12.0, 0.05
@@ -300,53 +287,101 @@ def _axles(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[F
     if tightest < MIN_BEND_PER_M**2:
         return
     slope, correlation = slope_of(longer, tightness, rows)
-    if correlation < SWAPPED_AXLES.low and slope < -1:
-        yield SWAPPED_AXLES.fault(*WHEELS, correlation=correlation)
+    if correlation < CHECKS["front and rear wheels"].low and slope < -1:
+        yield CHECKS["front and rear wheels"].fault(*WHEELS, correlation=correlation)
 
 
-# The course changes as the car turns and slips.
+# The checks of rows on some long drives of a cohort, read from the logs.
 
-COURSE_CHANGE_TICKS = 4 * TICKS_PER_S
-MIN_COURSE_MPS = 3.0
-"""Below, fixes of receivers are too noisy."""
+MAX_TICKS = 100_000
+"""Ticks of each drive that are read: a quarter of an hour."""
 
-
-def _course(signals: Signals) -> Iterator[Fault]:
-    """Compare a course with the yaw rate, and with how a car slips; the first fault is decisive."""
-    if not {"course", "yaw_rate"} <= set(signals):
-        return
-    course, turned = signals["course"], np.cumsum(signals["yaw_rate"]) * float(SAMPLE_TIME_S)
-    change = wrap_angle(course[TICKS_PER_S:] - course[:-TICKS_PER_S])
-    scale, correlation = slope_of(
-        change, turned[TICKS_PER_S:] - turned[:-TICKS_PER_S], np.isfinite(change)
-    )
-    if correlation:
-        if correlation < -MIN_CORRELATION:
-            yield COURSE_SENSE.fault(COURSE, scale=scale)
-        elif correlation < COURSE_UNRELATED.low:
-            yield COURSE_UNRELATED.fault(COURSE, correlation=correlation)
-        elif not COURSE_SIZE.low <= scale <= COURSE_SIZE.high:
-            yield COURSE_SIZE.fault(COURSE, scale=scale)
-    fast = signals.get(SATELLITE_SPEED, np.zeros(0)) > MIN_COURSE_MPS
-    share = 1 - float(np.isfinite(course[fast]).mean()) if fast.any() else 0.0
-    if share > COURSE_REPEATS.high:
-        yield COURSE_REPEATS.fault(COURSE, share=share)
-    relation = _relation(signals, turned)
-    if relation and (fault := relation.fault or relation.misplaced):
-        yield Fault(fault.kind, (COURSE,), fault.figure, fault.remedy)
-    elif relation and not GYROSCOPE_SCALE.low <= relation.scale <= GYROSCOPE_SCALE.high:
-        yield GYROSCOPE_SCALE.fault(COURSE, scale=relation.scale)
+_LONGEST = """
+    SELECT drive_id, vehicle_id, day FROM drives WHERE source = $source AND ({predicate})
+    ORDER BY row_number() OVER (PARTITION BY vehicle_id ORDER BY rows DESC, drive_id),
+        rows DESC, drive_id
+"""
 
 
-def _relation(signals: Signals, turned: FloatArray) -> CourseRelation | None:
-    """Return the relation of changes over some seconds, by the receiver's own speed."""
-    if not {"ay", SATELLITE_SPEED} <= set(signals):
-        return None
-    yaw_rate, speed = signals["yaw_rate"], signals[SATELLITE_SPEED]
-    fast = np.where(speed > MIN_COURSE_MPS, speed, np.nan)
-    series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
-    changes = series[:, COURSE_CHANGE_TICKS:] - series[:, :-COURSE_CHANGE_TICKS]
-    changes[4] = wrap_angle(changes[4] - changes[3])
-    sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(LARGEST_RAD))
-    rows = np.vstack([np.ones(int(sound.sum())), changes[:, sound]])
-    return relate(rows @ rows.T)
+@dataclass(frozen=True)
+class InspectedDrive:
+    """A drive whose rows were checked, and its faults that do harm."""
+
+    drive_id: str
+    vehicle_id: str
+    day: date
+    faults: tuple[Fault, ...]
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Drives whose rows were checked.
+
+    Attributes
+    ----------
+    drives
+        One of each car first, the longest first.
+    measured
+        Number of measured drives of the cohort.
+    """
+
+    drives: tuple[InspectedDrive, ...]
+    measured: int
+
+    def by_fault(self) -> dict[tuple[str, tuple[str, ...]], list[Fault]]:
+        """Return the faults of all drives by kind and signals."""
+        faults: dict[tuple[str, tuple[str, ...]], list[Fault]] = {}
+        for drive in self.drives:
+            for fault in drive.faults:
+                faults.setdefault((fault.kind, fault.signals), []).append(fault)
+        return faults
+
+    def is_systematic(self, fault: Fault) -> bool:
+        """Return True if most drives have this fault: no drive shows what is right."""
+        drives = self.by_fault().get((fault.kind, fault.signals), [])
+        return 2 * len(drives) > len(self.drives)
+
+
+def inspect_drives(
+    warehouse: Warehouse,
+    predicate: Predicate,
+    max_drives: int,
+    select: Callable[[Sequence[str]], Sequence[bool]] | None = None,
+) -> Inspection:
+    """Check the rows of the longest measured drives of a cohort, of as many cars as possible.
+
+    `select` returns which of the drives to consider, by their names.
+    """
+    signals = warehouse.catalog.signals
+    query = _LONGEST.format(predicate=predicate.sql)
+    with (
+        connect_tables(warehouse, query + "log_counts") as database,
+        guarded_query(database, predicate),
+    ):
+        drives = database.execute(query, {"source": MEASURED}).fetchall()
+        measured = len(drives)
+        if select is not None:
+            selected = select([drive for drive, *_ in drives])
+            drives = [drive for drive, use in zip(drives, selected, strict=True) if use]
+        inspected = []
+        for drive, vehicle, day in drives[:max_drives]:
+            columns = database.execute(
+                "SELECT * FROM log_counts WHERE day = $day AND drive_id = $drive ORDER BY tick "
+                f"LIMIT {MAX_TICKS}",
+                {"day": day, "drive": drive},
+            ).fetchnumpy()
+            faults = check_plausibility(signals, _signals_of(signals, columns))
+            harmful = tuple(fault for fault in faults if fault.does_harm)
+            inspected.append(InspectedDrive(drive, vehicle, day, harmful))
+    return Inspection(tuple(inspected), measured)
+
+
+def _signals_of(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
+    """Return the signals of a drive that have values."""
+    counts = {
+        name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
+        for name in signals.signals
+        if name in columns
+    }
+    present = {name: values for name, values in counts.items() if np.isfinite(values).any()}
+    return to_regular_grid(signals, np.asarray(columns["tick"], dtype=np.int32), present)

@@ -13,17 +13,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SignalCatalog
-from fleet_slip.quality.checks import (
-    CONSTANT,
-    CONTRADICTION,
-    ONE_SIDED,
-    SWAPPED_AXES,
-    SWAPPED_STEERING,
-    SWAPPED_WHEELS,
-    TURNING_SIGN,
-    Fault,
-)
-from fleet_slip.quality.moments import BATCH, DriveBatches, MeanMoments
+from fleet_slip.quality.checks import CHECKS, Fault
+from fleet_slip.quality.drive_signals import BATCH, DriveBatches, MeanMoments
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
@@ -87,9 +78,9 @@ def find_constant(table: "GramTable") -> dict[int, Fault]:
     # n sum(x^2) may not fit 64 bits, the difference from sum(x)^2 is right modulo 2^64.
     constant = table.n[:, None] * squares - table.sums * table.sums == 0
     moving = constant.mean(axis=1) < 0.5
-    names = np.array(table.signals)
+    names, check = np.array(table.signals), CHECKS["constant signal"]
     return {
-        drive: CONSTANT.fault(*names[constant[drive]].tolist(), value=": its variance is 0")
+        drive: check.fault(*names[constant[drive]].tolist(), value=": its variance is 0")
         for drive in np.flatnonzero(constant.any(axis=1) & moving).tolist()
     }
 
@@ -107,13 +98,14 @@ def find_reversed_or_swapped(
     names = _witnesses(moments)
     if len(names) < 2:
         return {}
-    lowest = TURNING_SIGN.low if min_correlation is None else -min_correlation
+    lowest = CHECKS["sign of turning"].low if min_correlation is None else -min_correlation
     correlations = _correlations(moments, names)
     if len(names) == 2:
+        between = correlations[:, 0, 1]
         both = [signal for name in names for signal in WITNESSES[name]]
         return {
-            drive: [CONTRADICTION.fault(*both, correlation=correlations[drive, 0, 1])]
-            for drive in np.flatnonzero(correlations[:, 0, 1] < lowest).tolist()
+            drive: [CHECKS["contradicting signs"].fault(*both, correlation=between[drive])]
+            for drive in np.flatnonzero(between < lowest).tolist()
         }
     loadings = np.linalg.eigh(correlations)[1][:, :, -1]
     signs = np.sign(loadings.sum(axis=1))
@@ -129,10 +121,10 @@ def find_reversed_or_swapped(
             continue
         signals, correlation = WITNESSES[names[i]], float(np.median(opposed))
         if len(signals) == 1:
-            fault = TURNING_SIGN.fault(*signals, correlation=correlation)
+            fault = CHECKS["sign of turning"].fault(*signals, correlation=correlation)
         else:
             hint = " If all others are positive to the right (SAE J670), negate these."
-            fault = SWAPPED_WHEELS.fault(
+            fault = CHECKS["left and right wheel"].fault(
                 *signals, correlation=correlation, others=hint if agree[drive] else ""
             )
         faults.setdefault(drive, []).append(fault)
@@ -164,7 +156,7 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
         signed = np.median(away[:, peers], axis=1) < MAX_TURNING_MEAN_RATIO
         for drive in np.flatnonzero(agree & lone & signed & (away[:, i] > MIN_MEAN_RATIO)).tolist():
             evidence = f"mean {away[drive, i]:.0%} of its size, and the others turn to both sides"
-            faults[drive] = ONE_SIDED.fault(*WITNESSES[name], evidence=evidence)
+            faults[drive] = CHECKS["lost sign"].fault(*WITNESSES[name], evidence=evidence)
     return faults
 
 
@@ -180,9 +172,10 @@ def find_swapped_axes(moments: MeanMoments) -> dict[int, Fault]:
     shared = np.abs(covariances[:, :2, 2:])
     agreement = np.divide(shared, product, out=np.zeros_like(shared), where=product > 0)
     ax, ay = agreement[:, 0].min(axis=1), agreement[:, 1].max(axis=1)
+    check = CHECKS["axes of the accelerometer"]
     return {
-        drive: SWAPPED_AXES.fault("ax", "ay", ax=ax[drive], ay=ay[drive])
-        for drive in np.flatnonzero((ax > SWAPPED_AXES.high) & (ay < SWAPPED_AXES.low)).tolist()
+        drive: check.fault("ax", "ay", ax=ax[drive], ay=ay[drive])
+        for drive in np.flatnonzero((ax > check.high) & (ay < check.low)).tolist()
     }
 
 
@@ -201,11 +194,11 @@ def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[
     product = m[:, i, j] * scale**2
     difference = (m[:, 0, i] - m[:, 0, j]) * scale
     ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
-    low, high = -SWAPPED_STEERING.low, MAX_STEERING_RATIO
+    low, high = -CHECKS["left and right road wheel"].low, MAX_STEERING_RATIO
     if ((np.abs(ratio) > low) & (np.abs(ratio) < high)).mean() < UNBIASED_STEERING:
         return {}
     return {
-        drive: SWAPPED_STEERING.fault(fl, fr, ratio=ratio[drive])
+        drive: CHECKS["left and right road wheel"].fault(fl, fr, ratio=ratio[drive])
         for drive in np.flatnonzero((-ratio > low) & (-ratio < high)).tolist()
     }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.quality.checks import LABEL_SCALE
+from fleet_slip.quality.checks import CHECKS
 from fleet_slip.quality.plausibility import check_plausibility
 from tests.support.catalog import SIGNALS
 from tests.support.relaxing_car import drive_relaxing_car
@@ -62,7 +62,7 @@ def test_the_bound_of_the_message_is_the_bound_that_is_used(wheelbase_m: float) 
         else:
             (fault,) = faults
             low, high = map(float, re.findall(r"be \+(\S+) to \+(\S+) m", fault.figure)[0])
-            assert low == LABEL_SCALE.low
+            assert low == CHECKS["scale of the label"].low
             assert high == pytest.approx(highest, abs=0.006)
 
 
