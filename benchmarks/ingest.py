@@ -42,7 +42,7 @@ SIGNALS = {
 }  # fmt: skip
 
 _INGEST = """
-from fleet_slip.ingest.load import ingest_files
+from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.storage.local import LocalFolder

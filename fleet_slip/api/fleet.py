@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from fleet_slip.api.pipelines import LearnReport, RunReport
     from fleet_slip.grams.on_board import OnboardImport
     from fleet_slip.grams.update import GramReport
-    from fleet_slip.ingest.load import IngestReport, Preview
+    from fleet_slip.ingest.logs import IngestReport, Preview
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.night import NightReport
@@ -281,7 +281,7 @@ class Fleet:
         ClusterError
             If the cluster cannot be used.
         """
-        from fleet_slip.ingest.load import ingest_files
+        from fleet_slip.ingest.logs import ingest_files
         from fleet_slip.ingest.mapping import keep_assumptions
         from fleet_slip.ingest.recordings import IngestCache
         from fleet_slip.operations.rewriting import build_removal
@@ -364,7 +364,7 @@ class Fleet:
         ConfigError, InputError
             As `ingest`.
         """
-        from fleet_slip.ingest.load import preview_logs
+        from fleet_slip.ingest.logs import preview_logs
 
         mapping, logs, _ = self._find_logs(files, mapping)
         return preview_logs(logs, mapping)

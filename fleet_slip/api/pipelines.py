@@ -33,7 +33,7 @@ from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.update import GramReport
-    from fleet_slip.ingest.load import IngestReport
+    from fleet_slip.ingest.logs import IngestReport
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.select import Selection

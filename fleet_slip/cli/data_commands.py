@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from fleet_slip.catalog.signals import SignalCatalog
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.draft import Draft
-    from fleet_slip.ingest.load import IngestReport, Preview
+    from fleet_slip.ingest.logs import IngestReport, Preview
     from fleet_slip.resources import Configs
 
 ALL_SETS = "all"

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import RepeatedError
-from fleet_slip.ingest.drive_cutting import MeasuredDrive
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import (
     WITHDRAWN,

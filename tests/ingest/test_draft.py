@@ -13,9 +13,9 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
-from fleet_slip.ingest.drive_cutting import MeasuredDrive
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.ingest.stream import IngestCounts, open_measured
+from fleet_slip.ingest.measured_log import IngestCounts, open_measured
+from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.ingest.vocabulary import unit_called
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
 from tests.support.catalog import CATALOG

@@ -12,9 +12,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import load
-from fleet_slip.ingest.load import write_batch
+from fleet_slip.ingest import logs
 from fleet_slip.ingest.log_files import find_logs
+from fleet_slip.ingest.logs import write_batch
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
@@ -86,7 +86,7 @@ def test_what_lands_does_not_depend_on_batches_or_order(
 ) -> None:
     ingest(folder)
     together = drives(folder)
-    monkeypatch.setattr(load, "BATCH_FILES", 2)
+    monkeypatch.setattr(logs, "BATCH_FILES", 2)
     (folder.parent / "root").rename(folder.parent / "first")
     files = sorted(folder.glob("day */*.csv"), key=lambda file: -file.stat().st_size)
     assert len(ingest(folder, *files)) == 5
@@ -204,9 +204,9 @@ def test_threads_read_small_files_and_large_ones_come_alone(
         read_by[threading.get_ident()].update(Path(one.file).name for one in files)
         return write_batch(warehouse, mapping, files, **more)
 
-    monkeypatch.setattr(load, "write_batch", write_and_note)
-    monkeypatch.setattr(load, "BATCH_FILES", 1)
-    monkeypatch.setattr(load, "BATCH_BYTES", large.stat().st_size)
+    monkeypatch.setattr(logs, "write_batch", write_and_note)
+    monkeypatch.setattr(logs, "BATCH_FILES", 1)
+    monkeypatch.setattr(logs, "BATCH_BYTES", large.stat().st_size)
     reports = ingest(folder)
     assert [report["new"] for report in reports] == [True] * 6
     assert sorted(drives(folder).values()) == [20, 21, 22, 23, 24, 200]

@@ -21,7 +21,7 @@ from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats import matlab, mdf
 from fleet_slip.ingest.formats import source as budget
 from fleet_slip.ingest.formats.source import Budget
-from fleet_slip.ingest.load import preview_logs
+from fleet_slip.ingest.logs import preview_logs
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.profile import profile_file
 from tests.support.catalog import SIGNALS

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import log_rows, stream
+from fleet_slip.ingest import checked_columns, measured_log
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.warehouse.warehouse import quarantine_schema
 from tests.support.catalog import CATALOG, SIGNALS
@@ -287,15 +287,15 @@ def test_a_rate_too_low_to_interpolate_leaves_what_was_measured(tmp_path: Path) 
 def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     columns = good_columns(300)
     columns["run"] = [i // 3 for i in range(300)]
-    monkeypatch.setattr(stream, "MAX_DRIVES", 99)
+    monkeypatch.setattr(measured_log, "MAX_DRIVES", 99)
     with pytest.raises(InputError, match="splits into more than 99 drives of 3 rows on average"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
-    monkeypatch.setattr(log_rows, "MAX_KEYS", 99)
+    monkeypatch.setattr(checked_columns, "MAX_KEYS", 99)
     with pytest.raises(InputError, match="more than 99 combinations"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
     columns["t"] = [10 * i for i in range(300)]
-    monkeypatch.setattr(stream, "MAX_TICKS", 100)
-    monkeypatch.setattr(stream, "MAX_TICKS_PER_ROW", 10)
+    monkeypatch.setattr(measured_log, "MAX_TICKS", 100)
+    monkeypatch.setattr(measured_log, "MAX_TICKS_PER_ROW", 10)
     with pytest.raises(InputError, match="300 rows span 299,001 ticks"):
         read_columns(tmp_path, columns, a_mapping(time={"split_gap_s": 60, "longest_gap_s": 10}))
 

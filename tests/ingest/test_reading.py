@@ -13,8 +13,8 @@ import pytest
 
 from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import log_rows as checking
-from fleet_slip.ingest import time_bases
+from fleet_slip.ingest import batches
+from fleet_slip.ingest import checked_columns as checking
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats import source, tables
 from fleet_slip.ingest.formats.csv import BLOCK_BYTES
@@ -154,7 +154,7 @@ def test_a_file_that_grows_while_it_is_read_is_refused(
 ) -> None:
     file = write(tmp_path, GOOD.encode())
 
-    read = time_bases.read_batches
+    read = batches.read_batches
 
     def grow(*arguments: Any) -> Any:
         yield from read(*arguments)

@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import load, open_drives, stream
-from fleet_slip.ingest.drive_cutting import DriveCutter, MeasuredDrive
+from fleet_slip.ingest import drives, logs, measured_log
+from fleet_slip.ingest.drives import DriveCutter
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
-from fleet_slip.ingest.load import log_table
+from fleet_slip.ingest.logs import log_table
+from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.measured import (
@@ -91,7 +92,7 @@ def test_blocks_change_nothing(
 def test_a_drive_that_lasts_too_long_is_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "MAX_DRIVE_S", 0.5)
+    monkeypatch.setattr(measured_log, "MAX_DRIVE_S", 0.5)
     log = read_columns(tmp_path, good_columns(60))
     name = f"test-{log.digest[:12]}-1"
     assert log.drives["drive_id"].to_pylist() == [name] * 50 + [f"{name}-2"] * 10
@@ -106,8 +107,8 @@ def test_the_usual_rate_does_not_depend_on_blocks(
 ) -> None:
     t = [*(i / 100 for i in range(30)), *(0.3 + i / 1000 for i in range(300))]
     columns = {"t": t, "ax": [1] * 330, "beta": [1] * 330}
-    monkeypatch.setattr(stream, "RATE_ROWS", 20)
-    monkeypatch.setattr(stream, "MIN_STEPS", 10)
+    monkeypatch.setattr(measured_log, "RATE_ROWS", 20)
+    monkeypatch.setattr(measured_log, "MIN_STEPS", 10)
     whole = read_columns(tmp_path, columns)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 12 * rows)
     assert read_columns(tmp_path, columns).drives.equals(whole.drives)
@@ -118,8 +119,8 @@ def test_the_usual_rate_does_not_depend_on_blocks(
 def test_what_lands_does_not_depend_on_the_size_of_data_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, files: int
 ) -> None:
-    monkeypatch.setattr(load, "FILE_ROWS", limit)
-    monkeypatch.setattr(stream, "REFUSED_ROWS", limit)
+    monkeypatch.setattr(logs, "FILE_ROWS", limit)
+    monkeypatch.setattr(measured_log, "REFUSED_ROWS", limit)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
     columns["ax"][3] = columns["ax"][70] = "x"
@@ -127,15 +128,15 @@ def test_what_lands_does_not_depend_on_the_size_of_data_files(
     warehouse = Warehouse(LocalFolder(tmp_path / "data"))
     report = ingest_file(warehouse, tmp_path / "log.csv", a_mapping())
     assert (report.counts.drives, report.counts.ticks) == (3, 88)
-    logs, refused = (
+    stored, refused = (
         pa.concat_tables(table.read(file.path) for file in table.snapshot().files)
         for table in (warehouse.logs, warehouse.quarantine)
     )
     assert len(warehouse.logs.snapshot().files) == files
     whole = read_measured(tmp_path / "log.csv", a_mapping())
     order = [("drive_id", "ascending"), ("tick", "ascending")]
-    logs = logs.set_column(0, "drive_id", logs["drive_id"].cast(pa.string())).sort_by(order)
-    assert logs["ax"].to_pylist() == whole.drives["ax"].to_pylist()
+    stored = stored.set_column(0, "drive_id", stored["drive_id"].cast(pa.string())).sort_by(order)
+    assert stored["ax"].to_pylist() == whole.drives["ax"].to_pylist()
     assert sorted(refused["row"].to_pylist()) == [4, 71]
     assert not ingest_file(warehouse, tmp_path / "log.csv", a_mapping()).new
 
@@ -149,9 +150,9 @@ def test_the_bits_that_land_depend_on_neither_threads_nor_blocks(
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(120)]
     columns["ax"][70] = "broken"
     (tmp_path / "log.csv").write_text(csv_text(columns))
-    monkeypatch.setattr(load, "FILE_ROWS", 50)
+    monkeypatch.setattr(logs, "FILE_ROWS", 50)
     expected = _land_in(tmp_path / "as it is", tmp_path / "log.csv")
-    monkeypatch.setattr(load, "WRITERS", threads)
+    monkeypatch.setattr(logs, "WRITERS", threads)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
     assert _land_in(tmp_path / "otherwise", tmp_path / "log.csv") == expected
     assert len(expected) == 3  # 4 drives in two files, and the quarantine
@@ -168,7 +169,7 @@ def _land_in(root: Path, file: Path) -> list[str]:
 def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(load, "FILE_ROWS", 1)
+    monkeypatch.setattr(logs, "FILE_ROWS", 1)
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 100)
     columns = good_columns(90)
     columns["t"] = [f"{i / 100 + 5 * (i // 30):.2f}" for i in range(90)]
@@ -200,10 +201,10 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
-    monkeypatch.setattr(open_drives, "MAX_OPEN_VALUES", 8 * rows)
-    monkeypatch.setattr(open_drives, "MAX_SEGMENTS_AT_ONCE", parts)
-    monkeypatch.setattr(open_drives, "MAX_SINGLE_PIECES", pieces)
-    monkeypatch.setattr(open_drives, "BUNDLED_GROUPS", groups)
+    monkeypatch.setattr(drives, "MAX_OPEN_VALUES", 8 * rows)
+    monkeypatch.setattr(drives, "MAX_SEGMENTS_AT_ONCE", parts)
+    monkeypatch.setattr(drives, "MAX_SINGLE_PIECES", pieces)
+    monkeypatch.setattr(drives, "BUNDLED_GROUPS", groups)
     spilled = read_columns(tmp_path, columns, mapping)
     assert spilled.drives.equals(whole.drives)
     assert spilled.counts == whole.counts

@@ -17,10 +17,10 @@ from numpy.testing import assert_allclose
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import open_drives, stream, time_bases
+from fleet_slip.ingest import batches, drives, measured_log
+from fleet_slip.ingest.batches import DISORDER, HELD, ROW, merge_bases
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate
-from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, merge_bases
 from tests.support.measured import OWN_CLOCK, MeasuredLog, a_mapping, own_clock, read_measured
 
 GAP_S = 1.0
@@ -105,7 +105,7 @@ def test_windows_say_what_the_whole_says(
     ]
     source = FakeSource(frames, batch)
     columns = [f"v{i}" for i in range(len(frames))]
-    with mock.patch.object(time_bases, "WINDOW_ROWS", window):
+    with mock.patch.object(batches, "WINDOW_ROWS", window):
         windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S))
     some = [rows for rows in bases if rows]
     if len(some) < 2:
@@ -141,16 +141,16 @@ def read_in(
     file = folder / "log.mf4"
     file.write_bytes(b"in memory")
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(time_bases, "open_source", opened))
-        patched.enter_context(mock.patch.object(time_bases, "BATCH_ROWS", max(batch // 2, 1)))
-        patched.enter_context(mock.patch.object(time_bases, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(open_drives, "MAX_SEGMENTS_AT_ONCE", 1 + batch % 3))
-        patched.enter_context(mock.patch.object(open_drives, "MAX_OPEN_VALUES", 40 * window))
-        patched.enter_context(mock.patch.object(open_drives, "MAX_SINGLE_PIECES", batch % 5))
-        patched.enter_context(mock.patch.object(open_drives, "BUNDLED_GROUPS", 1 + batch % 2))
-        patched.enter_context(mock.patch.object(stream, "RATE_ROWS", 60))
-        patched.enter_context(mock.patch.object(stream, "MIN_STEPS", 20))
-        patched.enter_context(mock.patch.object(stream, "MAX_DRIVE_S", 0.8))
+        patched.enter_context(mock.patch.object(batches, "open_source", opened))
+        patched.enter_context(mock.patch.object(batches, "BATCH_ROWS", max(batch // 2, 1)))
+        patched.enter_context(mock.patch.object(batches, "WINDOW_ROWS", window))
+        patched.enter_context(mock.patch.object(drives, "MAX_SEGMENTS_AT_ONCE", 1 + batch % 3))
+        patched.enter_context(mock.patch.object(drives, "MAX_OPEN_VALUES", 40 * window))
+        patched.enter_context(mock.patch.object(drives, "MAX_SINGLE_PIECES", batch % 5))
+        patched.enter_context(mock.patch.object(drives, "BUNDLED_GROUPS", 1 + batch % 2))
+        patched.enter_context(mock.patch.object(measured_log, "RATE_ROWS", 60))
+        patched.enter_context(mock.patch.object(measured_log, "MIN_STEPS", 20))
+        patched.enter_context(mock.patch.object(measured_log, "MAX_DRIVE_S", 0.8))
         try:
             return read_measured(file, mapping)
         except InputError as error:

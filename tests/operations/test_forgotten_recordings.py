@@ -14,12 +14,12 @@ import pytest
 
 from fleet_slip.errors import StorageError
 from fleet_slip.grams.update import update_grams
-from fleet_slip.ingest import load
-from fleet_slip.ingest.drive_cutting import MeasuredDrive
-from fleet_slip.ingest.load import ingest_files
+from fleet_slip.ingest import logs
+from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
-from fleet_slip.ingest.stream import open_measured
+from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.documents import DocumentFolder
@@ -126,15 +126,15 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"]
-    land = load.commit_batch
+    land = logs.commit_batch
 
     def overtaken(*written: Any) -> Any:
         forget(warehouse, ErasureSubject("drive", name), now=True)
         return land(*written)
 
-    monkeypatch.setattr(load, "commit_batch", overtaken)
+    monkeypatch.setattr(logs, "commit_batch", overtaken)
     again, other = write(tmp_path, recording()), a_mapping(name="other")
-    (report,) = load.ingest_files(warehouse, [again], other, replace="all")
+    (report,) = logs.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
     assert is_empty(warehouse)
 

@@ -13,7 +13,7 @@ import pytest
 import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import AlarmError
-from fleet_slip.ingest.stream import find_refusals, open_measured
+from fleet_slip.ingest.measured_log import find_refusals, open_measured
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
 from fleet_slip.quality.plausibility import check_plausibility, find_one_sided

@@ -16,6 +16,7 @@ import polars as pl
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches
 from fleet_slip.ingest.columns import (
     DateColumn,
     SignalColumn,
@@ -27,7 +28,6 @@ from fleet_slip.ingest.columns import (
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
 from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
-from fleet_slip.ingest.time_bases import DISORDER, HELD, ROW, read_batches
 
 RAW = "raw "
 REASONS = (

@@ -26,8 +26,8 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
-from fleet_slip.ingest.drive_cutting import MeasuredDrive, drive_id
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_log import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.recordings import (
     FILES,
     PREFIX,
@@ -47,7 +47,7 @@ from fleet_slip.ingest.recordings import (
     size_of,
     tables_of,
 )
-from fleet_slip.ingest.stream import IngestCounts, MeasuredStream, open_measured
+from fleet_slip.ingest.ticks import MeasuredDrive, drive_id
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.drive_signals import Signals, to_regular_grid
 from fleet_slip.quality.plausibility import check_plausibility

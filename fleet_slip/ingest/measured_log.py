@@ -21,21 +21,20 @@ from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.drive_cutting import (
+from fleet_slip.ingest.checked_columns import CheckedBlock, RowChecker, describe_refused, no_rows
+from fleet_slip.ingest.drives import (
     MAX_DRIVE_S,
     DriveCutter,
-    MeasuredDrive,
-    drive_id,
+    DriveRows,
+    OpenDrives,
     sample_intervals_s,
-    to_ticks,
 )
 from fleet_slip.ingest.formats.reading import file_errors, open_source, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
-from fleet_slip.ingest.log_rows import CheckedBlock, RowChecker, describe_refused, no_rows
 from fleet_slip.ingest.mapping import FromColumn, Mapping
-from fleet_slip.ingest.open_drives import DriveRows, OpenDrives
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
+from fleet_slip.ingest.ticks import MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import CHECKS, Check, Fault
 from fleet_slip.warehouse.warehouse import quarantine_schema
