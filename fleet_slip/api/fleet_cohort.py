@@ -1,17 +1,16 @@
 """The drives that satisfy a predicate, and what their Gram rows answer."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import UsageError
 
 if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
-    from fleet_slip.grams.folding import FoldKey
     from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.registry import ModelVersion
-    from fleet_slip.models.request import Label, SelectionRequest
+    from fleet_slip.models.request import SelectionOptions, SelectionRequest
     from fleet_slip.models.select import Selection
     from fleet_slip.operations.sensor_screen import SensorScreen
     from fleet_slip.regression.drive_moments import ClusterUnit
@@ -51,28 +50,7 @@ class FleetCohort:
             return SensorScreen(self.predicate)
         return screen_drives(self.warehouse, self.predicate)
 
-    def select(
-        self,
-        *,
-        models: str | None = None,
-        model: str | None = None,
-        order: str | None = None,
-        features: str | None = None,
-        label: "Label | None" = None,
-        group_by: "FoldKey | None" = None,
-        folds: int | str | None = None,
-        ranking: str | None = None,
-        criterion: str | None = None,
-        tolerance: str | None = None,
-        all_subsets: bool = False,
-        robust: bool = False,
-        cluster: "ClusterUnit | None" = None,
-        intercept: bool = True,
-        search: str | None = None,
-        max_features: int | None = None,
-        half_life: int | None = None,
-        prior: str | None = None,
-    ) -> "Selection":
+    def select(self, **options: "Unpack[SelectionOptions]") -> "Selection":
         """Compare models by cross-validation and choose one; `FleetModels.publish` takes it.
 
         Without options the models of the list `estimator` are compared. Drives with faulty sensors
@@ -130,28 +108,7 @@ class FleetCohort:
         """
         from fleet_slip.models.request import SelectionRequest
 
-        return self.run_request(
-            SelectionRequest(
-                models=models,
-                model=model,
-                order=order,
-                features=features,
-                label=label,
-                group_by=group_by,
-                folds=folds,
-                ranking=ranking,
-                criterion=criterion,
-                tolerance=tolerance,
-                all_subsets=all_subsets,
-                robust=robust,
-                cluster=cluster,
-                intercept=intercept,
-                search=search,
-                max_features=max_features,
-                half_life=half_life,
-                prior=prior,
-            )
-        )
+        return self.run_request(SelectionRequest(**options))
 
     def run_request(self, request: "SelectionRequest") -> "Selection":
         """Select as `select` does, with the options of a request."""

@@ -1,20 +1,14 @@
 """Commands for published models: models, show, promote, rollback, pin, unpin, diff, export."""
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from fleet_slip.base import pluralize
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
-from fleet_slip.rendering import Part, TextTable
-
-if TYPE_CHECKING:
-    from fleet_slip.models.manifest import CrossValidated, LearnedFrom
-    from fleet_slip.models.registry import ModelVersion
+from fleet_slip.rendering import TextTable
 
 
 def models(
@@ -67,116 +61,13 @@ def show(
 
     Example: fleet-slip show waterford
     """
+    from fleet_slip.export.costs import costs_content, describe_costs
+
     version = fleet_of(context).models.get(model)
     if json:
-        from fleet_slip.export.costs import costs_content
-
-        head = {
-            "version": version.version,
-            "sha256": version.sha256,
-            "on_board": costs_content(version),
-        }
-        print_json({**head, **version.manifest.model_dump(mode="json")})
+        print_json({**version.as_dict(), "on_board": costs_content(version)})
     else:
-        print_parts(_version_parts(version, everything))
-
-
-def _label_text(learned: "LearnedFrom") -> str:
-    """Describe the label of a model without a reference sensor, and its intercept."""
-    times = learned.change_s
-    intervals = ", ".join(f"{time:g}" for time in (times if isinstance(times, tuple) else (times,)))
-    text = f"changes of the {learned.label} over {intervals} s: the figures are of changes"
-    if not learned.cars:
-        return f"{text}. No intercept: it goes through the origin"
-    error = learned.intercept_uncertainty_deg
-    uncertainty = "uncertainty unknown" if error is None else f"uncertain by {error:.2g} deg"
-    return (
-        f"{text}. Intercept where {pluralize(learned.cars, 'car')} "
-        f"{'goes' if learned.cars == 1 else 'go'} straight, {uncertainty}"
-    )
-
-
-def _version_parts(version: "ModelVersion", everything: bool) -> Iterator[Part]:
-    """Render a model version."""
-    manifest = version.manifest
-    label, origin = manifest.label, manifest.through_origin
-    yield (
-        f"{version.reference}: {label.column} = {'' if origin else 'intercept + '}"
-        f"sum of coefficient * signal{', through the origin' if origin else ''}"
-    )
-    properties = {**_properties(version), **({"sha256": version.sha256} if everything else {})}
-    yield TextTable("", "|", properties.items(), text_columns=2)
-    form = repr if everything else "{:.6g}".format
-    terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
-    for term in manifest.terms:
-        per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
-        terms.append([term.column, term.unit, form(term.coefficient), per_count])
-    header = "signal|unit|coefficient"
-    if not everything:
-        yield TextTable("", header, [row[:3] for row in terms], text_columns=2)
-        return
-    yield TextTable("", f"{header}|per count", terms, text_columns=2)
-    yield "per count: coefficient times scale, for an ECU that works on raw counts"
-    if manifest.features:
-        yield TextTable(
-            "\nfeatures: SQL over the counts of log_counts, clipped to +-32767, times the scale",
-            "feature|scale|SQL",
-            (term for term in manifest.terms if term.sql),
-            "{signal}|{scale} {unit}|{sql}",
-            text_columns=3,
-        )
-
-
-def _properties(version: "ModelVersion") -> dict[str, str]:
-    """Return the properties of a version, with their names."""
-    from fleet_slip.export.costs import describe_costs
-    from fleet_slip.warehouse.predicate import describe_cohort
-
-    manifest = version.manifest
-    figures, trained, selected = (
-        manifest.cross_validation,
-        manifest.trained_on,
-        manifest.selected_by,
-    )
-    drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}, "
-    drives += pluralize(trained.rows, "row")
-    properties = {
-        "correlation": f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})",
-        "RMSE": f"{figures.rmse_deg:.4f} deg",
-        "label noise": _label_noise(figures),
-        "error std": f"{figures.error_std_deg:.4f} deg",
-        "error mean": f"{figures.error_mean_deg:+.4f} deg",
-        "on board": describe_costs(version),
-        "cross-validation": f"{pluralize(figures.folds, 'fold')} by {figures.folds_by}",
-        "cohort": f"{describe_cohort(trained.cohort)}: {drives}",
-        "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
-        "selected": f"model {selected.model} of {selected.model_list}",
-        "why": selected.reason,
-    }
-    if line := manifest.line:
-        properties["inner line"] = f"{line}, fitted first; feature set {trained.feature_set}"
-    if prior := manifest.prior:
-        properties["prior"] = (
-            f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
-            f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}"
-        )
-    if learned := manifest.learned_from:
-        properties["learned from"] = _label_text(learned)
-    if manifest.assumed:
-        properties["assumed"] = "; ".join(manifest.assumed)
-    if source := manifest.imported_from:
-        properties["imported"] = (
-            f"from {source.reference} of another data root, sha256 {source.sha256}"
-        )
-    return properties
-
-
-def _label_noise(figures: "CrossValidated") -> str:
-    """Describe the share of label noise in the RMSE."""
-    if figures.label_noise_deg is None:
-        return "unknown, and part of the RMSE"
-    rmse_deg = figures.beyond_label_noise_deg
-    return f"{figures.label_noise_deg:.4f} deg, without which the RMSE is {rmse_deg:.4f} deg"
+        print_answer(version, json, everything=everything, on_board=describe_costs(version))
 
 
 @recorded

@@ -57,30 +57,30 @@ def select(
 
     Keep the choice: fleet-slip select --order ay,yaw_rate --save own.toml
     """
-    selection = (
-        fleet_of(context)
-        .cohort(cohort, include_faulty=include_faulty)
-        .select(
-            models=models,
-            model=model,
-            order=order,
-            features=features,
-            label=label,
-            group_by=group_by,
-            folds=folds,
-            ranking=ranking,
-            criterion=criterion,
-            tolerance=tolerance,
-            all_subsets=all_subsets,
-            robust=robust,
-            cluster=cluster,
-            intercept=intercept,
-            search=search,
-            max_features=max_features,
-            half_life=half_life,
-            prior=prior,
-        )
+    from fleet_slip.models.request import SelectionRequest
+
+    request = SelectionRequest(
+        models=models,
+        model=model,
+        order=order,
+        features=features,
+        label=label,
+        group_by=group_by,
+        folds=folds,
+        ranking=ranking,
+        criterion=criterion,
+        tolerance=tolerance,
+        all_subsets=all_subsets,
+        robust=robust,
+        cluster=cluster,
+        intercept=intercept,
+        search=search,
+        max_features=max_features,
+        half_life=half_life,
+        prior=prior,
     )
+    drives = fleet_of(context).cohort(cohort, include_faulty=include_faulty)
+    selection = drives.run_request(request)
     print_answer(selection, json, everything=everything)
     if save is not None:
         with storage_errors(save):

@@ -26,6 +26,7 @@ from pydantic import (
     model_validator,
 )
 
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import (
     Combination,
@@ -179,6 +180,14 @@ class CrossValidated(Config):
         """The RMSE without the label's noise."""
         return math.sqrt(max(self.rmse_deg**2 - (self.label_noise_deg or 0.0) ** 2, 0.0))
 
+    @property
+    def label_noise_text(self) -> str:
+        """The share of label noise in the RMSE."""
+        if self.label_noise_deg is None:
+            return "unknown, and part of the RMSE"
+        rmse_deg = self.beyond_label_noise_deg
+        return f"{self.label_noise_deg:.4f} deg, without which the RMSE is {rmse_deg:.4f} deg"
+
     @model_validator(mode="after")
     def _can_be(self) -> Self:
         if abs(self.error_mean_deg) > self.rmse_deg * (1 + 1e-9) + 1e-12:
@@ -221,6 +230,19 @@ class LearnedFrom(Config):
     cars: Count
     intercept_uncertainty_deg: FiniteFloat | None
     intercept_spread_deg: FiniteFloat
+
+    def __str__(self) -> str:
+        times = self.change_s if isinstance(self.change_s, tuple) else (self.change_s,)
+        intervals = ", ".join(f"{time:g}" for time in times)
+        text = f"changes of the {self.label} over {intervals} s: the figures are of changes"
+        if not self.cars:
+            return f"{text}. No intercept: it goes through the origin"
+        error = self.intercept_uncertainty_deg
+        uncertainty = "uncertainty unknown" if error is None else f"uncertain by {error:.2g} deg"
+        return (
+            f"{text}. Intercept where {pluralize(self.cars, 'car')} "
+            f"{'goes' if self.cars == 1 else 'go'} straight, {uncertainty}"
+        )
 
 
 class Prior(Config):
@@ -424,6 +446,45 @@ class Manifest(Config):
         rows = (row for definition in self.definitions.values() for row in definition.rows())
         digests = (row.made.line for row in rows if isinstance(row.made, Combination))
         return next(filter(None, digests), None)
+
+    def properties(self, on_board: str = "") -> dict[str, str]:
+        """Return what `show` displays, by name; `on_board` are the costs in a car."""
+        from fleet_slip.warehouse.predicate import describe_cohort  # noqa: PLC0415 - SQL
+
+        figures, trained = self.cross_validation, self.trained_on
+        correlation = f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})"
+        drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
+        properties = {
+            "correlation": correlation,
+            "RMSE": f"{figures.rmse_deg:.4f} deg",
+            "label noise": figures.label_noise_text,
+            "error std": f"{figures.error_std_deg:.4f} deg",
+            "error mean": f"{figures.error_mean_deg:+.4f} deg",
+            "on board": on_board,
+            "cross-validation": f"{pluralize(figures.folds, 'fold')} by {figures.folds_by}",
+            "cohort": (
+                f"{describe_cohort(trained.cohort)}: {drives}, {pluralize(trained.rows, 'row')}"
+            ),
+            "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
+            "selected": f"model {self.selected_by.model} of {self.selected_by.model_list}",
+            "why": self.selected_by.reason,
+            "assumed": "; ".join(self.assumed),
+        }
+        if line := self.line:
+            stacked = f"{line}, fitted first; feature set {trained.feature_set}"
+            properties["first-stage model"] = stacked
+        if prior := self.prior:
+            properties["prior"] = (
+                f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
+                f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}"
+            )
+        if self.learned_from:
+            properties["learned from"] = str(self.learned_from)
+        if source := self.imported_from:
+            properties["imported"] = (
+                f"from {source.reference} of another data root, sha256 {source.sha256}"
+            )
+        return {name: text for name, text in properties.items() if text}
 
     def same_estimator(self, other: "Manifest") -> bool:
         """Return True if both have the same terms from the same rows."""

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, overload
 
 from pydantic import Field
@@ -184,7 +183,7 @@ class PandasFrame(Protocol):
 
 
 @dataclass(frozen=True)
-class ModelVersion:
+class ModelVersion(Answer):
     """A manifest with its number, its verified checksum, and the catalog of its data root."""
 
     version: int
@@ -199,11 +198,45 @@ class ModelVersion:
             f"{figures.rmse_deg:.4f} deg, correlation {figures.correlation:.4f}>"
         )
 
-    def _repr_html_(self) -> str:
-        terms = [(term.column, term.unit, term.coefficient) for term in self.manifest.terms]
-        terms.append(("intercept", self.manifest.label.unit, self.manifest.intercept))
-        table = TextTable("", "signal|unit|coefficient", terms, "{0}|{1}|{2:.6g}", text_columns=2)
-        return f"<pre>{escape(repr(self)[1:-1])}\n{escape(table.text())}</pre>"
+    def as_dict(self) -> dict[str, Any]:
+        """Return number, checksum and manifest."""
+        content = self.manifest.model_dump(mode="json")
+        return {"version": self.version, "sha256": self.sha256, **content}
+
+    def parts(self, everything: bool = False, on_board: str = "") -> Iterator[Part]:
+        """Render figures, training data and coefficients; `on_board` are the costs in a car."""
+        manifest = self.manifest
+        label, origin = manifest.label, manifest.through_origin
+        yield (
+            f"{self.reference}: {label.column} = {'' if origin else 'intercept + '}"
+            f"sum of coefficient * signal{', through the origin' if origin else ''}"
+        )
+        properties = manifest.properties(on_board)
+        yield TextTable(
+            "",
+            "|",
+            [*properties.items(), *([("sha256", self.sha256)] if everything else [])],
+            text_columns=2,
+        )
+        form = repr if everything else "{:.6g}".format
+        terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
+        for term in manifest.terms:
+            per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
+            terms.append([term.column, term.unit, form(term.coefficient), per_count])
+        header = "signal|unit|coefficient"
+        if not everything:
+            yield TextTable("", header, [row[:3] for row in terms], text_columns=2)
+            return
+        yield TextTable("", f"{header}|per count", terms, text_columns=2)
+        yield "per count: coefficient times scale, for an ECU that works on raw counts"
+        if manifest.features:
+            yield TextTable(
+                "\nfeatures: SQL over log_counts, clipped to +-32767 counts, times the scale",
+                "feature|scale|SQL",
+                (term for term in manifest.terms if term.sql),
+                "{signal}|{scale} {unit}|{sql}",
+                text_columns=3,
+            )
 
     @property
     def reference(self) -> str:

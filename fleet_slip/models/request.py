@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 from pydantic import (
     AfterValidator,
@@ -47,9 +47,32 @@ DEFAULT_MAX_FEATURES = 24
 _TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
 
 
+class SelectionOptions(TypedDict, total=False):
+    """Keyword arguments of `FleetCohort.select`, which explains them."""
+
+    models: str | None
+    model: str | None
+    order: str | None
+    features: str | None
+    label: Label | None
+    group_by: FoldKey | None
+    folds: int | str | None
+    ranking: str | None
+    criterion: str | None
+    tolerance: str | None
+    all_subsets: bool
+    robust: bool
+    cluster: ClusterUnit | None
+    intercept: bool
+    search: str | None
+    max_features: int | None
+    half_life: int | None
+    prior: str | None
+
+
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """Options of a selection, as `FleetCohort.select` explains them."""
+    """Options of a selection with their defaults."""
 
     models: str | None = None
     model: str | None = None

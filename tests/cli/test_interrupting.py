@@ -1,6 +1,5 @@
 """Ctrl-C in long work: what is said, and that the same command does the rest."""
 
-import inspect
 import json
 import os
 import re
@@ -16,10 +15,9 @@ import pytest
 
 import fleet_slip
 from fleet_slip import errors
-from fleet_slip.api.fleet_cohort import FleetCohort
 from fleet_slip.cli import app as program
 from fleet_slip.cli.app import COMMANDS, EXIT_CODES, GROUPS, CommandGroup, load_command
-from fleet_slip.models.request import SelectionRequest
+from fleet_slip.models.request import SelectionOptions, SelectionRequest
 from fleet_slip.regression.orders import METHODS, RANKINGS
 from fleet_slip.regression.subsets import CRITERIA
 from fleet_slip.storage.runs import LOGGER
@@ -267,7 +265,7 @@ def test_a_short_command_imports_no_large_library_in_vain(
 
 def test_select_and_publish_take_the_options_of_the_api() -> None:
     """Their help names every ranking, criterion and method."""
-    options = set(inspect.signature(FleetCohort.select).parameters) - {"self"}
+    options = {*SelectionOptions.__annotations__}
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
     assert taken["select"] - {"json", "cohort", "everything", "include_faulty", "save"} == options
     assert taken["publish"] & options == {"models", "label", "robust", "half_life", "prior"}
