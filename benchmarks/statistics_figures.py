@@ -21,9 +21,14 @@ from fleet_slip.regression.choice import (
     cross_validate_selection,
     nested_fits,
 )
-from fleet_slip.regression.drive_moments import DriveMoments, complete_cases
 from fleet_slip.regression.folds import CohortFolds, by_hash
-from fleet_slip.regression.inference import Evidence, infer_by_clusters, infer_classically
+from fleet_slip.regression.gram import complete_cases
+from fleet_slip.regression.inference import (
+    DriveMoments,
+    Evidence,
+    infer_by_clusters,
+    infer_classically,
+)
 from fleet_slip.regression.least_squares import correlation_matrix
 from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import (

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.request import SelectionOptions, SelectionRequest
     from fleet_slip.models.select import Selection
     from fleet_slip.operations.sensor_screen import SensorScreen
-    from fleet_slip.regression.drive_moments import ClusterUnit
+    from fleet_slip.regression.inference import ClusterUnit
     from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -17,7 +17,7 @@ from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.figures import student_t_two_sided
+from fleet_slip.regression.inference import student_t_two_sided
 from fleet_slip.regression.orders import RANKINGS, rank
 from fleet_slip.regression.subsets import best_subsets
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ

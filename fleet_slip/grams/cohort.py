@@ -35,14 +35,9 @@ from fleet_slip.grams.folding import (
     require_blocks,
 )
 from fleet_slip.regression.choice import TrainingFolds
-from fleet_slip.regression.drive_moments import (
-    ClusterUnit,
-    DriveMoments,
-    complete_cases,
-    missing_signals_error,
-)
 from fleet_slip.regression.folds import CohortFolds
-from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.gram import Gram, GramTable, complete_cases, missing_signals_error
+from fleet_slip.regression.inference import ClusterUnit, DriveMoments
 from fleet_slip.rendering import Remark
 from fleet_slip.warehouse.gram_reader import HASHES, GramReader, OpenedGrams, open_grams
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort

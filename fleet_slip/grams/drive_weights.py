@@ -12,8 +12,8 @@ import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.base import Record
-from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.inference import DriveMoments
 
 FULL = 16
 """Weight of a usual drive."""

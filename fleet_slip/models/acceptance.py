@@ -28,7 +28,6 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import search_procedure
 from fleet_slip.models.select import Selection
 from fleet_slip.regression.choice import RmseGap, Tolerance, compare_paired
-from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
@@ -36,6 +35,7 @@ from fleet_slip.regression.folds import (
     Folds,
     Procedure,
     assemble,
+    error_sums,
     held_out_errors,
     least_squares,
 )

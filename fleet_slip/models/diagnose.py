@@ -10,9 +10,9 @@ from fleet_slip.grams.drive_weights import DownweightedDrive
 from fleet_slip.models.select import outlier_drives
 from fleet_slip.models.summary import outlier_remarks
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.inference import (
     INTERCEPT,
+    ClusterUnit,
     Evidence,
     Inference,
     infer_by_clusters,

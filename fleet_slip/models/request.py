@@ -24,7 +24,7 @@ from fleet_slip.config import Config, load_config, refuse_renamed
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.folding import PARTS, Folding, FoldKey, make_folding
 from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
-from fleet_slip.regression.drive_moments import ClusterUnit
+from fleet_slip.regression.inference import ClusterUnit
 from fleet_slip.regression.orders import METHODS
 
 if TYPE_CHECKING:

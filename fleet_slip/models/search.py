@@ -26,10 +26,10 @@ from fleet_slip.regression.choice import (
     nested_fits,
     select_nested,
 )
-from fleet_slip.regression.figures import ErrorSums
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
+    ErrorSums,
     Procedure,
     assemble,
     held_out_errors,

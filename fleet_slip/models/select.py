@@ -50,13 +50,13 @@ from fleet_slip.models.search import (
 )
 from fleet_slip.models.summary import summarize
 from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winner
-from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
     cross_validate,
     least_squares,
 )
+from fleet_slip.regression.inference import DriveMoments
 from fleet_slip.rendering import Answer, Part
 from fleet_slip.warehouse.warehouse import Warehouse
 

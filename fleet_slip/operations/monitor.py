@@ -22,9 +22,9 @@ from fleet_slip.grams.cohort import remark_left_out, sum_days
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.quality.peers import thresholds
-from fleet_slip.regression.figures import error_sums, student_t_quantile
-from fleet_slip.regression.folds import least_squares
+from fleet_slip.regression.folds import error_sums, least_squares
 from fleet_slip.regression.gram import Gram
+from fleet_slip.regression.inference import student_t_quantile
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort

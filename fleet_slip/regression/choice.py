@@ -13,7 +13,6 @@ import numpy as np
 from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record
 from fleet_slip.errors import QuestionError
-from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,
@@ -24,7 +23,7 @@ from fleet_slip.regression.folds import (
     least_squares,
 )
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.inference import DriveMoments, Evidence
 from fleet_slip.regression.least_squares import Fit, Scales, fit_moments, moments
 from fleet_slip.regression.orders import rank
 from fleet_slip.regression.subsets import best_size, criterion_values
@@ -164,15 +163,17 @@ def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOL
 
 def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolerance) -> RmseGap:
     """Return the difference of two models' RMSE, over the same folds."""
-    difference, square = _differences(model, best)
-    within_tolerance = square < tolerance.squared(best.pooled.rmse)
-    return RmseGap(model, difference, _standard_error(model, best), square, within_tolerance)
+    return _gap(model, best, tolerance, _standard_error(model, best))
 
 
-def _differences(model: CrossValidation, other: CrossValidation) -> tuple[float, float]:
-    """Return the differences of two models' pooled RMSE and of their squares."""
-    first, second = model.pooled.rmse, other.pooled.rmse
-    return first - second, (first - second) * (first + second)
+def _gap(
+    model: CrossValidation, best: CrossValidation, tolerance: Tolerance, standard_error: float
+) -> RmseGap:
+    first, second = model.pooled.rmse, best.pooled.rmse
+    square = (first - second) * (first + second)
+    return RmseGap(
+        model, first - second, standard_error, square, square < tolerance.squared(second)
+    )
 
 
 def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
@@ -245,7 +246,9 @@ def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: To
     ----------
     Cochran, Sampling Techniques, 1977, section 6.4.
     """
-    rows = _common_rows(model, other)
+    rows = [fold.rows for fold in model.folds]
+    if model.fold_names != other.fold_names or rows != [fold.rows for fold in other.folds]:
+        raise ValueError("the models were not tested on the same rows")
     differences = [
         n * (first.rmse - second.rmse) * (first.rmse + second.rmse)
         for n, first, second in zip(rows, model.folds, other.folds, strict=True)
@@ -254,16 +257,7 @@ def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: To
     square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
     error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
     both = model.pooled.rmse + other.pooled.rmse
-    rmse, lacking = _differences(model, other)
-    within_tolerance = lacking < tolerance.squared(other.pooled.rmse)
-    return RmseGap(model, rmse, error / both if both else 0.0, lacking, within_tolerance)
-
-
-def _common_rows(model: CrossValidation, other: CrossValidation) -> list[int]:
-    rows = [fold.rows for fold in model.folds]
-    if model.fold_names != other.fold_names or rows != [fold.rows for fold in other.folds]:
-        raise ValueError("the models were not tested on the same rows")
-    return rows
+    return _gap(model, other, tolerance, error / both if both else 0.0)
 
 
 def nested_fits(

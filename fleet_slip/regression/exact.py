@@ -30,12 +30,13 @@ def solve(matrix: IntegerMatrix, right: Sequence[int]) -> tuple[list[int], int] 
         Numerators of the k unknowns over one common denominator. None if `matrix` is singular.
     """
     size = len(matrix)
-    augmented = [[*row, value] for row, value in zip(matrix, right, strict=True)]
-    reduced, denominator, _ = fmpz_mat(size, size + 1, _flat(augmented)).rref()
-    rows = reduced.tolist()
-    if any(row[i] == 0 for i, row in enumerate(rows)):
+    solution = _solve(
+        fmpq_mat(fmpz_mat(size, size, _flat(matrix))), fmpq_mat(fmpz_mat(size, 1, list(right)))
+    )
+    if solution is None:
         return None
-    return [int(row[size]) for row in rows], int(denominator)
+    numerators, denominator = solution.numer_denom()
+    return list(map(int, numerators.entries())), int(denominator)
 
 
 def solve_rational(rows: Sequence[Sequence[Fraction]]) -> tuple[Fraction, ...] | None:
@@ -52,11 +53,22 @@ def solve_rational(rows: Sequence[Sequence[Fraction]]) -> tuple[Fraction, ...] |
         The k unknowns. None if the equations are singular.
     """
     size = len(rows)
-    entries = [fmpq(value.numerator, value.denominator) for value in _flat(rows)]
-    reduced = fmpq_mat(size, size + 1, entries).rref()[0].tolist()
-    if any(row[i] == 0 for i, row in enumerate(reduced)):
+    matrix, right = (
+        fmpq_mat(size, width, [fmpq(x.numerator, x.denominator) for x in _flat(part)])
+        for width, part in ((size, [row[:-1] for row in rows]), (1, [row[-1:] for row in rows]))
+    )
+    solution = _solve(matrix, right)
+    if solution is None:
         return None
-    return tuple(Fraction(int(row[size].p), int(row[size].q)) for row in reduced)
+    return tuple(Fraction(int(value.p), int(value.q)) for value in solution.entries())
+
+
+def _solve(matrix: fmpq_mat, right: fmpq_mat) -> fmpq_mat | None:
+    """Return the solution of linear equations; None if they are singular."""
+    try:
+        return matrix.solve(right)
+    except ZeroDivisionError:
+        return None
 
 
 def invert(matrix: IntegerMatrix) -> tuple[list[list[int]], int]:

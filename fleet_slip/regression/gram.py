@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.errors import DataError
 
 SomeSize = TypeVar("SomeSize", int, IntArray)
@@ -415,3 +415,48 @@ def exact_sum(values: IntArray) -> list[int]:
         for at in np.flatnonzero(turns).tolist():
             totals[at] += int(turns[at]) * _MODULUS
     return totals
+
+
+def missing_signals_error(signals: Sequence[str]) -> DataError:
+    """Return the error for a cohort without a drive that has all signals."""
+    return DataError(
+        f"no drive of the cohort has all of {', '.join(signals)}. Use fewer signals, or another "
+        "cohort."
+    )
+
+
+def complete_cases(
+    tables: Sequence[GramTable], signals: Sequence[str]
+) -> tuple[GramTable, BoolArray]:
+    """Return the drives that have all signals.
+
+    Parameters
+    ----------
+    tables : sequence of GramTable
+        Drives by set of signals.
+    signals : sequence of str
+
+    Returns
+    -------
+    tuple of (GramTable, bool array)
+        The drives, and their mask among all drives of `tables`.
+
+    Raises
+    ------
+    DataError
+        If there are none.
+    """
+    served = [set(signals) <= set(table.signals) for table in tables]
+    if not any(served):
+        raise missing_signals_error(signals)
+    parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
+    mask = np.repeat(served, [len(table) for table in tables])
+    if len(parts) == 1:
+        return parts[0], mask
+    stacked = GramTable(
+        tuple(signals),
+        np.concatenate([part.n for part in parts]),
+        np.concatenate([part.sums for part in parts]),
+        np.concatenate([part.products for part in parts]),
+    )
+    return stacked, mask

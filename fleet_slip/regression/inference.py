@@ -7,20 +7,104 @@ the evidence is taken over drives.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.figures import student_t_two_sided
-from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import Fit, Scales, dependence, moments
+from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.least_squares import Fit, LinearModel, Scales, dependence, moments
+
+ClusterUnit = Literal["drive", "vehicle"]
+"""The independent unit of evidence: a cluster."""
+
+
+@dataclass(frozen=True)
+class DriveMoments:
+    """Moments of u = (1, (count - centre) / spread) of each drive. The label is last.
+
+    Attributes
+    ----------
+    signals : tuple of str
+        The k signals.
+    centre : tuple of int, shape (k,)
+        Mean count over all drives, rounded.
+    spread : float array, shape (k,)
+        Standard deviation of the counts; 1 for a constant.
+    moments : float array, shape (drives, k + 1, k + 1)
+        Sums of products of u.
+    cluster : integer array, shape (drives,), or None
+        Cluster of each drive; None if each drive is a cluster.
+    unit : str
+        The independent unit: drives of a vehicle share its biases and tyres.
+    """
+
+    signals: tuple[str, ...]
+    centre: tuple[int, ...]
+    spread: FloatArray
+    moments: FloatArray
+    cluster: IntArray | None = None
+    unit: ClusterUnit = "drive"
+
+    @classmethod
+    def from_table(
+        cls, table: GramTable, cluster: IntArray | None = None, unit: ClusterUnit = "drive"
+    ) -> "DriveMoments":
+        """Scale a table of drives. Raises `DataError` without rows."""
+        total = table.total()
+        if total.n == 0:
+            raise DataError(f"no rows have all of {', '.join(table.signals)}.")
+        centre = tuple(round(s / total.n) for s in total.sums)
+        squares = np.array(
+            [row[i] for i, row in enumerate(total.centered_products())], dtype=np.float64
+        )
+        spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
+        unit_of_u = np.array([1.0, *spread])
+        moments = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)
+        return cls(table.signals, centre, spread, moments, cluster, unit)
+
+    def __len__(self) -> int:
+        return len(self.moments)
+
+    def take(self, rows: NDArray[Any]) -> "DriveMoments":
+        """Return the drives at an index array or a mask, with the same centre and spread."""
+        cluster = None if self.cluster is None else self.cluster[rows]
+        return replace(self, moments=self.moments[rows], cluster=cluster)
+
+    @property
+    def clusters(self) -> int:
+        """Number of clusters."""
+        return len(self) if self.cluster is None else len(np.unique(self.cluster))
+
+    def by_cluster(self, values: FloatArray) -> FloatArray:
+        """Sum values of drives, shape (drives, ...), over each cluster."""
+        if self.cluster is None:
+            return values
+        order = np.argsort(self.cluster, kind="stable")
+        _, first = np.unique(self.cluster[order], return_index=True)
+        return np.add.reduceat(values[order], first, axis=0)
+
+    def direction(self, model: LinearModel) -> FloatArray:
+        """Return w with w'u = prediction minus label, in spreads of the label; model in counts."""
+        if model.label != self.signals[-1]:
+            raise ValueError(f"the moments end with {self.signals[-1]}, not {model.label}")
+        weights = dict(zip(model.signals, model.coefficients, strict=True))
+        inputs = self.signals[:-1]
+        level = model.intercept - self.centre[-1]
+        level += sum(weights.get(s, 0) * c for s, c in zip(inputs, self.centre, strict=False))
+        unit = self.spread[-1]
+        slopes = [
+            float(weights.get(s, 0)) * spread / unit
+            for s, spread in zip(inputs, self.spread, strict=False)
+        ]
+        return np.array([float(level) / unit, *slopes, -1.0])
+
 
 # Standard errors that are valid for few clusters, from Gram rows.
 #
@@ -563,3 +647,42 @@ def _root(falling: Callable[[float], float], low: float, high: float) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if falling(middle) > 0 else (low, middle)
     return (low + high) / 2
+
+
+def student_t_two_sided(t: float, degrees: float) -> float:
+    """Return the two-sided p-value of Student's t distribution.
+
+    Parameters
+    ----------
+    t : float
+        Value of the statistic.
+    degrees : float
+        Degrees of freedom, above 0.
+
+    Returns
+    -------
+    float
+        P(|T| >= |t|).
+    """
+    from scipy.special import stdtr  # noqa: PLC0415 - slow
+
+    return float(2 * stdtr(degrees, -abs(t)))
+
+
+def student_t_quantile(p: float, degrees: float) -> float:
+    """Return the quantile of Student's t distribution.
+
+    Parameters
+    ----------
+    p : float
+        Probability of a smaller value, between 0 and 1.
+    degrees : float
+        Degrees of freedom, above 0.
+
+    Returns
+    -------
+    float
+    """
+    from scipy.special import stdtrit  # noqa: PLC0415 - slow
+
+    return float(stdtrit(degrees, p))

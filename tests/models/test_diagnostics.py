@@ -15,7 +15,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.diagnose import diagnose
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.publish import manifest_of
-from fleet_slip.regression.drive_moments import ClusterUnit
+from fleet_slip.regression.inference import ClusterUnit
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect

@@ -8,7 +8,7 @@ import pytest
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
-from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import error_sums
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse

@@ -22,8 +22,8 @@ from fleet_slip.models.search import (
 )
 from fleet_slip.models.select import select
 from fleet_slip.regression.choice import CROSS_VALIDATION, Rule, select_nested
-from fleet_slip.regression.drive_moments import ClusterUnit
 from fleet_slip.regression.folds import cross_validate, least_squares
+from fleet_slip.regression.inference import ClusterUnit
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, Driven, cohort_of, dense_fit, driven, rows_of
 

@@ -18,7 +18,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.regression.figures import error_sums
+from fleet_slip.regression.folds import error_sums
 from fleet_slip.regression.gram import Gram
 from tests.support.cars import Signals, counts, drive, gram_of
 from tests.support.catalog import CATALOG, SIGNALS

@@ -19,7 +19,7 @@ from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
 from fleet_slip.operations.monitor import Chart, Limits, monitor
-from fleet_slip.regression.figures import student_t_quantile
+from fleet_slip.regression.inference import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import counts, drive

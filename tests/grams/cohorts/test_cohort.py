@@ -21,8 +21,8 @@ from fleet_slip.grams.drive_weights import (
 from fleet_slip.grams.folding import Folding, FoldKey
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.update import update_grams
-from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.gram import Gram, GramTable
+from fleet_slip.regression.inference import DriveMoments
 from fleet_slip.warehouse import gram_reader
 from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate

@@ -13,10 +13,14 @@ from fleet_slip.regression.choice import (
     nested_fits,
     select_nested,
 )
-from fleet_slip.regression.drive_moments import DriveMoments
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
-from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.folds import (
+    CohortFolds,
+    by_value,
+    cross_validate,
+    error_sums,
+    least_squares,
+)
+from fleet_slip.regression.inference import DriveMoments, Evidence
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.subsets import best_size, best_subsets, pick_sizes
 from tests.support.counts import gram_of, names, table_of, unit_scales

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import orders, subsets
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drive_moments import DriveMoments
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import Evidence
+from fleet_slip.regression.inference import DriveMoments, Evidence
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import METHODS, RANKINGS, rank, stepwise_order
 from fleet_slip.regression.subsets import all_rss, best_subsets, signals_of

@@ -17,8 +17,7 @@ import pytest
 
 from fleet_slip.regression import exact as exact_roots
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.figures import error_sums
-from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate
+from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate, error_sums
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import LinearModel, fit

@@ -14,14 +14,14 @@ from hypothesis.extra import numpy as hnp
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.drive_moments import DriveMoments, complete_cases
-from fleet_slip.regression.figures import student_t_two_sided
-from fleet_slip.regression.gram import GramTable
+from fleet_slip.regression.gram import GramTable, complete_cases
 from fleet_slip.regression.inference import (
+    DriveMoments,
     Evidence,
     infer_by_clusters,
     infer_classically,
     pool,
+    student_t_two_sided,
     variance_inflation,
 )
 from fleet_slip.regression.least_squares import fit

@@ -15,7 +15,6 @@ from scipy import stats
 from fleet_slip.base import hash_fold
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.choice import RmseGap, Tolerance, choose, compare_paired
-from fleet_slip.regression.figures import error_sums
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
@@ -24,7 +23,9 @@ from fleet_slip.regression.folds import (
     by_band,
     by_hash,
     by_value,
-    cross_validate_inputs,
+    cross_validate,
+    error_sums,
+    least_squares,
 )
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel
@@ -38,12 +39,17 @@ def cohort_of(drives: list[np.ndarray], fold: list[int]) -> CohortFolds:
     return CohortFolds.from_tables([table], by_value(fold))
 
 
+def cross_validated(name: str, cohort: CohortFolds, inputs: Sequence[str]) -> CrossValidation:
+    folds = cohort.complete_cases(inputs, "y")
+    return cross_validate(name, folds, least_squares(inputs, "y"), SCALES)
+
+
 @settings(max_examples=25)
 @given(st.integers(0, 10**6), st.integers(2, 5))
 def test_equals_cross_validation_on_rows(seed: int, count: int) -> None:
     drives = random_drives(seed, drives=10)
     fold = [i % count for i in range(10)]
-    result = cross_validate_inputs("m", cohort_of(drives, fold), ["x1", "x3"], "y", SCALES)
+    result = cross_validated("m", cohort_of(drives, fold), ["x1", "x3"])
     predicted, label, null = [], [], 0.0
     for number in range(count):
         columns = [drive[:, [0, 2, 4]] for drive in drives]
@@ -77,12 +83,12 @@ def test_drives_without_a_signal_serve_the_models_that_do_not_need_it() -> None:
         [Gram.from_counts(("y", "x1", "x2"), counts[:, [4, 0, 1]]) for counts in drives[6:]]
     )
     cohort = CohortFolds.from_tables([full, poor], by_value([0, 1, 2] * 4))
-    both = cross_validate_inputs("two", cohort, ["x1", "x2"], "y", SCALES)
+    both = cross_validated("two", cohort, ["x1", "x2"])
     assert both.drives == 12
     assert both.pooled.rows == 12 * 60
     together = cohort_of(drives, [0, 1, 2] * 4)
-    assert both == cross_validate_inputs("two", together, ["x1", "x2"], "y", SCALES)
-    assert cross_validate_inputs("three", cohort, ["x3"], "y", SCALES).drives == 6
+    assert both == cross_validated("two", together, ["x1", "x2"])
+    assert cross_validated("three", cohort, ["x3"]).drives == 6
     with pytest.raises(DataError, match="these drives lack gyro"):
         cohort.complete_cases(["gyro"], "y")
 
@@ -129,7 +135,7 @@ def candidate(name: str, size: int, correlation: float, *rmses: float) -> CrossV
     """Return a real result with its correlation and two folds' RMSEs placed."""
     cohort = cohort_of(random_drives(1, inputs=6), [0, 1] * 6)
     inputs = names(6)[:size]
-    result = cross_validate_inputs(name, cohort, inputs, "y", SCALES)
+    result = cross_validated(name, cohort, inputs)
     r = Fraction(correlation)
     sums = replace(
         result.sums, n=1, p=Fraction(0), y=Fraction(0), pp=Fraction(1), yy=Fraction(1), py=r
@@ -177,7 +183,7 @@ def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
 
 def test_the_standard_error_of_a_shortfall_is_that_of_a_paired_t_test() -> None:
     cohort = cohort_of(random_drives(1, inputs=6), [0, 1, 2] * 4)
-    one, other = (cross_validate_inputs(str(k), cohort, names(6)[:k], "y", SCALES) for k in (3, 5))
+    one, other = (cross_validated(str(k), cohort, names(6)[:k]) for k in (3, 5))
     chosen = choose([one, other])
     rest = next(s for s in chosen.gaps if s.model is not chosen.best)
     a, b = ([fold.rmse for fold in m.folds] for m in (rest.model, chosen.best))
@@ -209,7 +215,7 @@ def test_a_clear_best_wins_and_ties_go_to_the_declared_order() -> None:
 
 def test_a_json_document_has_what_is_promised() -> None:
     cohort = cohort_of(random_drives(2), [0, 1, 2] * 4)
-    document = cross_validate_inputs("m1", cohort, ["x2"], "y", SCALES).as_dict()
+    document = cross_validated("m1", cohort, ["x2"]).as_dict()
     assert document["name"] == "m1"
     assert document["signals"] == ["x2"]
     assert {"correlation", "rmse_deg", "error_mean_deg", "error_std_deg"} <= document.keys()
@@ -219,7 +225,7 @@ def test_a_json_document_has_what_is_promised() -> None:
 
 def test_a_constant_prediction_has_no_correlation() -> None:
     drives = random_drives(2, drives=4)
-    result = cross_validate_inputs("null", cohort_of(drives, [0, 0, 1, 1]), [], "y", SCALES)
+    result = cross_validated("null", cohort_of(drives, [0, 0, 1, 1]), [])
     assert all(fold.correlation == 0 for fold in result.folds)
 
 
