@@ -110,7 +110,8 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
 def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     """Tabulate statistics on measured drives, the best estimator first."""
     drives = pluralize(len(content["drives"]), "drive")
-    held_out = "in quarters of their time" if content["parts_of"] == "time" else "whole"
+    is_time = content["parts_of"] == "time"
+    held_out, unit = ("in quarters of their time", "quarter") if is_time else ("whole", "drive")
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(
         f"{content['cohort']}: {drives}, held out {held_out}, in {content['parts']} folds",
@@ -125,7 +126,8 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
         text_columns=2,
     )
     yield (
-        "±: standard error over drives; worst: RMSE of the worst drive.\n"
+        f"±: standard error over {unit}s; worst: RMSE of the worst {unit}; rows: share of the rows "
+        "with an estimate. All RMSEs are of the rows that all estimators have.\n"
         + (f"Kinds of driving: {kinds}." if kinds else "All drives are of one kind of driving.")
     )
     if content["vehicle"] is None:

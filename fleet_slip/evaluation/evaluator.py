@@ -16,10 +16,6 @@ class MissingSignalError(DataError):
     """A drive lacks a signal that an estimator needs."""
 
 
-MIN_SPEED_MPS = 2.0
-"""Speed below which no angle is evaluated: at standstill there is none, and a label is noise."""
-
-
 class Drive(Protocol):
     """A drive with a reference for its side-slip angle; arrays have shape (ticks,)."""
 
@@ -153,6 +149,45 @@ def _estimate(estimator: Estimator[D], drive: D) -> FloatArray:
         return estimator(drive)
     except MissingSignalError:
         return np.full(len(drive.sideslip_rad), np.nan)
+
+
+MIN_COMMON_SHARE = 0.9
+"""Share of the rows that must remain for an estimator to join a comparison on common rows."""
+
+
+def on_common_rows(
+    drives: Sequence[EvaluatedDrive[D]],
+) -> tuple[tuple[EvaluatedDrive[D], ...], dict[str, str]]:
+    """Restrict the evaluation to rows that all comparable estimators estimate.
+
+    The estimators with the most rows join first, while `MIN_COMMON_SHARE` of the rows of the first
+    remains. Returns the drives with the comparable estimators, and the reason of each other one.
+    """
+    rows = np.concatenate([evaluated.rows for evaluated in drives])
+    estimated = {
+        name: rows & np.isfinite(np.concatenate([drive.estimates[name] for drive in drives]))
+        for name in drives[0].estimates
+    }
+    largest = max((int(mask.sum()) for mask in estimated.values()), default=0)
+    common, comparable, excluded = rows, set[str](), dict[str, str]()
+    for name in sorted(estimated, key=lambda name: -int(estimated[name].sum())):
+        remaining = common & estimated[name]
+        if largest and remaining.sum() >= MIN_COMMON_SHARE * largest:
+            common, comparable = remaining, comparable | {name}
+        elif estimated[name].any():
+            share = estimated[name].sum() / largest
+            excluded[name] = f"it estimates {share:.0%} of the rows, too few to compare"
+        else:
+            excluded[name] = "no drive has the signals that it needs"
+    stops = np.cumsum([len(evaluated.rows) for evaluated in drives])[:-1]
+    return tuple(
+        replace(
+            evaluated,
+            rows=mask,
+            estimates={n: e for n, e in evaluated.estimates.items() if n in comparable},
+        )
+        for evaluated, mask in zip(drives, np.split(common, stops), strict=True)
+    ), excluded
 
 
 def pooled_statistics(drives: Sequence[EvaluatedDrive[D]]) -> dict[str, ErrorStatistics]:

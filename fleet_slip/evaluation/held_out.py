@@ -23,7 +23,6 @@ from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
 from fleet_slip.grams.folding import FOLD_KEYS, Folding
-from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionPlan, SelectionRequest
@@ -175,7 +174,7 @@ class Learner:
 
     @cached_property
     def quarters(self) -> Cohort:
-        """Gram rows of each quarter, each as a drive of its own."""
+        """Gram rows of each quarter of each drive, by the column `quarter`."""
         catalog, name = self.warehouse.catalog, self.plan.feature_set
         feature_set, label = catalog.feature_set(name), catalog.signals.label
         if feature_set.change_ticks:
@@ -189,23 +188,30 @@ class Learner:
             for quarter in range(QUARTERS)
             for row in _gram_rows(label, workspace, blocks, drive, quarter, attributes[drive.name])
         ]
-        schema = pa.schema([*self.cohort.drives.schema, ("sums", _SUMS), ("products", _SUMS)])
+        of_quarter = [("quarter", pa.int64()), ("sums", _SUMS), ("products", _SUMS)]
+        schema = pa.schema([*self.cohort.drives.schema, *of_quarter])
         return with_gram_rows(self.cohort, pa.Table.from_pylist(rows, schema=schema))
 
     def choose(self, held_out: Segments, prior: Cohort | None = None) -> Selection:
-        """Choose a model without held-out segments, in folds of drives if its key has one value.
+        """Choose a model as `publish` does on the segments that are not held out.
 
-        For a single training drive, or for quarters, each quarter counts as a drive.
+        The folds are trips where the key of the recipe has one value, and quarters of a single
+        trip, on which `publish` refuses. Quarters never count as drives.
         """
         training = _segments(self.drives) - held_out
-        names = {name for name, _ in training}
-        cohort, plan = self.cohort, self.plan
-        if len(training) < QUARTERS * len(names) or len(names) < 2:
+        names, plan = {name for name, _ in training}, self.plan
+        trips = {drive.trip for drive in self.drives if drive.name in names}
+        if len(training) == QUARTERS * len(names) and len(trips) > 1:
+            cohort = self.cohort
+            cohort = cohort.filter(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
+        else:
             cohort = self.quarters
-            names = {_quarter_name(name, quarter) for name, quarter in training}
-        cohort = cohort.filter(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
+            segments = _segments_of(cohort)
+            cohort = cohort.filter(np.array([segment in training for segment in segments]))
         if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
             plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
+        if plan.folds.by == "drive" and len(trips) == 1:
+            cohort = replace(cohort, drives=_quarters_as_trips(cohort))
         return select_models(replace(cohort, prior=prior) if prior else cohort, plan)
 
     def train(self, held_out: Segments, prior: Cohort | None = None) -> tuple[list[str], Predictor]:
@@ -220,8 +226,16 @@ class Learner:
 _SUMS = pa.list_(pa.int64())
 
 
-def _quarter_name(drive_id: str, quarter: int) -> str:
-    return f"{drive_id}, quarter {quarter + 1}"
+def _segments_of(quarters: Cohort) -> list[tuple[str, int]]:
+    columns = (quarters.drives[name].to_pylist() for name in ("drive_id", "quarter"))
+    return list(zip(*columns, strict=True))
+
+
+def _quarters_as_trips(quarters: Cohort) -> pa.Table:
+    """Return the metadata of Gram rows with each quarter of the time as a trip, hence a fold."""
+    names = [f"quarter {quarter + 1}" for _, quarter in _segments_of(quarters)]
+    column = quarters.drives.schema.get_field_index("trip")
+    return quarters.drives.set_column(column, "trip", pa.array(names))
 
 
 def _gram_rows(
@@ -236,11 +250,8 @@ def _gram_rows(
     counts = counts_of(drive.rows, workspace.plan, attributes)
     labelled = counts.present.get(label, np.ones(len(drive.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (drive.quarter == quarter)}
-    name = _quarter_name(drive.name, quarter)
-    (number,) = hash_names(pa.array([name])).tolist()
-    identity = {"drive_id": name, "trip": name, "drive_hash": number, "trip_hash": number}
     sums = drive_sums(workspace, blocks, replace(counts, present=present))
-    rows = gram_rows(sums, workspace.plan.names, blocks, {**attributes, **identity})
+    rows = gram_rows(sums, workspace.plan.names, blocks, {**attributes, "quarter": quarter})
     return [row for row in rows if label in row["signals"].split(",")]
 
 

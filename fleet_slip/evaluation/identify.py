@@ -28,7 +28,6 @@ from fleet_slip.evaluation.single_track import (
     DriveSignals,
     LabelledDrive,
     measured_speed_mps,
-    without_rest,
 )
 from fleet_slip.evaluation.tuning import (
     SUBSAMPLE,
@@ -351,7 +350,6 @@ def identify(
     a prior is a further residual of each parameter: it decides what the drives do not determine.
     Raises `DataError` without a label.
     """
-    drives = [without_rest(drive, measures.vehicle()) for drive in drives]
     require_finite(np.concatenate([drive.sideslip_rad for drive in drives]))
     labelled = [np.isfinite(drive.sideslip_rad[::SUBSAMPLE]) for drive in drives]
     has_road_wheels = any(drive.signals.has_road_wheels for drive in drives)
@@ -405,7 +403,6 @@ def identify_held_out(
     measures: VehicleMeasures, drives: Sequence[LabelledDrive], executor: Executor
 ) -> IdentifiedVehicle:
     """Identify a vehicle from all drives, with its error on drives held out in turn."""
-    drives = [without_rest(drive, measures.vehicle()) for drive in drives]
     identified = identify(measures, drives, executor)
     if len(drives) < 2:
         return identified

@@ -166,7 +166,7 @@ def estimate_yaw_rate(
     """
     axle = undriven_axle(drive, car)
     rolling = drive.ax_mps2 > BRAKING_MPS2
-    if np.array_equal(axle.left_mps, axle.right_mps, equal_nan=True):
+    if axle.is_one_speed:
         rolling &= axle.left_mps == 0
     return _filter_yaw_rate(
         drive.yaw_rate_rad_s,

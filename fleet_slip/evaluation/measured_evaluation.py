@@ -18,10 +18,10 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluator import (
-    MIN_SPEED_MPS,
     Estimator,
     MissingSignalError,
     evaluate,
+    on_common_rows,
     pooled_statistics,
     variation_between_drives,
 )
@@ -65,6 +65,7 @@ from fleet_slip.models.publish import recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import calibrated_cars, find_training_overlap
+from fleet_slip.models.summary import group_reasons
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
@@ -97,12 +98,13 @@ def evaluate_measured(
     fitted = {
         held_out: competition.fit(held_out) for held_out in dict.fromkeys([*folds, *kinds.values()])
     }
-    runs = evaluate(competition.drives, cross_fitted({fold: fitted[fold] for fold in folds}))
-    pooled = pooled_statistics(runs)
-    errors = {name: row for name, row in pooled.items() if row.rmse_deg is not None}
-    competition.warn_of_missing(pooled, errors)
+    all_rows = evaluate(competition.drives, cross_fitted({fold: fitted[fold] for fold in folds}))
+    runs, excluded = on_common_rows(all_rows)
+    coverage = {name: row.coverage for name, row in pooled_statistics(all_rows).items()}
+    errors = pooled_statistics(runs)
+    competition.warn_of_missing(excluded, errors)
     by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
-    of_kinds = pooled_statistics(evaluate(competition.drives, by_kind))
+    of_kinds = pooled_statistics(on_common_rows(evaluate(competition.drives, by_kind))[0])
     order = sorted(errors, key=lambda name: errors[name].rmse_deg or 0.0)
     whole_drives = len({quarter for _, quarter in folds[0]}) > 1
     units = runs
@@ -131,6 +133,7 @@ def evaluate_measured(
             name: {
                 "told": sources[name],
                 **asdict(errors[name]),
+                "coverage": coverage[name],
                 **variation_between_drives(units, name),
                 "kinds_left_out": asdict(of_kinds[name]) if name in of_kinds else None,
                 "found": [
@@ -295,13 +298,17 @@ class Competition:
                 fitted[name] = FittedEstimator(source, estimate, columns)
         return fitted
 
-    def warn_of_missing(self, estimators: Collection[str], evaluated: Collection[str]) -> None:
-        """Warn of models without a fit for some segments, and of estimators without an estimate."""
-        for name, reason in self._failures.items():
-            extent = "segments without a fit" if name in evaluated else "not evaluated"
-            LOGGER.warning("%s: %s: %s", name, extent, reason)
-        for name in set(estimators) - {*evaluated, *self._failures}:
-            LOGGER.warning("%s: not evaluated: no drive has the signals that it needs.", name)
+    def warn_of_missing(self, excluded: Mapping[str, str], evaluated: Collection[str]) -> None:
+        """Warn of models without a fit for some segments, and of estimators without figures.
+
+        Estimators with the same reason share a line.
+        """
+        reasons = {**excluded, **self._failures}
+        partial_fits = {name: reason for name, reason in reasons.items() if name in evaluated}
+        failed = {name: reason for name, reason in reasons.items() if name not in evaluated}
+        for extent, group in (("segments without a fit", partial_fits), ("not evaluated", failed)):
+            for names, reason in group_reasons(group):
+                LOGGER.warning("%s: %s: %s.", ", ".join(names), extent, reason.rstrip("."))
 
     def _prior(self, learner: Learner, identified: IdentifiedVehicle | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""
@@ -384,13 +391,12 @@ WHEELS_LAG = 0.1
 
 
 def prepare_drive(drive: HeldOutDrive, car: VehicleParameters) -> HeldOutDrive:
-    """Derive ax from wheel speeds where it is not logged, and drop labels of rows at rest."""
+    """Derive ax from wheel speeds where it is not logged."""
+    if np.isfinite(drive.signals.ax_mps2).any():
+        return drive
     try:
         speed_mps = measured_speed_mps(drive.signals, car)
     except MissingSignalError:
         return drive
-    if not np.isfinite(drive.signals.ax_mps2).any():
-        ax_mps2 = follow(np.diff(speed_mps, prepend=speed_mps[:1]) / STEP_S, WHEELS_LAG)
-        drive = replace(drive, signals=replace(drive.signals, ax_mps2=ax_mps2))
-    label = np.where(speed_mps > MIN_SPEED_MPS, drive.sideslip_rad, np.nan)
-    return replace(drive, sideslip_rad=label)
+    ax_mps2 = follow(np.diff(speed_mps, prepend=speed_mps[:1]) / STEP_S, WHEELS_LAG)
+    return replace(drive, signals=replace(drive.signals, ax_mps2=ax_mps2))

@@ -16,7 +16,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import QuestionError
-from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS, MissingSignalError
+from fleet_slip.evaluation.evaluator import MissingSignalError
+from fleet_slip.quality.drive_signals import SPEEDS, is_slow
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
 from fleet_slip.warehouse.database import reading_files
@@ -77,9 +78,14 @@ class LabelledDrive:
 def read_drive(
     signals: SignalCatalog, database: duckdb.DuckDBPyConnection, drive_id: str
 ) -> LabelledDrive:
-    """Read a drive from the view `log`. Raises `QuestionError` if there is no such drive."""
+    """Read a drive from the view `log`, without labels where the car `is_slow`.
+
+    Raises `QuestionError` if there is no such drive.
+    """
     label = signals[signals.label].column
-    columns = [*(field.name for field in fields(DriveSignals)), label]
+    speeds = {name: signals[name].column for name in SPEEDS if name in signals.signals}
+    read = [field.name for field in fields(DriveSignals)]
+    columns = list(dict.fromkeys([*read, label, *speeds.values()]))
     with reading_files(database, f"reading the drive {drive_id!r}"):
         rows = database.execute(
             f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
@@ -88,8 +94,11 @@ def read_drive(
     if not len(rows[label]):
         raise QuestionError(f"no drive is called {drive_id!r}. The view drives lists them.")
     arrays = {name: np.ma.filled(rows[name].astype(np.float64), np.nan) for name in columns}
-    sideslip_rad = arrays.pop(label)
-    return LabelledDrive(drive_id, DriveSignals(**arrays), sideslip_rad)
+    slow = is_slow({name: arrays[column] for name, column in speeds.items()})
+    sideslip_rad = np.where(slow, np.nan, arrays[label])
+    return LabelledDrive(
+        drive_id, DriveSignals(**{name: arrays[name] for name in read}), sideslip_rad
+    )
 
 
 def hold_last(values: FloatArray, name: str) -> FloatArray:
@@ -117,6 +126,11 @@ class AxleSpeeds:
     """Mean of tan δ times the axle's distance before the centre of gravity."""
 
     @property
+    def is_one_speed(self) -> bool:
+        """True if one speed of the car stands in for both wheels, which never differ."""
+        return np.array_equal(self.left_mps, self.right_mps, equal_nan=True)
+
+    @property
     def vx_mps(self) -> FloatArray:
         """Longitudinal velocity of the centre of gravity."""
         return (self.left_mps + self.right_mps) / 2 - self.turned_m * self.yaw_rate_rad_s
@@ -135,13 +149,19 @@ def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
         R ω / cos δ = vx ∓ t/2 r + tan δ (vy + a r).
 
     At the rear δ = 0. At the front the wheels travel with the yaw of the car, too: tan δ a r is
-    taken off their mean. tan δ vy, a thousandth of vx, is neglected.
+    taken off their mean. tan δ vy, a thousandth of vx, is neglected. A single speed of the car is
+    no speed of front wheels: the angle of the road wheels does not change it.
     """
     radius, front = car.tyre.rolling_radius_m, car.body.front_axle_m
     if car.drivetrain.front_drive_share >= 0.5:
         return AxleSpeeds(
             radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
         )
+    straight = AxleSpeeds(
+        radius * drive.wheel_fl_rad_s, radius * drive.wheel_fr_rad_s, car.body.track_front_m
+    )
+    if straight.is_one_speed:
+        return straight
     tan_left, tan_right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
     return AxleSpeeds(
         radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
@@ -172,15 +192,6 @@ SLOWEST_MPS = 5.0
 def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
     """Return the longitudinal velocity from wheel speeds. Raises `MissingSignalError`."""
     return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
-
-
-def without_rest(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
-    """Drop the labels of rows in which the car rests or creeps.
-
-    Raises `MissingSignalError` without wheel speeds.
-    """
-    moves = measured_speed_mps(drive.signals, car) > MIN_SPEED_MPS
-    return replace(drive, sideslip_rad=np.where(moves, drive.sideslip_rad, np.nan))
 
 
 def measured_steer_rad(drive: DriveSignals) -> FloatArray:

@@ -15,8 +15,8 @@ from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.signals import Identifier, SignalCatalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError
-from fleet_slip.evaluation.evaluator import MIN_SPEED_MPS
 from fleet_slip.grams.update import update_grams
+from fleet_slip.quality.drive_signals import MOVING_MPS
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.drive_plans import Drivers, FleetPlan, load_by_name
@@ -94,7 +94,7 @@ class TestDrive:
     @cached_property
     def evaluated(self) -> BoolArray:
         """Rows on which the car moves forward, so that it has a side-slip angle."""
-        return self.vx_mps > MIN_SPEED_MPS
+        return self.vx_mps > MOVING_MPS
 
     @cached_property
     def sections(self) -> "tuple[Section, ...]":

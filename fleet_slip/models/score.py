@@ -21,6 +21,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.summary import remark_skipped_rows
+from fleet_slip.quality.drive_signals import SPEEDS, is_slow
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.warehouse.database import sql_text
@@ -135,11 +136,15 @@ def cohort_of_rows(signals: SignalCatalog, predicate: str | Predicate) -> Predic
 def _estimate_rows(
     warehouse: Warehouse, manifest: Manifest, predicate: Predicate
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Return estimate and label in rad of the rows of a cohort that have both, and of how many."""
+    """Return estimate and label in rad of the rows of a cohort that have both, and of how many.
+
+    Rows in which the car `is_slow` do not count.
+    """
     signals = warehouse.catalog.signals
     predictor = Predictor.from_manifest(signals, manifest)
     label = manifest.label.signal
-    needed = [*predictor.plan.signals, label, *predictor.plan.facts, "vehicle_id"]
+    speeds = [name for name in SPEEDS if name in signals.signals]
+    needed = [*predictor.plan.signals, label, *speeds, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
     text = read_sql("jobs", "drives_in_time.sql").format(
@@ -158,8 +163,11 @@ def _estimate_rows(
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
             estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
-            truth = rows[label].to_numpy(zero_copy_only=False).astype(np.float64) * unit
+            truth = _physical(rows, label, unit)
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
+            chosen &= ~is_slow(
+                {name: _physical(rows, name, float(signals[name].scale)) for name in speeds}
+            )
             total += int(chosen.sum())
             complete = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[complete])
@@ -168,6 +176,12 @@ def _estimate_rows(
         np.concatenate([*parts, np.empty(0)]) for parts in (estimates, truths)
     )
     return estimate_rad, truth_rad, total
+
+
+def _physical(rows: pa.Table, name: str, scale: float) -> FloatArray:
+    """Return a column of counts in SI units, NaN where null."""
+    counts = rows[name].to_numpy(zero_copy_only=False)
+    return np.asarray(counts.astype(np.float64) * scale)
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:

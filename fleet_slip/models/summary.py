@@ -1,5 +1,6 @@
 """Text of a selection: the winner and the reason, the best models, the excluded drives."""
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -73,17 +74,42 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         )
     if isinstance(selection.distances, str):
         yield Remark(f"distances of the nested models unknown: {selection.distances}")
-    for name, reason in selection.skipped.items():
+    for names, reason in group_skipped(selection.skipped):
         first, *relations = reason.split("; ")
         more = pluralize(len(relations), "relation")
         more = f"; and {more} more, see --json." if relations else ""
-        noun = "" if name.endswith(")") else "model "
-        yield Remark(f"Skipped {noun}{name}: {first}{more}")
+        yield Remark(f"Skipped {names}: {first}{more}")
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
             "with the whole selection repeated inside every fold: correlation "
             f"{honest.correlation:.4f}, RMSE {honest.pooled.rmse_deg:.4f} deg."
         )
+
+
+_LACKING = re.compile(r"these drives lack \w+")
+
+
+def group_reasons(reasons: Mapping[str, str]) -> Iterator[tuple[list[str], str]]:
+    """Yield each reason once, after the names that it applies to.
+
+    Reasons with the same first missing signal are one.
+    """
+    groups: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        lacking = _LACKING.search(reason)
+        groups.setdefault(lacking[0] if lacking else reason, []).append(name)
+    for reason, names in groups.items():
+        yield names, reasons[names[0]] if len(names) == 1 else f"{reason.rstrip('.')}."
+
+
+def group_skipped(skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Yield each reason once, after the candidates and searches that it applies to."""
+    for names, reason in group_reasons(skipped):
+        searches = [name for name in names if name.endswith(")")]
+        models = ", ".join(name for name in names if name not in searches)
+        if models:
+            searches.insert(0, f"models {models}" if ", " in models else f"model {models}")
+        yield ", ".join(searches), reason
 
 
 def _shortened(predicate: str, everything: bool) -> str:

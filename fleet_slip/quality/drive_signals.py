@@ -31,7 +31,10 @@ RADIUS_M, TRACK_M = 0.31, 1.55
 WHEELS = ("wheel_fl", "wheel_fr", "wheel_rl", "wheel_rr")
 SIGNED = ("ay", "yaw_rate", "steering_wheel", "steer", "steer_fl", "steer_fr")
 """Positive in a left turn."""
-SPEEDS_OF_CAR = ("vx", "vehicle_speed", SATELLITE_SPEED)
+OWN_SPEEDS = ("vx", "vehicle_speed")
+SPEEDS_OF_CAR = (*OWN_SPEEDS, SATELLITE_SPEED)
+SPEEDS = (*OWN_SPEEDS, *WHEELS)
+"""Signals that `is_slow` reads."""
 
 
 def to_regular_grid(
@@ -70,6 +73,21 @@ def is_moving(signals: Signals) -> BoolArray:
     if not speeds:
         return np.ones(1, dtype=np.bool_)
     return np.asarray(np.any([np.nan_to_num(speed) > MOVING_MPS for speed in speeds], axis=0))
+
+
+def is_slow(signals: Signals) -> BoolArray:
+    """Return where the speed is known and below `MOVING_MPS`: the car's own, else its wheels'.
+
+    There a label is noise, and no estimate is compared with it. Of shape (1,) without a speed.
+    """
+    speed = np.full(1, np.nan)
+    wheels = [signals[name] for name in WHEELS if name in signals]
+    sources = [np.abs(signals[name]) for name in OWN_SPEEDS if name in signals]
+    if wheels:
+        sources.append(np.median(wheels, axis=0) * RADIUS_M)
+    for source in sources:
+        speed = np.where(np.isfinite(speed), speed, source)
+    return speed < MOVING_MPS
 
 
 def slope_of(values: FloatArray, expected: FloatArray, rows: BoolArray) -> tuple[float, float]:

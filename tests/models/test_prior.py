@@ -18,6 +18,7 @@ from fleet_slip.grams.drive_weights import age_weights
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import SelectionPlan, SelectionRequest, load_model_list
+from fleet_slip.models.select import keeps_prior
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -152,6 +153,12 @@ def test_a_wrong_prior_is_not_used(own: Path, few: str, monkeypatch: pytest.Monk
         found.winner.model.counts
         == fleet_slip.open(own).cohort().select(model=INPUTS).winner.model.counts
     )
+
+
+def test_a_prior_may_cost_a_tenth_on_held_out_drives_and_less_on_many() -> None:
+    assert keeps_prior(0.154, 0.147, drives=9), "a good prior on a real car"
+    assert not keeps_prior(2.16, 1.63, drives=3)
+    assert not keeps_prior(1.05, 1.0, drives=40)
 
 
 def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(

@@ -11,6 +11,7 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.evaluation.evaluator import (
     MissingSignalError,
     evaluate,
+    on_common_rows,
     pooled_statistics,
     variation_between_drives,
 )
@@ -58,6 +59,19 @@ def test_all_estimators_are_evaluated_on_the_rows_of_the_drive() -> None:
     pooled = pooled_statistics(runs)
     assert pooled["small"].rows == 100
     assert pooled["small"].rmse_deg == pytest.approx(0.1)
+
+
+def test_comparable_estimators_are_judged_on_the_rows_that_all_have() -> None:
+    def from_row(first: int) -> Callable[[Straight], FloatArray]:
+        return lambda drive: np.where(np.arange(ROWS) < first, np.nan, np.arange(ROWS) / 100)
+
+    estimators = {"whole": from_row(0), "late": from_row(4), "half": from_row(50)}
+    estimators["none"] = from_row(ROWS)
+    runs, excluded = on_common_rows(evaluate([straight("drive", ROWS)], estimators))
+    pooled = pooled_statistics(runs)
+    assert [*pooled] == ["whole", "late"]
+    assert pooled["whole"] == pooled["late"] and pooled["whole"].rows == 96
+    assert "50% of the rows" in excluded["half"] and "no drive has the signals" in excluded["none"]
 
 
 def test_a_part_of_a_drive_has_statistics_of_its_own() -> None:

@@ -24,11 +24,16 @@ from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.evaluation.single_track import DriveSignals
 from fleet_slip.evaluation.tuning import TuningResult
 from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import SelectionRequest
+from fleet_slip.quality.drive_signals import WHEELS
 from fleet_slip.resources import SHIPPED_CONFIGS
+from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
+from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import done_on, run_on
 from tests.support.drives import rolling_drive
+from tests.support.logs import land, log_rows
 from tests.support.measured import OWN_MAPPING, csv_text, ingest_own
 
 ROWS = 400
@@ -106,6 +111,7 @@ def test_without_a_vehicle_only_models_are_evaluated(own: Path) -> None:
     assert found["estimators"]["own@1"]["rmse_deg"] < 0.05
     assert {name for name in found["estimators"] if "/" not in name} == {"own@1"}
     assert (len(found["drives"]), found["parts"], found["parts_of"]) == (4, 4, "drives")
+    assert "±: standard error over drives; worst: RMSE of the worst drive" in str(told)
     assert 0 < found["estimators"]["own@1"]["rmse_standard_error_deg"] < 0.01
     assert found["estimators"]["own@1"]["worst_drive"] in [one["name"] for one in found["drives"]]
 
@@ -113,6 +119,14 @@ def test_without_a_vehicle_only_models_are_evaluated(own: Path) -> None:
 def test_a_model_of_other_drives_is_evaluated_as_published(own: Path) -> None:
     done = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'", "--json")
     assert done.json["estimators"]["own@1"]["told"] == "as published"
+    (lines,) = [line for line in done.stderr.splitlines() if "table1/2" in line]
+    assert lines == (
+        "table1/2, table1/3, table1/4: not evaluated: these drives lack steering_wheel."
+    )
+    two = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
+    assert "±: standard error over quarters" in two.stdout + two.stderr
+    refused = run_on(own, "select", "--model", "ax,steering_wheel")
+    assert "no candidate model can be fitted: these drives lack steering_wheel." in refused.stderr
 
 
 def test_an_error_of_a_published_model_stops_the_evaluation(
@@ -195,6 +209,62 @@ def test_gram_rows_of_quarters_add_up_to_those_of_drives(own: Path) -> None:
     assert quarters.total() == whole.total()
     of_quarters = learner.choose(frozenset((drive.name, 3) for drive in drives))
     assert of_quarters.winner.model.pooled.rows == 6 * 375
+
+
+SEARCHES = """
+description = "A search among few columns, and one that needs four drives"
+[[search]]
+name = "few"
+max_features = 3
+max_features_per_drive = 1
+inputs = ["ax", "ay", "yaw_rate"]
+[[search]]
+name = "many"
+min_drives = 4
+"""
+
+
+def test_quarters_of_drives_do_not_count_as_drives(own: Path, tmp_path: Path) -> None:
+    """An evaluation of two drives must choose by the recipe that publish has for two drives."""
+    fleet, predicate = fleet_slip.open(own), "vehicle_id < 'car-2'"
+    (tmp_path / "searches.toml").write_text(SEARCHES)
+    request = SelectionRequest(models=str(tmp_path / "searches.toml"))
+    drives = read_measured_drives(fleet.warehouse, load_cohort(fleet.warehouse, predicate))
+    learner = Learner.prepare(fleet.warehouse, request, predicate, drives)
+    published = fleet.cohort(predicate).run_request(request)
+    chosen = learner.choose(folds_of(drives)[3])
+    assert (
+        chosen.skipped
+        == published.skipped
+        == {"many (search)": "it needs 4 drives, and there are 2"}
+    )
+    assert len(chosen.models) == len(published.models) == 2, "a column for each drive"
+    assert chosen.winner.model.fold_names == published.winner.model.fold_names
+    alone = learner.choose(folds_of(drives)[3] | {(drives[0].name, n) for n in range(4)})
+    assert (alone.cohort.drive_count, len(alone.winner.model.folds)) == (1, 3)
+
+
+def test_rows_at_standstill_are_judged_nowhere(tmp_path: Path) -> None:
+    """Logs of earlier releases have labels there, such as 180 degrees of a navigation system."""
+    random, stood = np.random.default_rng(1), np.arange(400) < 100
+    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
+    drives = []
+    for number in range(3):
+        ay = random.integers(-3000, 3000, 400)
+        wheels = {name: np.where(stood, 0, 2000).astype(np.int16) for name in WHEELS}
+        label = np.where(stood, 20_000, np.rint(0.05 * ay))
+        counts = {"ay": ay.astype(np.int16), "sideslip": label.astype(np.int16), **wheels}
+        drives.append(log_rows(f"d{number}", counts))
+    land(warehouse, "all", *drives)
+    update_grams(warehouse)
+    fleet = fleet_slip.open(tmp_path / "data")
+    fleet.models.publish("own", fleet.cohort().select(model="ay"), force=True)
+    score = fleet.evaluation.score("own", "true")
+    assert score.rows == 900 and score.rows_without == 0
+    measured = read_measured_drives(warehouse, load_cohort(warehouse, "true"))
+    assert [int(drive.evaluated.sum()) for drive in measured] == [300] * 3
+    content = fleet.evaluation.evaluate_measured("own", "true").content
+    assert content["estimators"]["own@1"]["rows"] == 900
 
 
 @pytest.mark.parametrize(

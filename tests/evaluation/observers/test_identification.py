@@ -155,20 +155,6 @@ def test_drives_without_a_label_are_refused(drive: LabelledDrive, executor: Exec
         identify(MEASURED, [unknown], executor)
 
 
-def test_labels_at_rest_are_ignored(executor: Executor) -> None:
-    """Of a car that stood at first, with ±180 deg as a navigation system has it."""
-    drive = simulated_drive().beginning(1500)
-    stood, wheels = np.arange(1500) < 300, {}
-    for name in ("wheel_fl_rad_s", "wheel_fr_rad_s", "wheel_rl_rad_s", "wheel_rr_rad_s"):
-        wheels[name] = np.where(stood, 0.0, getattr(drive.signals, name))
-    signals = replace(drive.signals, **wheels)
-    found = [
-        identify(MEASURED, [replace(drive, signals=signals, sideslip_rad=label)], executor)
-        for label in (np.where(stood, said, drive.sideslip_rad) for said in (np.pi, np.nan))
-    ]
-    assert found[0] == found[1]
-
-
 class Inner(Config):
     b: float = Field(default=1.0, gt=0)
 

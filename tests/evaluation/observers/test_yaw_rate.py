@@ -8,7 +8,12 @@ import pytest
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import kalman
 from fleet_slip.evaluation.kalman import YawRateNoise
-from fleet_slip.evaluation.single_track import STEP_S, DriveSignals, undriven_axle
+from fleet_slip.evaluation.single_track import (
+    STEP_S,
+    DriveSignals,
+    measured_speed_mps,
+    undriven_axle,
+)
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, slalom
@@ -81,3 +86,12 @@ def test_undriven_axle_gives_speed_and_yaw_rate_of_a_rolling_car(name: str) -> N
     assert axle.yaw_rate_rad_s[0] == pytest.approx(rate, rel=1e-12)
     front = car.drivetrain.front_drive_share < 0.5
     assert axle.vx_mps[0] == pytest.approx(vx + front * np.tan(steer) * vy, rel=1e-12)
+
+
+def test_a_single_speed_of_the_car_is_not_the_speed_of_steered_wheels() -> None:
+    car = load_vehicle("rear_drive_sedan", SHIPPED_CONFIGS)
+    motion = np.full(3, 12.0), np.zeros(3), np.full(3, 0.35), np.full(3, 0.2)
+    drive = rolling_drive(car, *motion)
+    wheel = np.full(3, 12.0 / car.tyre.rolling_radius_m)
+    single = replace(drive, wheel_fl_rad_s=wheel, wheel_fr_rad_s=wheel)
+    assert measured_speed_mps(single, car) == pytest.approx(12.0, rel=1e-12)
