@@ -135,8 +135,13 @@ def require_extra(extra: str, purpose: str) -> Iterator[None]:
             raise
         raise ExtraError(
             f"{purpose} needs the package {package}, which is not installed. "
-            f"Run: pip install 'fleet-slip[{extra}]'"
+            f"{install_command(extra)}"
         ) from None
+
+
+def install_command(extra: str) -> str:
+    """Return the sentence that says how to install an extra."""
+    return f'Run: pip install "fleet-slip[{extra}]", or start by: uvx "fleet-slip[{extra}]" …'
 
 
 # Progress of long work.

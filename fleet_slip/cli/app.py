@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 GROUPS = {
     "Start here": {
+        "demo": "pipeline_commands",
         "run": "pipeline_commands",
         "mapping": "data_commands",
         "ingest": "data_commands",
@@ -258,7 +259,7 @@ def options(
     Logs of many cars become exact Gram matrices; from these every model, cohort and fold follows
     without reading a row again; the winner becomes a numbered model version.
 
-    Without logs: fleet-slip run --campaign smoke
+    Without logs: fleet-slip demo
 
     With logs of your own: fleet-slip mapping suggest LOG, then fleet-slip learn
     """

@@ -1,9 +1,10 @@
-"""Commands that run several steps: run, learn, nightly."""
+"""Commands that run several steps: demo, run, learn, nightly."""
 
 import os
 import shlex
 import shutil
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,11 +15,62 @@ from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
-from fleet_slip.errors import FleetSlipError
+from fleet_slip.errors import FleetSlipError, UsageError
 from fleet_slip.storage.data_root import data_root
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
+
+
+def demo(
+    context: typer.Context,
+    output: Annotated[
+        Path, typer.Option(help="Folder to write into: data, c and report.html.")
+    ] = Path("fleet-slip-demo"),
+    open_page: Annotated[
+        bool, typer.Option("--open", help="Open the report in the browser.")
+    ] = False,
+) -> None:
+    """Simulate 12 drives, train a model, export it as C, and show it on another drive.
+
+    It takes half a minute, and less when it is repeated. The data root is the folder data of
+    --output.
+
+    Example: fleet-slip demo --output /tmp/demo
+    """
+    import fleet_slip
+
+    if context.parent and context.parent.params["root"]:
+        raise UsageError("demo has a data root of its own: leave out --root, and give --output.")
+    start = time.monotonic()
+    with fleet_slip.open(output / "data") as fleet:
+        with progress_of_steps() as show:
+            report = fleet.run("demo", progress=show)
+            show("export and report", 0, None)
+            model = fleet.models.get("demo")
+            sources = fleet.models.export(model, "c", output / "c")
+            page = fleet.evaluation.watch("nominal", model, output / "report.html", until_s=60.0)
+        drives, rows = fleet.sql("SELECT count(*), sum(rows) FROM drives").fetchall()[0]
+        validation = model.manifest.cross_validation
+    c_file = next(file for file in sources if file.suffix == ".c")
+    begin = f"{program()} --root {shlex.quote(str(output / 'data'))}"
+    print_parts(
+        [
+            f"logs    {drives} simulated drives, {rows:,} rows at 100 Hz",
+            f"model   {model.reference}: {len(model.manifest.terms)} inputs, held-out RMSE "
+            f"{validation.rmse_deg:.3f} deg",
+            f"in C    {c_file}, integer arithmetic, {c_file.stat().st_size:,} bytes",
+            f"report  {page}: a drive the model has not seen, with its true and estimated angle",
+        ]
+    )
+    if not report.changed:
+        say("nothing was new: the demo was run before.")
+    say(f"done in {time.monotonic() - start:.0f} s; next:")
+    say(f"  {begin} show demo")
+    say(f'  {begin} sql "SELECT drive_id, rows, speed_factor FROM drives"')
+    say(f"  {begin} evaluate demo && {begin} report demo")
+    if open_page:
+        typer.launch(str(page))
 
 
 @recorded

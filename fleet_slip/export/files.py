@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
-from fleet_slip.base import canonical_json, sha256_of
+from fleet_slip.base import canonical_json, install_command, sha256_of
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S
 from fleet_slip.columns.column_sql import PLAIN_SQL, SqlLayers, attribute_sql
@@ -326,7 +326,7 @@ def _onnx(subject: Subject) -> dict[str, str | bytes]:
         from fleet_slip.export.onnx import onnx_model  # noqa: PLC0415 - optional package
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"the format ONNX needs the package {error.name}. Run: pip install 'fleet-slip[onnx]'"
+            f"the format ONNX needs the package {error.name}. {install_command('onnx')}"
         ) from None
     version, program = subject.version, subject.program
     prefix = file_prefix(version)

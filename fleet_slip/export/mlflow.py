@@ -17,7 +17,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
-from fleet_slip.base import pluralize
+from fleet_slip.base import install_command, pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.errors import ConfigError, StorageError, UsageError
@@ -101,7 +101,7 @@ def _library() -> Any:
         import pandas as pd  # noqa: F401, PLC0415
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"MLflow needs the package {error.name}. Run: pip install 'fleet-slip[mlflow]'"
+            f"MLflow needs the package {error.name}. {install_command('mlflow')}"
         ) from None
     return mlflow
 

@@ -221,14 +221,14 @@ def test_the_help_of_a_command_has_an_example_that_can_be_typed(name: str) -> No
         command.make_context(name, given).close()  # raises for what it does not know
 
 
-def test_help_groups_the_commands_and_begins_with_eight() -> None:
+def test_help_groups_the_commands_and_begins_with_nine() -> None:
     text = run([COMMAND, "--help"], env={**os.environ, "COLUMNS": "80"}).stdout
     places = [text.index(f"\n{group}:\n") for group in GROUPS]
     assert places == sorted(places)
-    assert len(GROUPS["Start here"]) == 8
-    assert len(COMMANDS) <= 34
+    assert len(GROUPS["Start here"]) == 9
+    assert len(COMMANDS) <= 36
     assert "\n  diagnose   Fit a model's signals" in text
-    assert "Without logs: fleet-slip run --campaign smoke\n" in text
+    assert "Without logs: fleet-slip demo\n" in text
     assert max(map(len, text.splitlines())) <= 80
 
 

@@ -178,7 +178,7 @@ def test_without_dask_the_option_says_what_to_install(tmp_path: Path) -> None:
     command = [sys.executable, "-c", program, *options]
     done = run(command)
     assert done.exit_code == 13
-    assert "pip install 'fleet-slip[cluster]'" in done.stderr
+    assert 'pip install "fleet-slip[cluster]"' in done.stderr
 
 
 def test_a_bounded_number_of_tasks_is_under_way() -> None:

@@ -90,7 +90,9 @@ def test_querying_and_selecting_need_the_core_alone(root: Path, tmp_path: Path) 
 def test_what_needs_more_says_which_extra() -> None:
     codes, said = given(of_extras("objects"), ["--root", "s3://bucket/data", "status"])
     assert codes == [13], said
-    assert "which is not installed. Run: pip install 'fleet-slip[objects]'" in said
+    assert (
+        'which is not installed. Run: pip install "fleet-slip[objects]", or start by: uvx' in said
+    )
 
 
 def test_every_extra_that_is_named_is_one() -> None:

@@ -169,7 +169,7 @@ def test_without_the_library_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "mlflow", None)
     fleet = fleet_slip.open(smoke_root)
-    with pytest.raises(ConfigError, match=r"mlflow. Run: pip install 'fleet-slip\[mlflow\]'"):
+    with pytest.raises(ConfigError, match=r'mlflow. Run: pip install "fleet-slip\[mlflow\]"'):
         fleet.models.log_to_mlflow("smoke", "http://127.0.0.1:9")
 
 

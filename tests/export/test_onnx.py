@@ -89,5 +89,5 @@ def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx")
     version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
-    with pytest.raises(ConfigError, match=r"onnx. Run: pip install 'fleet-slip\[onnx\]'"):
+    with pytest.raises(ConfigError, match=r'onnx. Run: pip install "fleet-slip\[onnx\]"'):
         export_files(version, None, "onnx")

@@ -1,7 +1,7 @@
 """The wheel works without the checkout: its SQL and configs are inside."""
 
+import shutil
 import sys
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -19,8 +19,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     built = run([*build, "--wheel-dir", str(folder), str(CHECKOUT)])
     assert built.exit_code == 0, built.stderr
     (wheel,) = folder.glob("*.whl")
-    with zipfile.ZipFile(wheel) as archive:
-        archive.extractall(folder / "site")
+    shutil.unpack_archive(wheel, folder / "site", format="zip")
     return folder / "site"
 
 
@@ -55,3 +54,42 @@ def files_in(folder: Path) -> dict[Path, bytes]:
 def test_the_wheel_runs_the_job_away_from_the_checkout(site: Path, tmp_path: Path) -> None:
     """All that is compiled is compiled anew."""
     assert "published smoke@1" in run_wheel(site, tmp_path, "run", "--campaign", "smoke").stderr
+
+
+@pytest.mark.long
+@pytest.mark.tools("twine", "check-wheel-contents")
+def test_a_published_wheel_installs_in_an_empty_environment_and_runs_the_demo(
+    tmp_path: Path,
+) -> None:
+    """The wheel is built from the source distribution, as installers and `uvx` build it."""
+    build = [sys.executable, "-m", "hatchling", "build", "--directory", str(tmp_path)]
+    assert run([*build, "--target", "sdist"], cwd=CHECKOUT).exit_code == 0
+    (sdist,) = tmp_path.glob("*.tar.gz")
+    shutil.unpack_archive(sdist, tmp_path / "source", filter="data")
+    (source,) = (tmp_path / "source").iterdir()
+    built = run([*build, "--target", "wheel"], cwd=source)
+    assert built.exit_code == 0, built.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    for check in (["twine", "check", "--strict", str(sdist)], ["check-wheel-contents"]):
+        checked = run([*check, str(wheel)])
+        assert checked.exit_code == 0, checked.stdout + checked.stderr
+
+    environment = tmp_path / "environment"
+    assert run([sys.executable, "-m", "venv", str(environment)]).exit_code == 0
+    program = environment / "bin/fleet-slip"
+    pip = [str(environment / "bin/python"), "-m", "pip", "--disable-pip-version-check", "install"]
+    constraints = ["--quiet", "--constraint", str(CHECKOUT / "constraints.txt")]
+    installed = run([*pip, *constraints, str(wheel)])
+    assert installed.exit_code == 0, installed.stderr
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    isolated = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
+    demo = run([str(program), "demo"], cwd=folder, env=isolated)
+    assert demo.exit_code == 0, demo.stderr
+    assert "12 simulated drives" in demo.stdout
+    for file in ("report.html", "c/sideslip_demo.c"):
+        assert (folder / "fleet-slip-demo" / file).stat().st_size > 10_000
+    (folder / "log.mf4").write_bytes(b"MDF     4.10    " + bytes(1000))
+    missing = run([str(program), "mapping", "suggest", "log.mf4"], cwd=folder, env=isolated)
+    assert missing.exit_code == 13
+    assert 'pip install "fleet-slip[logs]", or start by: uvx "fleet-slip[logs]"' in missing.stderr
