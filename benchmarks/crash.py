@@ -36,7 +36,7 @@ from fleet_slip.operations.verify import verify
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.gram_rows import BEING_WRITTEN_HOURS
+from fleet_slip.warehouse.gram_reader import BEING_WRITTEN_HOURS
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
 

@@ -55,8 +55,13 @@ from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.warehouse.gram_reader import GramReader, OpenedGrams, open_grams
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table
+from fleet_slip.warehouse.gram_reader import (
+    GramReader,
+    OpenedGrams,
+    by_signals,
+    gram_table,
+    open_grams,
+)
 from fleet_slip.warehouse.predicate import Predicate, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 

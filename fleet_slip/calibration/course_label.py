@@ -14,8 +14,7 @@ from fleet_slip.catalog.course import STRAIGHT, STRAIGHT_COURSE, TURNED, turned_
 from fleet_slip.errors import DataError
 from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.gram import GramTable, packed_position
-from fleet_slip.warehouse.gram_reader import GramReader, open_grams
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table
+from fleet_slip.warehouse.gram_reader import GramReader, by_signals, gram_table, open_grams
 from fleet_slip.warehouse.predicate import Predicate
 from fleet_slip.warehouse.warehouse import Warehouse
 

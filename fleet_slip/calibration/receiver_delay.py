@@ -27,7 +27,7 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.erasure_log import find_erased
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table, is_onboard, rows_of_set
+from fleet_slip.warehouse.gram_reader import by_signals, gram_table, is_onboard, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SPAN, STEP, STEPS = 40, 5, 12

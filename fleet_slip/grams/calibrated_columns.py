@@ -19,8 +19,7 @@ from fleet_slip.catalog.course import BESIDE, TURNED
 from fleet_slip.catalog.definitions import ParameterFactor
 from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
-from fleet_slip.warehouse.gram_reader import OpenedGrams
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table
+from fleet_slip.warehouse.gram_reader import OpenedGrams, by_signals, gram_table
 from fleet_slip.warehouse.predicate import parse_predicate
 
 # Bias and scale error of the gyroscope are removed from Gram rows of changes, drive by drive.

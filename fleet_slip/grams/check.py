@@ -16,7 +16,7 @@ from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
 from fleet_slip.storage.table import TableFile, retry_if_stale
-from fleet_slip.warehouse.gram_rows import find_backlog, is_onboard, is_onboard_file
+from fleet_slip.warehouse.gram_reader import find_backlog, is_onboard, is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4

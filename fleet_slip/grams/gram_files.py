@@ -21,7 +21,7 @@ from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, Table, TableFile
 from fleet_slip.warehouse.database import open_database, reading_files
-from fleet_slip.warehouse.gram_rows import (
+from fleet_slip.warehouse.gram_reader import (
     ONBOARD_PREFIX,
     by_signals,
     gram_table,

@@ -67,8 +67,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts
 from fleet_slip.warehouse.database import database_errors, open_database, reading_files
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.gram_reader import BATCH_ROWS
-from fleet_slip.warehouse.gram_rows import by_signals, gram_table
+from fleet_slip.warehouse.gram_reader import BATCH_ROWS, by_signals, gram_table
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Feature sets that cars can compute, with the ranges of their columns and their definition.

@@ -32,8 +32,8 @@ from fleet_slip.grams.gram_files import (
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import LOGGER, recorded_step
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, TableFile, retrying
-from fleet_slip.warehouse.gram_reader import cohort_files
-from fleet_slip.warehouse.gram_rows import (
+from fleet_slip.warehouse.gram_reader import (
+    cohort_files,
     find_backlog,
     is_onboard,
     is_onboard_file,

@@ -20,7 +20,7 @@ from fleet_slip.rendering import Remark
 from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
 from fleet_slip.storage.table import Snapshot, Table
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.gram_rows import BEING_WRITTEN_HOURS
+from fleet_slip.warehouse.gram_reader import BEING_WRITTEN_HOURS
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.

@@ -60,7 +60,7 @@ from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
 from fleet_slip.storage.table import Change, retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
-from fleet_slip.warehouse.gram_rows import is_onboard_file
+from fleet_slip.warehouse.gram_reader import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
 
 PENDING_SHOWN = 5

@@ -41,7 +41,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.gram_rows import is_onboard, rows_of_set
+from fleet_slip.warehouse.gram_reader import is_onboard, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -27,8 +27,7 @@ from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import Snapshot
-from fleet_slip.warehouse.gram_reader import GramReader
-from fleet_slip.warehouse.gram_rows import find_backlog
+from fleet_slip.warehouse.gram_reader import GramReader, find_backlog
 from fleet_slip.warehouse.predicate import (
     Predicate,
     drive_columns,

@@ -33,7 +33,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import find_erased
-from fleet_slip.warehouse.gram_rows import find_backlog
+from fleet_slip.warehouse.gram_reader import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600

@@ -53,7 +53,7 @@ from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, retry_if_stale, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.gram_rows import is_onboard, is_onboard_file, named_files
+from fleet_slip.warehouse.gram_reader import is_onboard, is_onboard_file, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[

@@ -15,6 +15,7 @@ from concurrent.futures import Future, wait
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from fleet_slip.config import load_toml
 from fleet_slip.errors import (
     FleetSlipError,
     QueryGoesOnError,
@@ -23,9 +24,9 @@ from fleet_slip.errors import (
     printable,
 )
 from fleet_slip.limits import data_needed, memory_bytes
+from fleet_slip.resources import folder
 from fleet_slip.storage.checksums import check_local_files, missing_file_error
 from fleet_slip.storage.folder import SPILL_PREFIX, Folder
-from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS, words
 
 if TYPE_CHECKING:  # functions import it: it takes as long to start as all else of most commands
     import duckdb
@@ -264,9 +265,6 @@ LONGEST_QUERY = 100_000
 QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
 """Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
 
-_SYMBOLS = frozenset({"+", "-", "*", "/", "//", "%", "||", "~~", "!~~", "~~*", "!~~*", "~~~"})
-"""Operators that are functions to DuckDB; the last ones are LIKE, ILIKE and GLOB."""
-
 
 def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
     """Return the statements of a text; the text itself if it has none or is not valid SQL."""
@@ -331,7 +329,7 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
             "with IN)."
         )
     after_from: set[int] = set()
-    for node in _nodes(tree):
+    for node in nodes_of(tree):
         kind = node.get("type")
         if not isinstance(kind, str):
             continue
@@ -346,70 +344,34 @@ def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:
 
 
 def _require_function(name: str, after_from: bool) -> None:
-    if after_from and name not in TABLE_FUNCTIONS:
+    allowed = allowed_words()
+    if after_from and name not in allowed["table"]["functions"]:
         raise QuestionError(
             f"the function {printable(name)!r} cannot be called after FROM here. Functions: "
-            f"{', '.join(sorted(TABLE_FUNCTIONS))}."
+            f"{', '.join(sorted(allowed['table']['functions']))}."
         )
-    if not after_from and name not in QUERY_FUNCTIONS:
+    if not after_from and not any(name in functions for functions in allowed["query"].values()):
         raise QuestionError(
             f"the function {printable(name)!r} cannot be called here: only functions that compute "
             "a value of their arguments can."
         )
 
 
+@functools.cache
+def allowed_words() -> Mapping[str, Mapping[str, frozenset[str]]]:
+    """Return what SQL of users may contain, by section and key of `warehouse/functions.toml`."""
+    sections = load_toml(folder("warehouse") / "functions.toml")
+    return {
+        section: {key: frozenset(text.split()) for key, text in lists.items()}
+        for section, lists in sections.items()
+    }
+
+
 Tree = Mapping[str, Any]
 """An expression as DuckDB's parser serialises it."""
 
-_EXPRESSIONS = words(
-    "BETWEEN CASE CAST COLUMN_REF COMPARISON CONJUNCTION CONSTANT FUNCTION OPERATOR TYPE"
-)
-"""Kinds of expressions, as DuckDB calls them; others are subqueries, windows, lambdas, stars …"""
 
-_OPERATORS = words(
-    "COMPARE_IN COMPARE_NOT_IN OPERATOR_COALESCE OPERATOR_IS_NOT_NULL OPERATOR_IS_NULL OPERATOR_NOT"
-)
-
-
-FUNCTIONS = words(
-    """
-        abs ceil ceiling floor greatest least mod nullif round sign sqrt trunc
-        contains ends_with left length lower ltrim prefix right rtrim split_part starts_with strpos
-        substr substring suffix trim upper
-        regexp_full_match regexp_matches like_escape not_like_escape ilike_escape not_ilike_escape
-        list_value md5 sha256
-        date_diff date_part date_trunc datediff datepart datetrunc day dayofmonth dayofweek
-        dayofyear isodow isoyear make_date month quarter week weekday weekofyear year yearweek
-        to_days to_months to_weeks to_years
-        """,
-)
-"""Functions of their arguments alone, the same on every machine and in every version of DuckDB.
-
-None makes a text longer than its arguments together, so that the cost of a predicate is bounded by
-its length. `to_days` and its like are what INTERVAL becomes, `list_value` is a list in brackets."""
-
-TYPES = words("BOOLEAN TINYINT SMALLINT INTEGER BIGINT HUGEINT FLOAT DOUBLE DECIMAL VARCHAR DATE")
-"""What may be cast to. Not a time with a zone: the zone is the machine's."""
-
-
-def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
-    """Yield what is not allowed in an expression on some columns, as what a predicate does."""
-    for node in _nodes(tree):
-        if problem := _problem(node, columns):
-            yield problem
-
-
-def columns_of(tree: Tree) -> frozenset[str]:
-    """Return the columns that an expression without problems asks for."""
-    return frozenset(
-        name.lower()
-        for node in _nodes(tree)
-        if node.get("class") == "COLUMN_REF"
-        for name in node["column_names"]
-    )
-
-
-def _nodes(tree: Any) -> Iterator[Tree]:
+def nodes_of(tree: Any) -> Iterator[Tree]:
     """Yield the objects of a parsed text, each before those in it."""
     waiting = [tree]
     while waiting:
@@ -419,39 +381,3 @@ def _nodes(tree: Any) -> Iterator[Tree]:
             waiting.extend(reversed(value.values()))
         elif isinstance(value, list):
             waiting.extend(reversed(value))
-
-
-def _problem(node: Tree, columns: frozenset[str]) -> str | None:
-    kind = node.get("class")
-    if kind is None:
-        return None
-    if kind not in _EXPRESSIONS or (kind == "OPERATOR" and node["type"] not in _OPERATORS):
-        construct = str(node["type"]).replace("_", " ").lower()
-        return f"may not contain {construct}. Columns, constants, operators and functions may."
-    if kind == "COLUMN_REF":
-        return _column_problem(node, columns)
-    if kind == "FUNCTION":
-        return _function_problem(node)
-    if kind == "TYPE" and (node["type_name"].upper() not in TYPES or node["schema"]):
-        named = printable(node["type_name"])
-        return f"casts to {named!r}. It may cast to: {', '.join(sorted(TYPES))}."
-    return None
-
-
-def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
-    names = node["column_names"]
-    if len(names) == 1 and names[0].lower() in columns:
-        return None
-    named = printable(".".join(map(str, names)))
-    return f"has an unknown column {named!r}. Columns: {', '.join(sorted(columns))}."
-
-
-def _function_problem(node: Tree) -> str | None:
-    name = str(node["function_name"]).lower()
-    plain = not (node["schema"] or node["catalog"] or node["filter"] or node["distinct"])
-    if name in FUNCTIONS | _SYMBOLS and plain and not node["order_bys"]["orders"]:
-        return None
-    return (
-        f"calls {printable(name)!r}. A predicate must always mean the same, so it may call only: "
-        f"{', '.join(sorted(FUNCTIONS))}."
-    )

@@ -23,15 +23,16 @@ from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,
     Tree,
-    columns_of,
+    allowed_words,
     duckdb_message,
+    nodes_of,
     open_scratch,
-    problems,
     reading_files,
 )
 
 if TYPE_CHECKING:
     import duckdb
+
 
 MAX_QUERY_S = 3600.0
 """Longest query with a predicate, in s: unattended jobs must end."""
@@ -274,3 +275,66 @@ def _split_excluded(cohort: str) -> tuple[str, str]:
     while match := _EXCLUDED.fullmatch(cohort):
         cohort, number = match[1], number + 1 + match[2].count(",")
     return cohort, f", without {pluralize(number, 'faulty drive')}" if number else ""
+
+
+# What a predicate may contain: `warehouse/functions.toml` lists its functions, operators and types.
+
+
+def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
+    """Yield what is not allowed in an expression on some columns, as what a predicate does."""
+    for node in nodes_of(tree):
+        if problem := _problem(node, columns):
+            yield problem
+
+
+def columns_of(tree: Tree) -> frozenset[str]:
+    """Return the columns that an expression without problems asks for."""
+    return frozenset(
+        name.lower()
+        for node in nodes_of(tree)
+        if node.get("class") == "COLUMN_REF"
+        for name in node["column_names"]
+    )
+
+
+def _problem(node: Tree, columns: frozenset[str]) -> str | None:
+    kind, allowed = node.get("class"), allowed_words()["predicate"]
+    if kind is None:
+        return None
+    if kind not in allowed["expressions"] or (
+        kind == "OPERATOR" and node["type"] not in allowed["conditions"]
+    ):
+        construct = str(node["type"]).replace("_", " ").lower()
+        return f"may not contain {construct}. Columns, constants, operators and functions may."
+    if kind == "COLUMN_REF":
+        return _column_problem(node, columns)
+    if kind == "FUNCTION":
+        return _function_problem(node)
+    if kind == "TYPE" and (node["type_name"].upper() not in allowed["types"] or node["schema"]):
+        named = printable(node["type_name"])
+        return f"casts to {named!r}. It may cast to: {', '.join(sorted(allowed['types']))}."
+    return None
+
+
+def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
+    names = node["column_names"]
+    if len(names) == 1 and names[0].lower() in columns:
+        return None
+    named = printable(".".join(map(str, names)))
+    return f"has an unknown column {named!r}. Columns: {', '.join(sorted(columns))}."
+
+
+def _function_problem(node: Tree) -> str | None:
+    name = str(node["function_name"]).lower()
+    allowed = allowed_words()["predicate"]
+    plain = not (node["schema"] or node["catalog"] or node["filter"] or node["distinct"])
+    if (
+        name in allowed["functions"] | allowed["operators"]
+        and plain
+        and not node["order_bys"]["orders"]
+    ):
+        return None
+    return (
+        f"calls {printable(name)!r}. A predicate must always mean the same, so it may call only: "
+        f"{', '.join(sorted(allowed['functions']))}."
+    )

@@ -23,8 +23,8 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.storage.checksums import check_local_files
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
-from fleet_slip.warehouse.allowed_functions import QUERY_FUNCTIONS, TABLE_FUNCTIONS
 from fleet_slip.warehouse.database import (
+    allowed_words,
     check_opened_files,
     database_errors,
     interruptible,
@@ -144,10 +144,12 @@ def test_listed_functions_are_those_of_duckdb_that_only_compute() -> None:
         query = "SELECT function_name, stability FROM duckdb_functions()"
         functions = database.execute(query).fetchall()
     names = {name.lower() for name, _ in functions}
-    assert names >= TABLE_FUNCTIONS
-    assert QUERY_FUNCTIONS - names == {"ifnull", "nvl"}  # which its parser replaces
+    allowed = allowed_words()
+    assert names >= allowed["table"]["functions"]
+    callable_in_queries = frozenset().union(*allowed["query"].values())
+    assert callable_in_queries - names == {"ifnull", "nvl"}  # which its parser replaces
     acting = {name for name, stability in functions if stability == "VOLATILE"}
-    assert acting & QUERY_FUNCTIONS == {"error", "random"}
+    assert acting & callable_in_queries == {"error", "random"}
 
 
 def test_a_forged_log_of_opened_files_opens_no_pipe(root: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.gram_rows import find_backlog, gram_table, is_onboard_file, named_files
+from fleet_slip.warehouse.gram_reader import find_backlog, gram_table, is_onboard_file, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
