@@ -267,7 +267,7 @@ def list_mappings(context: typer.Context, json: opt.Json = False) -> None:
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return the draft of a mapping for a log, and its text."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft
-    from fleet_slip.ingest.formats.can import CanBus, read_can_database
+    from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
     from fleet_slip.ingest.log_files import find_logs
     from fleet_slip.ingest.profile import profile_file
 

@@ -250,7 +250,7 @@ class TimeBase(Config):
     epoch: bool = added(False)
     """Numbers are counted from 1970, in UTC, so that they have the date."""
     zone: str | None = added(None)
-    """Time zone of timestamps without one, such as `Europe/Berlin`."""
+    """Time zone of timestamps, or of a file's clock, without one, such as `Europe/Berlin`."""
     assumed: bool = added(False)
     """The rate is a guess; each ingest reports it."""
     own_clock: bool = added(False)
@@ -293,8 +293,8 @@ class TimeBase(Config):
             if not _reads_back(str(self.moment_format)):
                 raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
         zoned = self.format is not None and "%z" in self.format
-        if self.zone is not None and (zoned or self.unit is not None or self.column is None):
-            raise ValueError("'zone' is for timestamps without a time zone")
+        if self.zone is not None and (zoned or self.unit is not None or self.rate_hz is not None):
+            raise ValueError("'zone' is for timestamps or a clock without a time zone")
         if self.longest_gap_s > self.split_gap_s:
             raise ValueError("longest_gap_s cannot be larger than split_gap_s")
         if self.unit is not None:

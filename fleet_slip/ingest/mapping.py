@@ -40,9 +40,13 @@ from fleet_slip.ingest.columns import (
     require_satellites,
     split_components,
 )
-from fleet_slip.ingest.formats.can import CanBus, read_can_database
-from fleet_slip.ingest.formats.csv import CsvFormat, PlainNumbers
-from fleet_slip.ingest.formats.reading import FileFormats
+from fleet_slip.ingest.formats.file_formats import (
+    CanBus,
+    CsvFormat,
+    FileFormats,
+    PlainNumbers,
+    read_can_database,
+)
 from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
@@ -337,7 +341,8 @@ class Mapping(Config):
     @property
     def formats(self) -> FileFormats:
         """The parameters to open a file."""
-        return FileFormats(self.csv, self.can, self.name, self._plain_numbers)
+        zone = self.time.zone if self.time.own_clock else None
+        return FileFormats(self.csv, self.can, self.name, self._plain_numbers, zone)
 
     @property
     def _plain_numbers(self) -> PlainNumbers:

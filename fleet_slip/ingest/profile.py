@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import CanBus
-from fleet_slip.ingest.formats.csv import CsvFormat, Encoding, decompressed, first_lines
+from fleet_slip.ingest.formats.csv import decompressed, first_lines
+from fleet_slip.ingest.formats.file_formats import CanBus, CsvFormat, Encoding, FileFormats
 from fleet_slip.ingest.formats.reading import (
-    FileFormats,
     file_errors,
     open_source,
     require_unchanged_log,

@@ -15,7 +15,8 @@ from fleet_slip.base import no_progress
 from fleet_slip.config import LONGEST_FILE_BYTES, load_config, read_named_file
 from fleet_slip.errors import ConfigError, FleetSlipError, InputError, StorageError
 from fleet_slip.grams.update import update_grams
-from fleet_slip.ingest.formats.can import CanBus, parse_database, read_can_database
+from fleet_slip.ingest.formats.can import parse_database
+from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
 from fleet_slip.ingest.log_files import StrayLink, find_logs
 from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.models.acceptance import PublishThresholds

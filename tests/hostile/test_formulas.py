@@ -17,6 +17,7 @@ from mcap.writer import CompressionType
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.confined_reader import open_here
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget
 from tests.support.commands import within
 
@@ -42,7 +43,7 @@ def write_mdf(
 
 
 def read(file: Path, name: str, format_name: str = "mdf") -> Any:
-    with within(), open_here(format_name, None, Budget.for_file(file)) as source:
+    with within(), open_here(format_name, Budget.for_file(file), FileFormats()) as source:
         return np.concatenate([rows[name].to_numpy() for rows in source.batches([name])])
 
 

@@ -20,7 +20,7 @@ from asammdf import MDF, Signal
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import source
-from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.formats.file_formats import CanBus
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.commands import within
 from tests.support.fuzz.logs import DBC, FORMATS, sound_file

@@ -17,16 +17,16 @@ from hypothesis import strategies as st
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.formats import can as can_frames
 from fleet_slip.ingest.formats.can import (
-    CanBus,
     CanFrames,
     FrameBlock,
     open_can_trace,
     physical,
     raw_numbers,
-    read_can_database,
 )
+from fleet_slip.ingest.formats.file_formats import CanBus, FileFormats, read_can_database
 from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.mapping import load_mapping
+from tests.support.can_files import Frame, asc_line, write_asc, write_blf
 from tests.support.catalog import CATALOG
 from tests.support.logs import without_names
 from tests.support.measured import MeasuredLog, read_measured, ticks
@@ -161,11 +161,11 @@ def test_names_of_values_can_be_a_condition(tmp_path: Path) -> None:
 def test_a_message_on_two_buses_must_be_told_apart(tmp_path: Path) -> None:
     frames = [frame for i in range(50) for frame in (motion(i, 1), motion(i, 2, ax=0.0))]
     file = write_trace(tmp_path, frames)
-    assert "Motion is on the buses 1, 2. Choose one in the mapping" in failure(file)
-    log = read(file, MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "1"'))
+    assert "Motion is on the buses 2, 3. Choose one in the mapping" in failure(file)
+    log = read(file, MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "2"'))
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     text = MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "9"')
-    assert "buses: 1, 2" in failure(file, text)
+    assert "not on the bus 9, but on 2, 3" in failure(file, text)
 
 
 def test_a_database_that_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -306,8 +306,68 @@ def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> Non
     frames = [motion(i) for i in range(50)] + [mux(i, 0, 1.0) for i in range(50)]
     (tmp_path / "car.dbc").write_text(DBC)
     bus = read_can_database(CanBus(database="car.dbc"), tmp_path)
-    with open_can_trace(bus, Budget.for_file(write_trace(tmp_path, frames))) as source:
+    budget = Budget.for_file(write_trace(tmp_path, frames))
+    with open_can_trace(budget, FileFormats(can=bus)) as source:
         for column in ("Motion.ax", "Mux.yaw", "Motion.beta"):
             (table,) = source.batches([column])
             assert (table.height, table[column].null_count()) == (50, 0)
         assert {channel.base for channel in source.channels()} == {"Motion", "Mux"}
+
+
+def payload(ax: float) -> bytes:
+    return bytes(DATABASE.encode_message("Motion", {"ax": ax, "beta": 0.5, "state": "on"}))
+
+
+def write_two_buses(folder: Path, suffix: str, *, fd: bool = False) -> Path:
+    """Write a trace with ax = 1 m/s^2 on bus 1, and -2 m/s^2 on bus 2."""
+    pairs = ((i / 100, bus, ax) for i in range(50) for bus, ax in ((1, 1.0), (2, -2.0)))
+    frames = [Frame(t + bus * 1e-4, bus, 256, payload(ax), fd) for t, bus, ax in pairs]
+    file = folder / f"two{suffix}"
+    if suffix == ".asc":
+        return write_asc(file, map(asc_line, frames))
+    return write_blf(file, frames, datetime(2024, 5, 31, 12, tzinfo=UTC))
+
+
+@pytest.mark.parametrize("fd", [False, True])
+@pytest.mark.parametrize("suffix", [".asc", ".blf"])
+def test_buses_have_the_numbers_of_the_trace(tmp_path: Path, suffix: str, fd: bool) -> None:
+    file = write_two_buses(tmp_path, suffix, fd=fd)
+    dated = MAPPING.replace("[drive]", "[drive]\nday = 2024-05-31")
+
+    def text(bus: int) -> str:
+        return dated.replace('"car.dbc"', f'"car.dbc"\nchannel = "{bus}"')
+
+    for bus, count in ((1, 1000), (2, -2000)):
+        assert set(read(file, text(bus)).drives["ax"].to_pylist()) == {count}
+    assert "not on the bus 0, but on 1, 2" in failure(file, text(0))
+    assert "is on the buses 1, 2" in failure(file, dated)
+
+
+@pytest.mark.parametrize("is_relative", [False, True])
+def test_times_of_asc_begin_before_the_trigger_and_count_every_event(
+    tmp_path: Path, is_relative: bool
+) -> None:
+    times_s = [i / 100 - 0.3 for i in range(50)]
+    lines, before_s = [], 0.0
+    for i, time_s in enumerate(times_s):
+        events = [asc_line(Frame(time_s, 1, 256, payload(i / 10)))]
+        events.append(f"{time_s + 0.004:11.6f} 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%")
+        events.append(f"{time_s + 0.006:11.6f} 2  ErrorFrame")
+        for line in events:
+            event_s, text = line.split(maxsplit=1)
+            shown_s = float(event_s) - before_s if is_relative else float(event_s)
+            lines.append(f"{shown_s:11.6f} {text}")
+            before_s = float(event_s)
+    file = write_asc(tmp_path / "a.asc", lines, "relative" if is_relative else "absolute")
+    log = read(file, MAPPING.replace("[drive]", "[drive]\nday = 2024-05-31"))
+    assert ticks(log) == list(range(50))
+    assert log.drives["ax"].to_pylist() == [100 * i for i in range(50)]
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".blf"])
+def test_a_trace_starts_in_the_zone_of_the_mapping(tmp_path: Path, suffix: str) -> None:
+    file = write_two_buses(tmp_path, suffix)
+    text = MAPPING.replace("own_clock = true", 'own_clock = true\nzone = "America/New_York"')
+    log = read(file, text.replace('"car.dbc"', '"car.dbc"\nchannel = "1"'))
+    started = log.drives["started_at"][0].as_py()
+    assert started.astimezone(UTC).replace(microsecond=0) == datetime(2024, 5, 31, 16, tzinfo=UTC)

@@ -3,7 +3,9 @@
 import gc
 import re
 import tempfile
+import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from fleet_slip.errors import ExtraError
 from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats import matlab, mdf
 from fleet_slip.ingest.formats import source as budget
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.logs import preview_logs
 from fleet_slip.ingest.mapping import Mapping
@@ -37,6 +40,7 @@ from tests.support.format_values import (
 from tests.support.fuzz import logs
 from tests.support.fuzz.logs import FORMATS, sound_file
 from tests.support.measured import (
+    OWN_CLOCK,
     a_mapping,
     failure,
     own_clock,
@@ -118,7 +122,7 @@ def test_a_group_of_an_mdf_file_is_read_window_by_window(
     file = write_mdf(tmp_path, [a_x(), beta(**flags)], version=version)
     whole = read_measured(file, mdf_mapping())
     monkeypatch.setattr(mdf, "WINDOW_RECORDS", 33)
-    with mdf.open_mdf(Budget.for_file(file)) as source:
+    with mdf.open_mdf(Budget.for_file(file), FileFormats()) as source:
         batches = list(source.batches(["a_x", "beta"]))
     assert [batch.height for batch in batches] == [33, 33, 33, 1]
     log = read_measured(file, mdf_mapping())
@@ -351,7 +355,7 @@ def test_columns_of_matlab_5_are_listed(tmp_path: Path) -> None:
     }  # fmt: skip
     file = tmp_path / "log.mat"
     scipy.io.savemat(file, content)
-    with matlab.open_mat(Budget.for_file(file)) as source:
+    with matlab.open_mat(Budget.for_file(file), FileFormats()) as source:
         listed = [channel.name for channel in source.channels()]
         (batch,) = source.batches(["s.deep.x(:,2)"])
         (names,) = source.batches(["names"])
@@ -396,3 +400,29 @@ def test_a_file_that_was_cut_is_refused(
     message = failure(file, FORMATS[name].mapping)
     assert re.search("Is it complete|ends too early|it is truncated", message)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("here", ["UTC", "Asia/Tokyo"])
+@pytest.mark.parametrize("version", ["3.00", "4.10"])
+def test_a_clock_without_a_zone_does_not_depend_on_the_zone_of_the_reader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str, here: str
+) -> None:
+    with MDF(version=version) as file:
+        file.append([a_x()])
+        if version == "3.00":
+            file.header.date, file.header.time = b"31:05:2024", b"12:00:00"
+        else:
+            file.start_time = START.replace(tzinfo=None)
+        log = Path(file.save(tmp_path / "log", overwrite=True))
+    monkeypatch.setenv("TZ", here)
+    time.tzset()
+    try:
+        for zone, hour in ((None, 12), ("America/New_York", 16)):
+            clock = {**OWN_CLOCK, "zone": zone}
+            only_ax = {"ax": {"column": "a_x", "unit": "m/s^2"}}
+            drives = read_measured(log, own_clock(time=clock, signals=only_ax)).drives
+            started = drives["started_at"][0].as_py().astimezone(UTC)
+            assert started == datetime(2024, 5, 31, hour, tzinfo=UTC)
+    finally:
+        monkeypatch.undo()
+        time.tzset()

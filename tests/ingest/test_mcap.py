@@ -13,6 +13,7 @@ from mcap_ros2.writer import Writer
 
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats import mcap as mcap_log
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.format_values import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
@@ -118,7 +119,10 @@ def write_json(
 
 def test_a_topic_of_which_a_part_cannot_be_decoded_is_refused(tmp_path: Path) -> None:
     file = write_json(tmp_path / "log.mcap", [{"a": 1.0}] * 4, ("json", "protobuf"))
-    with mcap_log.open_mcap(Budget.for_file(file)) as source, pytest.raises(InputError) as caught:
+    with (
+        mcap_log.open_mcap(Budget.for_file(file), FileFormats()) as source,
+        pytest.raises(InputError) as caught,
+    ):
         list(source.batches(["imu.a"]))
     assert "topic 'imu' has messages in an encoding that is not supported ('protobuf')" in str(
         caught.value
@@ -130,7 +134,7 @@ def test_a_field_with_a_text_far_down_is_one_of_texts(tmp_path: Path) -> None:
     messages[0]["b"] = messages[0]["c"] = None
     messages[17] |= {"b": "late", "c": 5}
     file = write_json(tmp_path / "log.mcap", messages)
-    with mcap_log.open_mcap(Budget.for_file(file)) as source:
+    with mcap_log.open_mcap(Budget.for_file(file), FileFormats()) as source:
         (base,) = source.bases(["imu.a", "imu.b", "imu.c"])
         found = pl.concat(base)
         assert found.height == 20

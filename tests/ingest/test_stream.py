@@ -18,7 +18,8 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import drives, logs, measured_log
 from fleet_slip.ingest.drives import DriveCutter
 from fleet_slip.ingest.formats import csv as csv_batches
-from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
+from fleet_slip.ingest.formats.csv import CsvSource
+from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.logs import log_table
 from fleet_slip.ingest.ticks import MeasuredDrive

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from nptdms import ChannelObject
 
 from fleet_slip.ingest.formats import matlab, tdms
-from fleet_slip.ingest.formats.reading import FileFormats, open_source
+from fleet_slip.ingest.formats.file_formats import FileFormats
+from fleet_slip.ingest.formats.reading import open_source
 from fleet_slip.ingest.formats.source import OWN_TIME
 from tests.support.measured import a_mapping, failure, physical, read_measured, ticks
 from tests.support.tdms_files import START, own_clock, wave, write

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_slip.ingest.formats.reading import FileFormats, open_source
+from fleet_slip.ingest.formats.file_formats import FileFormats
+from fleet_slip.ingest.formats.reading import open_source
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.measured import DRIVE, failure, own_clock, physical, read_measured, reasons

@@ -8,15 +8,15 @@ Start bit, byte order and multiplexing are those of the DBC format, as cantools 
 compare with its decoder, which takes one frame at a time.
 """
 
-import hashlib
 import logging
 import math
 import pickle
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -25,18 +25,18 @@ from typing import Any
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
-from pydantic import Field
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.base import quote_name
-from fleet_slip.config import Config, Name, read_named_file
-from fleet_slip.errors import ConfigError, InputError
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.file_formats import CanBus, FileFormats
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Budget,
     Channel,
     FormatSource,
     Spool,
+    clock_start_s,
     load_library,
     missing_column,
 )
@@ -179,47 +179,6 @@ class CanFrames:
                 yield selected.times_s, selected.data[:, :size]
 
 
-# The keys of a mapping for CAN traces: the database of messages, and the bus.
-
-DATABASES = {".dbc": "dbc", ".kcd": "kcd", ".sym": "sym"}
-MAX_DATABASE_BYTES = 2**28
-
-
-class CanBus(Config):
-    """The database of a CAN trace. Its content, not its path, is part of a mapping's identity."""
-
-    database: Name = Field(exclude=True)
-    """Path of a DBC, KCD or SYM file, seen from the mapping's own."""
-    channel: Name | None = None
-    """The bus, as the trace calls it; needed where a message occurs on several."""
-    text: str = Field(default="", exclude=True, repr=False)
-    """The content of the database, read when the mapping is loaded."""
-    digest: str = ""
-    """SHA-256 of it."""
-
-    @property
-    def format(self) -> str:
-        """The encoding of the database."""
-        return DATABASES[Path(self.database).suffix.lower()]
-
-
-def read_can_database(bus: CanBus, folder: Path) -> CanBus:
-    """Return the bus with the content of its database. Raises `ConfigError`."""
-    file = folder / bus.database
-    if file.suffix.lower() not in DATABASES:
-        raise ConfigError(
-            f"{file}: not a CAN database ({', '.join(DATABASES)}). Convert ARXML with "
-            "canconvert, which is part of canmatrix."
-        )
-    content = read_named_file(file, MAX_DATABASE_BYTES)
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        text = content.decode("cp1252", "replace")  # what most tools on Windows write
-    digest = hashlib.sha256(content).hexdigest()
-    return bus.model_copy(update={"text": text, "digest": digest})
-
-
 def parse_database(bus: CanBus) -> Any:
     """Return the messages of a database. Raises `InputError`, which quotes no line of it."""
     database = Path(bus.database)
@@ -241,7 +200,42 @@ AT_ONCE = 2**14
 """Frames of python-can that are kept together."""
 
 
-def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
+_ASC_TIME = re.compile(r"\s*(-?\d+[.,]\d+)\s+(.*)", re.DOTALL)
+_ASC_DATE = re.compile(r"\s*(?:date|begin\s+triggerblock)\s+\w+\s+(.+?)\s*$", re.IGNORECASE)
+_RELATIVE = re.compile(r"\s*base\s+\w+\s+timestamps\s+relative", re.IGNORECASE)
+
+
+class _AscLines:
+    """The lines of an ASC trace, with the time of the last one in s since the header's date.
+
+    python-can drops frames before the trigger, whose times are negative, and reads times since the
+    previous event as absolute. So it gets lines at time 0, and frames get their times from here.
+    """
+
+    def __init__(self, lines: Iterable[str], can: Any) -> None:
+        self._lines, self._can = lines, can
+        self.time_s, self._is_relative = 0.0, False
+        self.start: datetime | None = None
+
+    def __iter__(self) -> Iterator[str]:
+        for line in self._lines:
+            self._is_relative |= _RELATIVE.match(line) is not None
+            if self.start is None and (date := _ASC_DATE.match(line)):
+                with suppress(ValueError):
+                    start_s = self._can.ASCReader._datetime_to_timestamp(date[1])
+                    self.start = datetime.fromtimestamp(start_s)
+            if event := _ASC_TIME.match(line):
+                time_s = float(event[1].replace(",", "."))
+                self.time_s = self.time_s + time_s if self._is_relative else time_s
+                yield f"0.0 {event[2]}"
+            else:
+                yield line
+
+    def close(self) -> None:
+        """Leave the file open: python-can calls this at its end."""
+
+
+def _read_trace(budget: Budget, zone: str | None) -> Iterator[FrameBlock]:
     """Yield the data frames of a trace. Raises `InputError`."""
     if budget.file.suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -249,6 +243,9 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
             f"{', '.join(sorted(SUFFIXES))}. Rename the file."
         )
     can = load_library(budget.file, "can")
+    if budget.file.suffix.lower() == ".asc":
+        yield from _read_asc(budget.file, can, zone)
+        return
     passes_over = logging.getLogger("can.io.blf")
     passes_over.setLevel(logging.WARNING)
     passes_over.addFilter(_refuse_unknown)
@@ -258,20 +255,43 @@ def _read_trace(budget: Budget) -> Iterator[FrameBlock]:
         if stated > budget.size:
             raise InputError(
                 f"{quote_name(budget.file)}: {budget.size:,} of {stated:,} bytes: it is truncated. "
-                "Copy "
-                "it again."
+                "Copy it again."
             )
-        sent = (
-            message for message in trace if not (message.is_error_frame or message.is_remote_frame)
-        )
-        while messages := list(islice(sent, AT_ONCE)):
-            yield _block_of(messages)
+        is_blf = hasattr(trace, "start_timestamp")
+        shift_s = 0.0
+        if is_blf and zone is not None and trace.start_timestamp:  # python-can reads UTC
+            local = datetime.fromtimestamp(trace.start_timestamp, UTC).replace(tzinfo=None)
+            shift_s = clock_start_s(local, zone) - trace.start_timestamp
+        for frames in _data_frames(trace):
+            yield _block_of(frames, shift_s, bus_offset=int(is_blf))
         if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
             raise InputError(
                 f"{quote_name(budget.file)}: an object in it is damaged, or ends too early. Copy "
-                "it "
-                "again."
+                "it again."
             )
+
+
+def _read_asc(file: Path, can: Any, zone: str | None) -> Iterator[FrameBlock]:
+    """Yield the data frames of an ASC trace, with dates if the mapping states their time zone."""
+    with file.open(encoding="cp1252", errors="replace") as text:
+        lines = _AscLines(text, can)
+
+        def timed() -> Iterator[Any]:
+            for frame in can.ASCReader(lines):
+                frame.timestamp = lines.time_s
+                yield frame
+
+        for frames in _data_frames(timed()):
+            start = lines.start if zone is not None else None
+            start_s = 0.0 if start is None else clock_start_s(start, zone)
+            yield _block_of(frames, start_s, bus_offset=1)
+
+
+def _data_frames(frames: Iterable[Any]) -> Iterator[list[Any]]:
+    """Yield the frames with data, some at once."""
+    sent = (frame for frame in frames if not (frame.is_error_frame or frame.is_remote_frame))
+    while several := list(islice(sent, AT_ONCE)):
+        yield several
 
 
 def _refuse_unknown(record: logging.LogRecord) -> bool:
@@ -281,14 +301,15 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
     return False
 
 
-def _block_of(frames: list[Any]) -> FrameBlock:
-    """Return frames of python-can."""
+def _block_of(frames: list[Any], start_s: float, bus_offset: int) -> FrameBlock:
+    """Return frames of python-can, which counts the buses of ASC and BLF from 0, they from 1."""
     payloads = b"".join(bytes(frame.data).ljust(MAX_FRAME_BYTES, b"\0") for frame in frames)
+    buses = (frame.channel for frame in frames)
     return FrameBlock(
         np.array([frame.arbitration_id for frame in frames]),
         np.array([frame.is_extended_id for frame in frames]),
-        np.array([frame.timestamp for frame in frames]),
-        np.array([str(frame.channel) for frame in frames]),
+        start_s + np.array([frame.timestamp for frame in frames]),
+        np.array([str(bus + bus_offset if isinstance(bus, int) else bus) for bus in buses]),
         np.array([len(frame.data) for frame in frames]),
         np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MAX_FRAME_BYTES),
     )
@@ -301,10 +322,17 @@ _Key = tuple[int, bool]
 class CanSource(FormatSource):
     """The messages of a CAN trace, or of a file with bus logging."""
 
-    def __init__(self, file: Path, bus: CanBus, blocks: Callable[[], Iterator[FrameBlock]]) -> None:
+    def __init__(
+        self, file: Path, formats: FileFormats, blocks: Callable[[], Iterator[FrameBlock]]
+    ) -> None:
         """Take a file, its keys in the mapping, and the function that reads its frames."""
-        self._file, self._bus, self._spool, self._blocks = file, bus, Spool(), blocks
-        self._database = parse_database(bus)
+        if formats.can is None:
+            raise InputError(
+                f'{quote_name(file)}: this format needs [can] with database = "….dbc" in the '
+                f"mapping {formats.name!r}."
+            )
+        self._file, self._bus, self._spool, self._blocks = file, formats.can, Spool(), blocks
+        self._database = parse_database(formats.can)
         self._messages = {message.name: message for message in self._database.messages}
         self._identifiers_to_keep: set[_Key] = set()
         self._numbers: set[_Key] = set()
@@ -405,9 +433,15 @@ class CanSource(FormatSource):
                 f"{', '.join(buses)}. Choose one in the mapping: [can] channel = "
                 f'"{buses[0]}".'
             )
+        if self._bus.channel is not None and self._bus.channel not in buses:
+            raise InputError(
+                f"{quote_name(self._file)}: the message {message.name} is not on the bus "
+                f"{self._bus.channel}, but on {', '.join(buses)}. Choose one in the mapping: [can] "
+                f'channel = "{buses[0]}".'
+            )
         sizes = frames.sizes_on(self._bus.channel)
         short = sum(number for size, number in sizes.items() if size < needed)
-        if short or not sizes:
+        if short:
             raise InputError(
                 f"{quote_name(self._file)}: {short:,} of {sizes.total():,} frames of "
                 f"{message.name} ({message.frame_id:#x}) are too short: {column} ends "
@@ -443,6 +477,6 @@ def _key(message: Any) -> _Key:
 
 
 @contextmanager
-def open_can_trace(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
+def open_can_trace(budget: Budget, formats: FileFormats) -> Iterator[CanSource]:
     """Open a CAN trace. Raises `InputError`, for a database that cannot be parsed too."""
-    yield CanSource(budget.file, bus, partial(_read_trace, budget))
+    yield CanSource(budget.file, formats, partial(_read_trace, budget, formats.zone))

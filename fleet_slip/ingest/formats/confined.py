@@ -27,8 +27,8 @@ import pyarrow as pa
 
 from fleet_slip import errors
 from fleet_slip.errors import FleetSlipError, InputError
-from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined_reader import SIZES, Job
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget, Channel, Source
 
 _SERVE = (
@@ -42,9 +42,11 @@ _ENVIRONMENT = {
     "ARROW_DEFAULT_MEMORY_POOL": "system",
     "MALLOC_MMAP_THRESHOLD_": "1000000000",
     "MALLOC_TRIM_THRESHOLD_": "1000000000",
+    "TZ": "UTC",
 }
-"""Else libraries reserve memory for threads that a reader does not need."""
-_INHERITED = ("TZ", "LD_LIBRARY_PATH")
+"""Else libraries reserve memory for threads that a reader does not need. Clocks without a zone are
+in UTC, so that the result does not depend on the zone of this machine."""
+_INHERITED = ("LD_LIBRARY_PATH",)
 _MAX_TEXT_BYTES = 2**26
 _POLL_S = 0.1
 """Interval in s at which the sum of a reader's temporary files is measured."""
@@ -206,13 +208,13 @@ def _written_bytes(folder: Path, handle: int) -> int:
 
 
 @contextmanager
-def open_confined(name: str, bus: CanBus | None, budget: Budget) -> Iterator[Source]:
+def open_confined(name: str, budget: Budget, formats: FileFormats) -> Iterator[Source]:
     """Open a file of a format for reading by another process. Raises `InputError`."""
     with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
         channel, handle = _fork_reader(name, budget)
         try:
             job = Job(
-                *(name, os.fspath(budget.file), budget.size, bus, str(Path.cwd()), folder),
+                *(name, os.fspath(budget.file), budget.size, formats, str(Path.cwd()), folder),
                 limits=(budget.memory, budget.unfolded, int(10 * budget.seconds) + 1),
             )
             channel.sendall(pickle.dumps(job))

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import polars as pl
 
 from fleet_slip.errors import FleetSlipError, is_lack_of_memory
-from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 
 
@@ -67,7 +67,7 @@ class Job:
     format: str
     file: str
     size: int
-    bus: CanBus | None
+    formats: FileFormats
     cwd: str
     folder: str
     """For its temporary files."""
@@ -75,11 +75,10 @@ class Job:
     """Bytes of memory and of a temporary file, and seconds of a processor."""
 
 
-def open_here(name: str, bus: CanBus | None, budget: Budget) -> AbstractContextManager[Source]:
+def open_here(name: str, budget: Budget, formats: FileFormats) -> AbstractContextManager[Source]:
     """Open a file of a format in this process. Raises `InputError`."""
     module = importlib.import_module(f"{__package__}.{FORMATS[name].module}")
-    arguments = [budget] if bus is None else [bus, budget]
-    source: AbstractContextManager[Source] = getattr(module, f"open_{name}")(*arguments)
+    source: AbstractContextManager[Source] = getattr(module, f"open_{name}")(budget, formats)
     return source
 
 
@@ -130,7 +129,7 @@ class _Reader:
             budget = Budget(Path(job.file), job.size)
 
             def open_it() -> bool:
-                self._source = opened.enter_context(open_here(job.format, job.bus, budget))
+                self._source = opened.enter_context(open_here(job.format, budget, job.formats))
                 return self._source.has_clock
 
             if not self._answer(job.file, open_it):

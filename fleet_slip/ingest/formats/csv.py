@@ -2,22 +2,19 @@
 
 import csv
 from collections.abc import Iterator, Set
-from dataclasses import dataclass
 from functools import cached_property
 from io import BufferedReader, BytesIO
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, BinaryIO, Literal
+from typing import BinaryIO
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
-from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.arrays import is_finite
 from fleet_slip.base import quote_name
-from fleet_slip.config import Config, added
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
 # The layout of a CSV file: encoding, separator, and the lines of header and data.
@@ -26,41 +23,6 @@ BUFFER_BYTES = 2**22
 MAX_LINE_BYTES = 2**20
 COMPRESSED = {b"\x1f\x8b": "gzip", b"\x28\xb5\x2f\xfd": "zstd"}
 """First bytes of compressed files."""
-
-
-Encoding = Literal["utf-8", "utf-16", "cp1252"]
-Line = Annotated[int, Field(ge=1, le=1000)]
-
-
-class CsvFormat(Config):
-    """How a CSV file is written. Lines are counted from 1, as editors do.
-
-    Keys that came after the first release are not part of the mapping's identity at their default.
-    """
-
-    separator: str = ","
-    decimal_comma: bool = False
-    encoding: Encoding = added("utf-8")
-    """UTF-8 is with or without a byte order mark."""
-    header_line: Line = added(1)
-    """The line with the names of the columns; those above it are passed over."""
-    data_line: Line | None = added(None)
-    """The first line of data, if it is not the next: a line of units may be between."""
-
-    @field_validator("separator")
-    @classmethod
-    def _one_character(cls, separator: str) -> str:
-        if len(separator) != 1 or not separator.isascii() or separator in '"\r\n\0':
-            raise ValueError("must be one ASCII character such as ',', ';' or a tab")
-        return separator
-
-    @model_validator(mode="after")
-    def _unambiguous(self) -> "CsvFormat":
-        if self.decimal_comma and self.separator == ",":
-            raise ValueError("with decimal_comma the separator cannot be ',': set it, often ';'")
-        if self.data_line is not None and self.data_line <= self.header_line:
-            raise ValueError("data_line must come after header_line")
-        return self
 
 
 def decompressed(stream: BinaryIO) -> BinaryIO:
@@ -103,24 +65,6 @@ EXTRA_FIELDS = "\0extra fields"
 
 CUT = "the file ends within this line"
 """Its value for a last line that is cut: without a line break, with fewer fields than others."""
-
-
-@dataclass(frozen=True)
-class PlainNumbers:
-    """Columns that are used only as numbers, and numbers that mean "no value".
-
-    They are parsed as numbers at once, three times as fast as by way of text. A column in which a
-    text is empty, is not a number or means "no value" is read as text.
-    """
-
-    columns: frozenset[str] = frozenset()
-    missing: tuple[float, ...] = ()
-
-    def are_in(self, column: pl.Series) -> bool:
-        """Return True if a column that was parsed as numbers has one in every row."""
-        if column.null_count() or not is_finite(column.to_numpy()):
-            return False
-        return not (self.missing and column.is_in(self.missing).any())
 
 
 class CsvSource(FormatSource):

@@ -13,6 +13,7 @@ import polars as pl
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
     Budget,
     Channel,
@@ -124,7 +125,7 @@ class Vectors(FormatSource):
 
 
 @contextmanager
-def open_mat(budget: Budget) -> Iterator[Vectors]:
+def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
     with budget.file.open("rb") as stream:
         content = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
@@ -142,7 +143,7 @@ def _arrays_in(variables: Mapping[str, Any], above: str = "") -> Iterator[tuple[
 
 
 @contextmanager
-def open_mat73(budget: Budget) -> Iterator[Vectors]:
+def open_mat73(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`.
 
     HDF5 can take the values of a dataset out of any other file. That is asked of each dataset

@@ -18,6 +18,7 @@ import polars as pl
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Budget,
@@ -236,6 +237,6 @@ class McapSource(FormatSource):
 
 
 @contextmanager
-def open_mcap(budget: Budget) -> Iterator[McapSource]:
+def open_mcap(budget: Budget, _formats: FileFormats) -> Iterator[McapSource]:
     """Open an MCAP file. Raises `InputError`."""
     yield McapSource(budget)

@@ -4,6 +4,7 @@ import mmap
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,15 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import Bytes, CanBus, CanSource, FrameBlock
+from fleet_slip.ingest.formats.can import Bytes, CanSource, FrameBlock
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
-    EARLIEST_S,
     OWN_TIME,
     Budget,
     Channel,
     FormatSource,
     as_column,
+    clock_start_s,
     load_library,
     missing_column,
 )
@@ -139,11 +141,10 @@ _IDENTIFIER = (1 << 29) - 1
 class MdfSource(FormatSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
-    def __init__(self, mdf: Any, budget: Budget) -> None:
-        """Take a file opened by asammdf."""
+    def __init__(self, mdf: Any, budget: Budget, zone: str | None) -> None:
+        """Take a file opened by asammdf, and the zone of a clock without one."""
         self._file, self._mdf = budget.file, mdf
-        start = mdf.start_time.timestamp()
-        self._start_s = start if start > EARLIEST_S else 0.0
+        self._start_s = _start_s(mdf.header, zone)
 
     def channels(self) -> list[Channel]:
         """Return all channels but the groups' masters."""
@@ -340,8 +341,25 @@ class MdfSource(FormatSource):
         return name if len(self._places(name)) < 2 else f"{name}@{number}"
 
 
+def _start_s(header: Any, zone: str | None) -> float:
+    """Return the start of the measurement in s since 1970, 0 if the file has no date.
+
+    MDF 3 may have the local date and time as text alone: asammdf would read them in the zone of
+    this machine, and a damaged date as now.
+    """
+    counted_ns: int = getattr(header, "abs_time", 0)
+    if hasattr(header, "time_flags") or counted_ns:
+        return clock_start_s(header.start_time, zone)
+    text = f"{header.date.decode('latin-1')} {header.time.decode('latin-1')}".strip("\0 ")
+    try:
+        start = datetime.strptime(text, "%d:%m:%Y %H:%M:%S")
+    except ValueError:
+        return 0.0
+    return clock_start_s(start, zone)
+
+
 @contextmanager
-def open_mdf(budget: Budget) -> Iterator[MdfSource]:
+def open_mdf(budget: Budget, formats: FileFormats) -> Iterator[MdfSource]:
     """Open an MDF file. Raises `InputError`.
 
     An attachment may be any other file, and so may the database by which asammdf would decode bus
@@ -354,7 +372,7 @@ def open_mdf(budget: Budget) -> Iterator[MdfSource]:
         mdf._mdf.name.unlink()  # it stays open until the process ends
     mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
     try:
-        yield MdfSource(mdf, budget)
+        yield MdfSource(mdf, budget, formats.zone)
     finally:
         mdf.close()
 
@@ -368,7 +386,7 @@ def _payloads(samples: NDArray[Any]) -> Bytes:
 
 
 @contextmanager
-def open_mdf_bus(bus: CanBus, budget: Budget) -> Iterator[CanSource]:
+def open_mdf_bus(budget: Budget, formats: FileFormats) -> Iterator[CanSource]:
     """Open an MDF file for the CAN frames in it. Raises `InputError`."""
-    with open_mdf(budget) as mdf:
-        yield CanSource(budget.file, bus, mdf.frames)
+    with open_mdf(budget, formats) as mdf:
+        yield CanSource(budget.file, formats, mdf.frames)

@@ -5,7 +5,6 @@ The first bytes identify the format; for text also the mapping and the file's su
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import polars as pl
@@ -13,10 +12,10 @@ import pyarrow as pa
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import CanBus
 from fleet_slip.ingest.formats.confined import open_confined
 from fleet_slip.ingest.formats.confined_reader import FORMATS
-from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers
+from fleet_slip.ingest.formats.csv import CsvSource
+from fleet_slip.ingest.formats.file_formats import CsvFormat, FileFormats
 from fleet_slip.ingest.formats.parquet_footer import MAGIC
 from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 from fleet_slip.ingest.formats.tables import open_parquet
@@ -33,28 +32,6 @@ _BINARY = {
     (".mcap",): "an MCAP file",
     (".tdms", ".tdms_index"): "a TDMS file",
 }
-
-
-@dataclass(frozen=True)
-class FileFormats:
-    """Parameters of a file's format that the file does not contain.
-
-    Attributes
-    ----------
-    csv
-        Separator and decimal sign of text.
-    can
-        The database of a CAN trace.
-    name
-        The mapping, for messages.
-    plain_numbers
-        Columns of text that are numbers wherever they are used.
-    """
-
-    csv: CsvFormat = field(default_factory=CsvFormat)
-    can: CanBus | None = None
-    name: str = "mapping suggest"
-    plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
 
 
 @contextmanager
@@ -108,14 +85,8 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         name = name or "can_trace"
     if start.startswith(MAGIC):
         return open_parquet(budget)
-    if name == "can_trace" and formats.can is None:
-        raise InputError(
-            f'{quote_name(file)}: this format needs [can] with database = "….dbc" in the mapping '
-            f"{formats.name!r}."
-        )
     if name:
-        bus = formats.can if name in {"can_trace", "mdf_bus"} else None
-        return open_confined(name, bus, budget)
+        return open_confined(name, budget, formats)
     for suffixes, kind in _BINARY.items():
         if suffix in suffixes:
             raise InputError(

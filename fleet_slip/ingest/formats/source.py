@@ -13,9 +13,11 @@ from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
 import polars as pl
@@ -30,6 +32,18 @@ BASE = "\0base"
 
 EARLIEST_S = 10**8
 """A start before 1973 is no date: of loggers without a clock it is 0, of LabVIEW 1904."""
+
+
+def clock_start_s(start: datetime, zone: str | None) -> float:
+    """Return the start of a clock in s since 1970, 0 if it is no date.
+
+    A start without a time zone is in `zone`, else in UTC.
+    """
+    if start.tzinfo is None:
+        start = start.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+    start_s = start.timestamp()
+    return start_s if start_s > EARLIEST_S else 0.0
+
 
 MAX_COLUMNS = 10_000
 

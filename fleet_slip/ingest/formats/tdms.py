@@ -16,6 +16,7 @@ import polars as pl
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.matlab import Matrix, Vectors
 from fleet_slip.ingest.formats.source import (
     EARLIEST_S,
@@ -83,7 +84,7 @@ class TdmsSource(Vectors):
 
 
 @contextmanager
-def open_tdms(budget: Budget) -> Iterator[Vectors]:
+def open_tdms(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     """Open a TDMS file without its index, which may belong to another file.
 
     Raises `InputError`, also for a file that ends too early, or has counts of a converter.

@@ -17,7 +17,8 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.csv import CsvFormat, CsvSource, PlainNumbers, first_lines
+from fleet_slip.ingest.formats.csv import CsvSource, first_lines
+from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel
 from fleet_slip.ingest.vocabulary import unit_called
 

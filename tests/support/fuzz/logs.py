@@ -21,7 +21,7 @@ import pyarrow as pa
 import scipy.io
 from asammdf import MDF, Signal
 
-from fleet_slip.ingest.formats.can import CanBus
+from fleet_slip.ingest.formats.file_formats import CanBus
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.catalog import SIGNALS
 from tests.support.fuzz.files import _BASE
