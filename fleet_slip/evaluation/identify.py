@@ -184,6 +184,7 @@ class IdentifiedVehicle(Answer):
     fit_rad: float
     held_out_rad: float | None = None
     drives: int = 0
+    fit: FitParameters | None = None
     at_bounds: tuple[str, ...] = ()
     not_identifiable: tuple[str, ...] = ()
 
@@ -342,9 +343,14 @@ def fit_accelerometer(
 
 
 def identify(
-    measures: VehicleMeasures, drives: Sequence[LabelledDrive], executor: Executor
+    measures: VehicleMeasures,
+    drives: Sequence[LabelledDrive],
+    executor: Executor,
+    start: "IdentifiedVehicle | None" = None,
 ) -> IdentifiedVehicle:
     """Fit a vehicle, its sensors and the filter's noise to drives.
+
+    The search begins at `start`, a fit to similar drives, else at both `STARTS`.
 
     All drives have the same weight, large errors count less than their squares (pseudo-Huber), and
     a prior is a further residual of each parameter: it decides what the drives do not determine.
@@ -356,8 +362,8 @@ def identify(
     unused = "steering_ratio" if has_road_wheels else "noise.sensors.steer_gain"
     names = [name for name in (*PRIOR_STD, *NOISE_NAMES) if name != unused]
     sensors = fit_accelerometer(drives, measures.vehicle())
-    start = FitParameters(noise=ekf.EkfNoise(sensors=sensors or ekf.SensorErrors()))
-    coordinates = Coordinates(start, names)
+    usual = FitParameters(noise=ekf.EkfNoise(sensors=sensors or ekf.SensorErrors()))
+    coordinates = Coordinates(usual, names)
     prior_std = np.array([PRIOR_STD.get(name, NOISE_PRIOR_STD) for name in names])
 
     def estimate(fit: FitParameters, drive: LabelledDrive) -> FloatArray:
@@ -373,11 +379,15 @@ def identify(
             blocks.append(np.copysign(size, error) / math.sqrt(max(len(error), 1)))
         return np.concatenate(blocks)
 
-    starts = [
-        coordinates.point([values.get(name, value_of(start, name)) for name in names])
-        for values in STARTS
-    ]
-    optimum = minimize_from(residuals, coordinates, starts)
+    if start is not None and start.fit is not None:
+        begin = coordinates.point([value_of(start.fit, name) for name in names])
+        optimum = minimize_from(residuals, coordinates, [begin])
+    else:
+        starts = [
+            coordinates.point([values.get(name, value_of(usual, name)) for name in names])
+            for values in STARTS
+        ]
+        optimum = minimize_from(residuals, coordinates, starts)
     fit = coordinates.parameters(optimum.x)
     covariance = np.linalg.inv(optimum.jacobian.T @ optimum.jacobian)
     std_ratio = np.sqrt(np.diag(covariance)) * PRIOR_WEIGHT_RAD / prior_std
@@ -394,6 +404,7 @@ def identify(
         fit.noise,
         rmse_rad(partial(estimate, fit), drives, executor),
         drives=len(drives),
+        fit=fit,
         at_bounds=tuple(names[index] for index in np.flatnonzero(at_bounds)),
         not_identifiable=tuple(unknown),
     )
