@@ -77,9 +77,10 @@ def digest_counts(
         if column.null_count == len(column):
             continue
         # No count is -32768. Arrow's own conversion would load pandas.
-        values = pl.Series(column).fill_null(-COUNT_MAX - 1).to_numpy()
+        present = pl.Series(column)
+        values = (present.fill_null(-COUNT_MAX - 1) if column.null_count else present).to_numpy()
         digest.update(f"\n{name}\n".encode())
-        digest.update(values.tobytes())
+        digest.update(np.ascontiguousarray(values).data)
         changes += int(np.count_nonzero(values[1:] != values[:-1]))
     if changes < EVENTFUL_CHANGES:
         digest.update(f"\n{vehicle_id}\n{day}\n".encode())

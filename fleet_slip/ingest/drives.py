@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -22,7 +23,7 @@ MAX_DRIVE_S = 2**19 * STEP_S
 _GROUP = np.dtype(
     [
         ("last", "f8"),  # time of the last row
-        ("kept", "f8"),  # of the last one that is not isolated
+        ("time", "f8"),  # of the last one that is not isolated
         ("latest", "f8"),  # the latest time of the stretch
         ("start", "f8"),  # its first time
         ("segment", "i8"),  # number of the open segment
@@ -30,6 +31,17 @@ _GROUP = np.dtype(
     ]
 )
 _UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
+
+
+class CutRows(NamedTuple):
+    """The rows of a block with their `segment`, the misplaced rows, and the segments that ended.
+
+    The order of ended segments does not depend on blocks.
+    """
+
+    rows: pl.DataFrame
+    refused: pl.DataFrame
+    ended: list[int]
 
 
 class DriveCutter:
@@ -50,31 +62,29 @@ class DriveCutter:
         self._segments = 0
         self._state = np.empty(0, dtype=_GROUP)
         """The state of each group."""
-        self.ended: list[int] = []
-        """Segments that the last block ended, in an order that does not depend on blocks."""
 
-    def cut(self, rows: pl.DataFrame, *, last: bool) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return the rows of a block with their `segment`, together; and the misplaced ones."""
-        self.ended = []
+    def cut(self, rows: pl.DataFrame, *, last: bool) -> CutRows:
+        """Return the rows of a block, those of a segment together; `last` ends all segments."""
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
         if rows.is_empty():
-            return rows.with_columns(pl.lit(0, pl.Int64).alias("segment")), no_rows()
+            nothing = rows.with_columns(pl.lit(0, pl.Int64).alias("segment"))
+            return CutRows(nothing, no_rows(), self._open_segments() if last else [])
         if several:
             rows = rows.sort("group", "time", maintain_order=True)
         elif not rows["group"].is_sorted():
             rows = rows.sort("group", maintain_order=True)
-        more = int(rows["group"][-1]) + 1 - self._state.size
-        if more > 0:
-            self._state = np.concatenate([self._state, np.full(more, _UNSEEN, dtype=_GROUP)])
-        alone, waiting, known_at = self._isolated(rows, last=last)
+        new_groups = int(rows["group"][-1]) + 1 - self._state.size
+        if new_groups > 0:
+            self._state = np.concatenate([self._state, np.full(new_groups, _UNSEEN, dtype=_GROUP)])
+        alone, waiting, decided_at = self._isolated(rows, last=last)
         self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
         refused = [describe_refused(rows, alone, "isolated")]
         unsettled = alone | waiting
         if unsettled.any():
-            rows, known_at = rows.filter(pl.Series(~unsettled)), known_at[~unsettled]
-        rows, before = self._number_segments(rows, known_at)
+            rows, decided_at = rows.filter(pl.Series(~unsettled)), decided_at[~unsettled]
+        rows, before, ended = self._number_segments(rows, decided_at)
         if not several:
             time = rows["time"].to_numpy()
             twice, backwards = time == before, time < before
@@ -84,18 +94,17 @@ class DriveCutter:
             ]
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
-        return rows, pl.concat(refused)
+        return CutRows(rows, pl.concat(refused), ended + (self._open_segments() if last else []))
 
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
     ) -> tuple[BoolArray, BoolArray, FloatArray]:
-        """Return which rows are isolated, which wait for the next, and which row shows that."""
+        """Return which rows are isolated, which wait for the next, and which row decides that."""
         group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
         first, end = _ends(group)
-        before = np.concatenate([[np.nan], time[:-1]])
-        before[first] = self._state["last"][group[first]]
+        before = self._previous("last", time, group, first)
         is_far = ~(np.abs(time - before) <= self._gap_s)
-        far_next = np.concatenate([is_far[1:], [True]])
+        far_next = np.append(is_far[1:], True)
         far_next[end] = True
         alone = is_far & far_next
         waiting = np.zeros(alone.size, dtype=np.bool_)
@@ -105,55 +114,66 @@ class DriveCutter:
         self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
         # Rows of several time bases can be ordered by their times only.
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
-        known_at = np.concatenate([number[1:], [np.inf]])
-        known_at[end] = np.inf
-        return alone, waiting, np.where(is_far, known_at, number)
+        decided_at = np.append(number[1:], np.inf)
+        decided_at[end] = np.inf
+        return alone, waiting, np.where(is_far, decided_at, number)
 
     def _number_segments(
-        self, rows: pl.DataFrame, known_at: FloatArray
-    ) -> tuple[pl.DataFrame, FloatArray]:
-        """Return the rows with their segments, and the latest earlier time of their stretch.
+        self, rows: pl.DataFrame, decided_at: FloatArray
+    ) -> tuple[pl.DataFrame, FloatArray, list[int]]:
+        """Return the rows with segments, the latest earlier time of their stretch, ended segments.
 
-        Lists ended segments in the order in which their end is detected. Example for one group,
+        Ended segments are in the order in which their end is detected. Example for one group,
         with `split_gap_s` = 1 and `longest_s` = 2: times 0, 1, 2, 3, 9 are in the segments
         0, 0, 1, 1, 2, since the first one ends after 2 s, and 9 follows a gap.
         """
-        group, time, seen = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
+        group, time, state = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
         first, end = _ends(group)
         is_first = np.zeros(time.size, dtype=np.bool_)
         is_first[first] = True
-        before = np.concatenate([[np.nan], time[:-1]])
-        before[first] = seen["kept"][group[first]]
-        begins = ~(np.abs(time - before) <= self._gap_s)
-        before[first] = seen["latest"][group[first]]
+
+        # 1. A stretch begins after a gap; its start, and the latest time in it up to each row.
+        step_s = time - self._previous("time", time, group, first)
+        begins = ~(np.abs(step_s) <= self._gap_s)
+        before = self._previous("latest", time, group, first)
         before[begins] = np.nan
         latest = time
         if not (begins | (time > before)).all():
             latest, before = _latest(time, before, begins | is_first)
         heads = np.flatnonzero(begins | is_first)
-        start_of = np.where(begins[heads], time[heads], seen["start"][group[heads]])
-        start = np.repeat(start_of, np.diff(np.append(heads, time.size)))
-        piece = ((latest - start) // self._longest_s).astype(np.int64)
-        piece_before = np.concatenate([[-1], piece[:-1]])
-        piece_before[first] = seen["piece"][group[first]]
-        begins |= piece != piece_before
-        heads = np.flatnonzero(begins | is_first)
-        fresh, open_segment = begins[heads], seen["segment"][group[heads]]
-        segment_of = np.where(fresh, self._segments + np.cumsum(fresh) - 1, open_segment)
-        self._segments += int(fresh.sum())
-        before_head = np.where(
-            is_first[heads], open_segment, np.concatenate([[-1], segment_of[:-1]])
-        )
-        over = fresh & (before_head >= 0)
-        order = np.lexsort((group[heads[over]], known_at[heads[over]]))
-        self.ended += before_head[over][order].tolist()
-        segments = np.repeat(segment_of, np.diff(np.append(heads, time.size)))
-        now = {"kept": time, "latest": latest, "start": start, "segment": segments, "piece": piece}
-        for name, values in now.items():
-            seen[name][group[end]] = values[end]
-        return rows.with_columns(pl.Series("segment", segments)), before
+        start_s = np.where(begins[heads], time[heads], state["start"][group[heads]])
+        start_s = np.repeat(start_s, np.diff(heads, append=time.size))
 
-    def open_segments(self) -> list[int]:
+        # 2. A long stretch has several segments, which are numbered in the order of rows.
+        piece = ((latest - start_s) // self._longest_s).astype(np.int64)
+        begins |= piece != self._previous("piece", piece, group, first)
+        heads = np.flatnonzero(begins | is_first)
+        is_new, is_first_head = begins[heads], is_first[heads]
+        open_segment = state["segment"][group[heads]]
+        segment = np.where(is_new, self._segments + np.cumsum(is_new) - 1, open_segment)
+        self._segments += int(is_new.sum())
+
+        # 3. A new segment of a group ends the one before.
+        before_head = np.where(is_first_head, open_segment, np.roll(segment, 1))
+        ends = is_new & (before_head >= 0)
+        order = np.lexsort((group[heads[ends]], decided_at[heads[ends]]))
+        ended: list[int] = before_head[ends][order].tolist()
+
+        segment = np.repeat(segment, np.diff(heads, append=time.size))
+        now = {"time": time, "latest": latest, "start": start_s, "segment": segment, "piece": piece}
+        for name, values in now.items():
+            state[name][group[end]] = values[end]
+        return rows.with_columns(pl.Series("segment", segment)), before, ended
+
+    def _previous(
+        self, name: str, values: FloatArray | IntArray, group: IntArray, first: IntArray
+    ) -> FloatArray:
+        """Return the value at the row before in each group; for its first row, of the state."""
+        before = np.roll(values, 1).astype(np.float64)
+        before[first] = self._state[name][group[first]]
+        return before
+
+    def _open_segments(self) -> list[int]:
         """Return the segments that no block has ended, by group."""
         return [int(segment) for segment in self._state["segment"] if segment >= 0]
 
@@ -176,7 +196,7 @@ def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
         nothing = np.empty(0, dtype=np.int64)
         return nothing, nothing
     changes = np.flatnonzero(np.diff(group)) + 1
-    return np.concatenate([[0], changes]), np.concatenate([changes - 1, [group.size - 1]])
+    return np.append(0, changes), np.append(changes - 1, group.size - 1)
 
 
 def _latest(
@@ -186,16 +206,18 @@ def _latest(
     seeded = np.where(heads & ~np.isnan(before), np.maximum(time, before), time)
     frame = pl.DataFrame({"time": seeded, "stretch": np.cumsum(heads)})
     latest = frame.select(pl.col("time").cum_max().over("stretch"))["time"].to_numpy()
-    shifted = np.concatenate([[np.nan], latest[:-1]])
-    return latest, np.where(heads, before, shifted)
+    return latest, np.where(heads, before, np.roll(latest, 1))
 
 
 # The rows of open drives, few of them in memory.
 
-MAX_OPEN_VALUES = 2**21
-"""Maximum values of open drives in memory; the others are in a temporary file."""
-MAX_SEGMENTS_AT_ONCE = 64
-"""Segments taken out of blocks at once: thousands of small frames take much memory."""
+MAX_OPEN_VALUES = 2**23
+"""Maximum values of open drives in memory, 64 MiB; the others are in a temporary file.
+
+A drive of 87 minutes at 100 Hz with 14 signals fits: drives that stand together are not spilled.
+"""
+MANY_SEGMENTS = 64
+"""Segments that end at once, for which blocks are joined: each is one piece then."""
 MAX_SINGLE_PIECES, BUNDLED_GROUPS = 512, 128
 """Maximum number of segments that are spilled one by one; beyond it groups are bundled."""
 
@@ -253,7 +275,7 @@ class OpenDrives:
     def __init__(self) -> None:
         """Begin without rows."""
         self._blocks: list[pl.DataFrame] = []
-        self._in_memory = 0
+        self._values = 0
         self._spool = Spool()
         self._bundled = False
         self._ended: list[int] = []
@@ -261,10 +283,10 @@ class OpenDrives:
         """The group of each segment with spilled rows."""
 
     def add(self, rows: pl.DataFrame) -> None:
-        """Keep rows with their segment."""
+        """Keep rows with their segment, those of a segment together."""
         if rows.height:
             self._blocks.append(rows)
-            self._in_memory += rows.height * rows.width
+            self._values += rows.height * rows.width
 
     def take(self, segments: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
         """Yield the rows of segments and release them; `last` for the end of the file."""
@@ -276,26 +298,29 @@ class OpenDrives:
             yield from self._unbundled()
 
     def _take(self, segments: Sequence[int]) -> Iterator[DriveRows]:
-        for start in range(0, len(segments), MAX_SEGMENTS_AT_ONCE):
-            chunk = segments[start : start + MAX_SEGMENTS_AT_ONCE]
-            rows_in_memory = self._release(chunk)
-            for segment in chunk:
-                self._group_of.pop(segment, None)
-                spilled = map(pl.read_ipc_stream, self._spool.take(segment))
-                if pieces := [*spilled, *rows_in_memory[segment]]:
-                    yield DriveRows(_by_base(pieces))
+        runs = self._release(segments) if self._blocks else {}
+        for segment in segments:
+            self._group_of.pop(segment, None)
+            spilled = map(pl.read_ipc_stream, self._spool.take(segment))
+            in_memory = (rows.slice(head, height) for rows, head, height in runs.pop(segment, ()))
+            if pieces := [*spilled, *in_memory]:
+                yield DriveRows(_by_base(pieces))
 
-    def _release(self, segments: Sequence[int]) -> dict[int, list[pl.DataFrame]]:
-        """Take the rows of segments out of memory."""
-        rows_of_segment = defaultdict[int, list[pl.DataFrame]](list)
-        is_taken = pl.col("segment").is_in(segments)
-        for _ in range(len(self._blocks)):
-            rows = self._blocks.pop(0)
-            for run in rows.filter(is_taken).partition_by("segment", maintain_order=True):
-                rows_of_segment[run["segment"][0]].append(run)
-            self._in_memory -= rows.height * rows.width
-            self.add(rows.filter(~is_taken))
-        return rows_of_segment
+    def _release(self, segments: Sequence[int]) -> dict[int, list[tuple[pl.DataFrame, int, int]]]:
+        """Take segments out of memory; return the place of each one's rows in blocks."""
+        if len(segments) > MANY_SEGMENTS:
+            self._blocks = [pl.concat(self._blocks).sort("segment", maintain_order=True)]
+        runs = defaultdict[int, list[tuple[pl.DataFrame, int, int]]](list)
+        blocks, self._blocks, self._values = self._blocks, [], 0
+        for rows in blocks:
+            number = rows["segment"].to_numpy()
+            first, end = _ends(number)
+            height, is_taken = end + 1 - first, np.isin(number[first], segments)
+            for head, n in zip(first[is_taken], height[is_taken], strict=True):
+                runs[int(number[head])].append((rows, int(head), int(n)))
+            is_open = pl.Series(np.repeat(~is_taken, height))
+            self.add(rows.filter(is_open) if is_taken.any() else rows)
+        return runs
 
     def _unbundled(self) -> Iterator[DriveRows]:
         """Yield the rows of all segments, bundle by bundle, and in each as the segments ended."""
@@ -306,15 +331,15 @@ class OpenDrives:
         for bundle, segments in sorted(bundles.items()):
             for piece in self._spool.take(("bundle", bundle)):
                 self.add(pl.read_ipc_stream(piece))
-                if self._in_memory > MAX_OPEN_VALUES:
+                if self._values > MAX_OPEN_VALUES:
                     self._spill_rows(bundled=False)
-            if self._blocks:  # hundreds of small frames a segment would take much memory
-                self._blocks = [pl.concat(self._blocks, rechunk=True)]
+            if self._blocks:  # a piece has a segment in several places
+                self._blocks = [pl.concat(self._blocks).sort("segment", maintain_order=True)]
             yield from self._take(segments)
 
     def spill(self) -> None:
         """Spill the rows if they are many. Raises `InputError` if the disk is full."""
-        if self._in_memory > MAX_OPEN_VALUES:
+        if self._values > MAX_OPEN_VALUES:
             segments = pl.concat([rows["segment"] for rows in self._blocks]).n_unique()
             self._bundled |= segments > MAX_SINGLE_PIECES
             self._spill_rows(bundled=self._bundled)
@@ -324,7 +349,7 @@ class OpenDrives:
         if not self._blocks:
             return
         rows = pl.concat(self._blocks)
-        self._blocks, self._in_memory = [], 0
+        self._blocks, self._values = [], 0
         heads = rows.select("segment", "group").unique("segment")
         self._group_of.update(zip(heads["segment"], heads["group"], strict=True))
         key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("segment")).alias("key")

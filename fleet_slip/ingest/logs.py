@@ -20,7 +20,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.arrays import IntArray
 from fleet_slip.base import Record, pluralize
 from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.catalog.signals import SignalCatalog
@@ -582,7 +581,7 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
-    drive_of_row = np.repeat(np.arange(len(drives)), [drive.ticks.size for drive in drives])
+    drive_of_row = as_arrow(np.repeat(np.arange(len(drives)), [d.ticks.size for d in drives]))
     columns, signal_catalog = {}, mapping.signal_catalog
     for column in signal_catalog.log_schema:
         if column.name == "tick":
@@ -593,21 +592,21 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
         elif column.name in signal_catalog.extras:
             continue
         elif column.name in signal_catalog.signals:
-            columns[column.name] = pa.nulls(drive_of_row.size, column.type)
+            columns[column.name] = pa.nulls(len(drive_of_row), column.type)
         else:
             values = [drive.metadata.get(column.name) for drive in drives]
-            columns[column.name] = _gather(values, drive_of_row, column.type)
+            columns[column.name] = _column(values, column.type).take(drive_of_row)
     return pa.table(columns)
 
 
-def _gather(values: Sequence[Any], at: IntArray, kind: pa.DataType) -> pa.Array:
-    """Return values at positions. Not by `pa.array`, which imports pandas if installed."""
+def _column(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """Return values as a column. Not by `pa.array`, which imports pandas if installed."""
     if pa.types.is_string(kind):
         texts = list(dict.fromkeys(text for text in values if text is not None))
         codes = [None if text is None else texts.index(text) for text in values]
         named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
-        return pa.DictionaryArray.from_arrays(_gather(codes, at, pa.int32()), named, safe=False)
-    return pl.Series(values, strict=False).gather(at).to_arrow().cast(kind)
+        return pa.DictionaryArray.from_arrays(_column(codes, pa.int32()), named, safe=False)
+    return pl.Series(values, strict=False).to_arrow().cast(kind)
 
 
 # Commits: rejected rows first, then drives.

@@ -154,10 +154,9 @@ class MeasuredStream:
     ) -> Iterator[MeasuredDrive]:
         """Yield the drives that ended in a block, and keep its rejected rows."""
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
-        rows, misplaced = cutter.cut(block.rows, last=last)
+        rows, misplaced, segments = cutter.cut(block.rows, last=last)
         self._open.add(rows)
         self._refuse(pl.concat([block.refused, misplaced]))
-        segments = [*cutter.ended, *(cutter.open_segments() if last else ())]
         for ended in self._open.take(segments, last=last):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
                 self._refuse(describe_refused(ended.frame, None, "too_short"))
@@ -360,13 +359,11 @@ def _reach(blocks: list[CheckedBlock]) -> int:
 
 def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
     """Return the first rows, cut into segments, for `_usual_intervals`."""
-    rows = blocks[0].rows if len(blocks) == 1 else pl.concat([block.rows for block in blocks])
-    several = "base" in rows.columns
-    if several:
-        rows = rows.head(until)
-    elif until < blocks[-1].read:
-        rows = rows.filter(pl.col("row") <= until)
-    return DriveCutter(mapping.time).cut(rows, last=several)[0]
+    several = "base" in blocks[0].rows.columns
+    names = ["row", "group", "time", *(["base"] if several else [])]
+    rows = pl.concat([block.rows.select(names) for block in blocks])
+    rows = rows.head(until) if several else rows.filter(pl.col("row") <= until)
+    return DriveCutter(mapping.time).cut(rows, last=several).rows
 
 
 # Faults of a log as a whole: many rejected rows, and several cars, where one is under way

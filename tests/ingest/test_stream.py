@@ -60,17 +60,17 @@ def cut(
     parts: dict[int, list[int]] = {}
     refused, order, at = [], [], 0
     for size in [*sizes, len(rows)]:
-        found, bad = cutter.cut(frame.slice(at, size), last=False)
+        found, bad, ended = cutter.cut(frame.slice(at, size), last=False)
         at += size
         for part, row in found.select("segment", "row").iter_rows():
             parts.setdefault(part, []).append(row)
         refused += list(bad.select("row", "reason").iter_rows())
-        order += cutter.ended
-    found, bad = cutter.cut(frame.clear(), last=True)
+        order += ended
+    found, bad, ended = cutter.cut(frame.clear(), last=True)
     for part, row in found.select("segment", "row").iter_rows():
         parts.setdefault(part, []).append(row)
     refused += list(bad.select("row", "reason").iter_rows())
-    order += [*cutter.ended, *cutter.open_segments()]
+    order += ended
     return [parts[part] for part in order if part in parts], sorted(refused)
 
 
@@ -203,7 +203,7 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
     monkeypatch.setattr(drives, "MAX_OPEN_VALUES", 8 * rows)
-    monkeypatch.setattr(drives, "MAX_SEGMENTS_AT_ONCE", parts)
+    monkeypatch.setattr(drives, "MANY_SEGMENTS", parts)
     monkeypatch.setattr(drives, "MAX_SINGLE_PIECES", pieces)
     monkeypatch.setattr(drives, "BUNDLED_GROUPS", groups)
     spilled = read_columns(tmp_path, columns, mapping)

@@ -144,7 +144,7 @@ def read_in(
         patched.enter_context(mock.patch.object(batches, "open_source", opened))
         patched.enter_context(mock.patch.object(batches, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(batches, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(drives, "MAX_SEGMENTS_AT_ONCE", 1 + batch % 3))
+        patched.enter_context(mock.patch.object(drives, "MANY_SEGMENTS", 1 + batch % 3))
         patched.enter_context(mock.patch.object(drives, "MAX_OPEN_VALUES", 40 * window))
         patched.enter_context(mock.patch.object(drives, "MAX_SINGLE_PIECES", batch % 5))
         patched.enter_context(mock.patch.object(drives, "BUNDLED_GROUPS", 1 + batch % 2))
