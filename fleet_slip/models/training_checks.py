@@ -27,6 +27,9 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 MAX_DRIVES = 5
 """Drives to inspect, each of a different vehicle where possible."""
+WRONG_MAPPING = ("late", "magnitude", "reversed", "scaled", "swapped")
+"""Kinds of faults of the mapping: in most drives of a first champion nothing shows what is right,
+and later models may use the signal."""
 MIN_NEW_DRIVES = 3
 """Fewest new drives to judge beside a champion: one alone may be odd."""
 
@@ -39,9 +42,9 @@ def require_sound_drives(
 ) -> None:
     """Raise `RefusedError` if most of the inspected measured drives contradict the motion of cars.
 
-    Only faults of the label and of signals in columns of the model count. Beside a champion only
-    drives that it was not trained on are inspected; a model of more columns than the champion needs
-    as much data as a first one.
+    Faults of the label and of signals in columns of the model count. For a first champion wrong
+    mappings of all other signals do, too. Beside a champion only drives that it was not trained on
+    are inspected; a model of more columns than the champion needs as much data as a first one.
     """
 
     def select_new(drives: Sequence[str]) -> Sequence[bool]:
@@ -64,9 +67,10 @@ def require_sound_drives(
     used = {manifest.label.signal}
     for term in manifest.terms:
         used |= set(term.definition.signals) if term.definition else {term.signal}
-    for (_, signals), faults in inspection.by_fault().items():
+    for (kind, signals), faults in inspection.by_fault().items():
+        counts = not used.isdisjoint(signals) or (kind in WRONG_MAPPING and not has_champion)
         # Drives of a champion have no faults, so that half of the new ones are enough beside it.
-        if used.isdisjoint(signals) or 2 * len(faults) + has_champion <= inspected:
+        if not counts or 2 * len(faults) + has_champion <= inspected:
             continue
         raise RefusedError(
             f"{manifest.name} was not published: {len(faults)} of {inspected} inspected drives "

@@ -8,9 +8,11 @@ import polars as pl
 from fleet_slip.errors import AlarmError, RefusedError
 from fleet_slip.quality.drive_signals import WHEELS
 from tests.support.commands import run_on
+from tests.support.model_lists import write_list
 from tests.support.textbook_car import Car, winding_car
 
-UNITS = {"ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s", **dict.fromkeys(WHEELS, "rad/s")}
+UNITS = {"ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s", "vx": "m/s"}
+UNITS |= dict.fromkeys(WHEELS, "rad/s")
 HEAD = """name = "car"
 time = { column = "t", unit = "s" }
 drive = { day = 2024-05-31, vehicle_id = "car", vehicle_model = "sedan" }
@@ -79,6 +81,23 @@ def test_a_label_that_is_late_in_all_drives_leaves_none_out_and_is_not_published
     done = run_on(root, "publish", "m", "--models", "table1")
     assert done.exit_code == RefusedError.exit_code
     assert "Add 1.00 to its delay_s" in done.stderr
+
+
+def test_a_first_champion_is_refused_for_a_wrong_unit_of_signals_that_it_does_not_use(
+    tmp_path: Path,
+) -> None:
+    cars = drives(4)
+    for car in cars:
+        car["vx"] = 0.31 * sum(car[name] for name in WHEELS) / 4
+        car |= {name: car[name] / 9.55 for name in WHEELS}
+    ingest, root = write_drives(tmp_path, *cars), tmp_path / "root"
+    run_on(root, *ingest)
+    run_on(root, "gram")
+    models = write_list(tmp_path / "own.toml", "ay,yaw_rate,steering_wheel")
+    done = run_on(root, "publish", "m", "--models", models)
+    assert done.exit_code == RefusedError.exit_code
+    assert "scaled wheel_fl, wheel_fr, wheel_rl, wheel_rr? vx is 9.55 times" in done.stderr
+    assert run_on(root, "publish", "m", "--models", models, "--force").exit_code == 0
 
 
 def test_a_drive_with_two_sets_of_signals_is_one_drive(tmp_path: Path) -> None:
