@@ -156,6 +156,11 @@ class MeanMoments:
         matrix[1:, 1:] = table @ table.T / table.shape[1]
         return cls(tuple(values), matrix[None])
 
+    def in_si(self, signals: SignalCatalog) -> "MeanMoments":
+        """Return the moments of the values in SI units."""
+        scales = np.array([1.0, *(float(signals[name].scale) for name in self.signals)])
+        return MeanMoments(self.signals, self.matrices * np.outer(scales, scales))
+
     def __len__(self) -> int:
         """Return the number of drives."""
         return len(self.matrices)

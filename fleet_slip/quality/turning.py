@@ -14,7 +14,13 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
-from fleet_slip.quality.drive_signals import BATCH, DriveBatches, MeanMoments
+from fleet_slip.quality.drive_signals import (
+    BATCH,
+    RADIUS_M,
+    TRACK_M,
+    DriveBatches,
+    MeanMoments,
+)
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
@@ -33,6 +39,9 @@ WITNESSES: Mapping[str, Mapping[str, int]] = {
 AXLES = ("front wheels", "rear wheels")
 MIN_WITNESSES = 3
 """In a Gram row, which includes rows of a car that stands or drives backwards."""
+MIN_WHEEL_DIFFERENCE = 0.5
+"""Of the track width times the yaw rate, in the mean: a smaller difference of two wheels has no
+sign. It is of one speed that is logged in place of four, at different delays."""
 MIN_LOADING = 0.2
 """A loading nearer to zero has no clear sign."""
 ROUNDING = 1e-12
@@ -54,8 +63,9 @@ def check_moments(
 ) -> dict[int, Fault]:
     """Return the drives whose signals contradict one another or stand still, with the fault."""
     faults: dict[int, Fault] = {}
-    for first, moments in zip(count(0, BATCH), DriveBatches.from_table(table)):
-        in_batch = find_swapped_steering(moments, signals)
+    for first, batch in zip(count(0, BATCH), DriveBatches.from_table(table)):
+        moments = batch.in_si(signals)
+        in_batch = find_swapped_steering(moments)
         if len(_witnesses(moments)) >= MIN_WITNESSES:
             turning = find_reversed_or_swapped(moments, min_correlation)
             in_batch |= {drive: _join(several) for drive, several in turning.items()}
@@ -179,7 +189,7 @@ def find_swapped_axes(moments: MeanMoments) -> dict[int, Fault]:
     }
 
 
-def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[int, Fault]:
+def find_swapped_steering(moments: MeanMoments) -> dict[int, Fault]:
     """Return the drives in which the outer front wheel steers more than the inner one.
 
     With Ackermann's geometry cot(right) - cot(left) = track / wheelbase in a left turn, so that
@@ -190,10 +200,11 @@ def find_swapped_steering(moments: MeanMoments, signals: SignalCatalog) -> dict[
     if not {fl, fr} <= set(moments.signals):
         return {}
     i, j = moments.position(fl), moments.position(fr)
-    m, scale = moments.matrices, float(signals[fl].scale)
-    product = m[:, i, j] * scale**2
-    difference = (m[:, 0, i] - m[:, 0, j]) * scale
-    ratio = np.divide(difference, product, out=np.zeros_like(product), where=product > 0)
+    m = moments.matrices
+    product = m[:, i, j]
+    ratio = np.divide(
+        m[:, 0, i] - m[:, 0, j], product, out=np.zeros_like(product), where=product > 0
+    )
     low, high = -CHECKS["left and right road wheel"].low, MAX_STEERING_RATIO
     if ((np.abs(ratio) > low) & (np.abs(ratio) < high)).mean() < UNBIASED_STEERING:
         return {}
@@ -237,6 +248,11 @@ def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
     summed = np.diagonal(of_signals, axis1=1, axis2=2) @ (weights**2).T
     std = np.sqrt(np.where(variances > ROUNDING * summed, variances, 0))
     product = std[:, :, None] * std[:, None, :]
-    return np.asarray(
-        np.divide(covariances, product, out=np.zeros_like(covariances), where=product > 0)
-    )
+    correlations = np.divide(covariances, product, out=np.zeros_like(product), where=product > 0)
+    if "yaw_rate" in names:
+        at = names.index("yaw_rate")
+        expected = MIN_WHEEL_DIFFERENCE * TRACK_M / RADIUS_M * variances[:, at]
+        for i in (i for i, name in enumerate(names) if name in AXLES):
+            is_equal = np.abs(covariances[:, i, at]) < expected
+            correlations[is_equal, i] = correlations[is_equal, :, i] = 0.0
+    return np.asarray(correlations)
