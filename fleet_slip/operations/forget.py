@@ -301,6 +301,8 @@ class Retention(Config):
 
     drives_days: int = Field(ge=1, le=36_500)
     replaced_files_hours: int = Field(ge=1, le=RETENTION_HOURS)
+    max_days_without_drives: int = Field(default=31, ge=1)
+    """Days between the latest drive and the clock, beyond which the clock may be wrong."""
 
 
 @dataclass(frozen=True)
@@ -338,7 +340,8 @@ def retain(
 ) -> RetentionReport:
     """Erase the drives that exceed the retention, then vacuum; `progress` counts files.
 
-    Raises `RefusedError` if no drive would remain, as with a wrong clock.
+    Raises `RefusedError` if no drive would remain, or if drives would be erased by a clock that is
+    further from the latest drive than plausible: it may be ahead.
     """
     warehouse.require()
     try:
@@ -347,11 +350,19 @@ def retain(
         raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
     days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
     for file in filter(is_onboard_file, warehouse.grams.snapshot().files):
-        days.append(pc.max(warehouse.grams.read(file.path, ["day"])["day"]).as_py())
+        days += pc.min_max(warehouse.grams.read(file.path, ["day"])["day"]).as_py().values()
     if days and max(days) < before:
         raise RefusedError(
             f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
             "be forgotten, which leaves none. Check the clock, or drives_days of the retention."
+        )
+    idle_days = (today - max(days, default=today)).days
+    if idle_days > retention.max_days_without_drives and min(days) < before:
+        raise RefusedError(
+            f"{warehouse.root}: its latest drive is of {max(days)}, {idle_days} days before the "
+            f"date of the clock, {today}; plausible are {retention.max_days_without_drives}. A "
+            f"clock that is ahead would erase too many drives, so none before {before} was erased. "
+            "Check the clock. If it is right, raise max_days_without_drives in the retention file."
         )
     forgotten = forget(warehouse, ErasureSubject("before", before.isoformat()), progress=progress)
     vacuumed = vacuum(warehouse, retention.replaced_files_hours)

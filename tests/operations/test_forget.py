@@ -231,6 +231,9 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
         land(warehouse, f"m{month}", drive("alfa", month, day), day=day)
     update_grams(warehouse)
     retention = Retention(drives_days=45, replaced_files_hours=24)
+    ahead = Retention(drives_days=60, replaced_files_hours=24, max_days_without_drives=7)
+    with pytest.raises(RefusedError, match="10 days before the date of the clock, 2024-03-11"):
+        retain(warehouse, ahead, date(2024, 3, 11))
     with pytest.raises(RefusedError, match="Check the clock"):
         retain(warehouse, retention, date(2034, 3, 2))
     report = retain(warehouse, retention, date(2024, 3, 2))
