@@ -173,9 +173,8 @@ class Trained(Answer):
         """Render the result of each step."""
         for gram in self.grams:
             name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set}"
-            rows, new = pluralize(gram.rows_read, "row"), pluralize(gram.gram_rows, "Gram row")
             if gram.changed or gram in self.grams[:2]:
-                yield Remark(f"{name}: {rows} read, {new}")
+                yield Remark(f"{name}: {pluralize(gram.rows_read, 'row')} read, {gram.total}")
         if self.selection:
             yield from self.selection.parts(everything)
         if self.publication:

@@ -59,20 +59,24 @@ class GramReport(Answer):
     """Gram rows from cars that the logs of the same drives replaced."""
 
     @property
+    def total(self) -> str:
+        """Return the number of Gram rows in the table, with what it counts."""
+        return f"{pluralize(self.gram_rows, 'Gram row')} of all drives and feature sets"
+
+    @property
     def changed(self) -> bool:
         """Return True if Gram rows were added or dropped."""
         return bool(self.files_read or self.files_dropped)
 
     def parts(self) -> Iterator[Part]:
         """Return remarks on the files read and the Gram rows."""
-        rows = f"{pluralize(self.gram_rows, 'Gram row')} in all"
         if not self.changed:
-            yield Remark(f"gram {self.feature_set}: nothing to do, {rows} are up to date")
+            yield Remark(f"gram {self.feature_set}: nothing to do, {self.total} are up to date")
             return
         yield Remark(
             f"gram {self.feature_set}: {pluralize(self.files_read, 'new file')}, "
             f"{pluralize(self.rows_read, 'row')} read, "
-            f"{pluralize(self.files_dropped, 'file')} dropped; {rows}"
+            f"{pluralize(self.files_dropped, 'file')} dropped; {self.total}"
         )
         if dropped := self.received_dropped:
             yield Remark(

@@ -271,8 +271,8 @@ def _sizes(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[F
             yield check.fault(*names, ratio=ratio, expected=expected, hint=hint)
 
 
-MAX_BEND_MPS, MIN_BEND_PER_M = 12.0, 0.05
-"""Bends of 20 m and less, at a speed at which the tyres hardly slip."""
+MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05
+"""Bends of 20 m and less, at a speed and yaw rate times speed at which the tyres hardly slip."""
 
 
 def _axles(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Fault]:
@@ -283,6 +283,7 @@ def _axles(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[F
     with np.errstate(divide="ignore", invalid="ignore"):
         tightness, longer = (signals["yaw_rate"] / speed) ** 2, front / rear - 1
     rows = moving & (speed < MAX_BEND_MPS)
+    rows &= np.abs(signals["yaw_rate"] * speed) < MAX_BEND_MPS2
     tightest = np.nanmax(tightness, initial=0, where=rows & np.isfinite(tightness))
     if tightest < MIN_BEND_PER_M**2:
         return

@@ -109,7 +109,7 @@ def find_reversed_or_swapped(
     if len(names) < 2:
         return {}
     lowest = CHECKS["sign of turning"].low if min_correlation is None else -min_correlation
-    correlations = _correlations(moments, names)
+    correlations = _without_equal_wheels(_correlations(moments, names), moments, names)
     if len(names) == 2:
         between = correlations[:, 0, 1]
         both = [signal for name in names for signal in WITNESSES[name]]
@@ -248,11 +248,21 @@ def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
     summed = np.diagonal(of_signals, axis1=1, axis2=2) @ (weights**2).T
     std = np.sqrt(np.where(variances > ROUNDING * summed, variances, 0))
     product = std[:, :, None] * std[:, None, :]
-    correlations = np.divide(covariances, product, out=np.zeros_like(product), where=product > 0)
-    if "yaw_rate" in names:
-        at = names.index("yaw_rate")
-        expected = MIN_WHEEL_DIFFERENCE * TRACK_M / RADIUS_M * variances[:, at]
-        for i in (i for i, name in enumerate(names) if name in AXLES):
-            is_equal = np.abs(covariances[:, i, at]) < expected
-            correlations[is_equal, i] = correlations[is_equal, :, i] = 0.0
-    return np.asarray(correlations)
+    return np.asarray(
+        np.divide(covariances, product, out=np.zeros_like(covariances), where=product > 0)
+    )
+
+
+def _without_equal_wheels(
+    correlations: FloatArray, moments: MeanMoments, names: Sequence[str]
+) -> FloatArray:
+    """Return correlations that are zero of wheels whose difference is too small for the turns."""
+    if "yaw_rate" not in names:
+        return correlations
+    weights, at = _weights(moments, names), names.index("yaw_rate")
+    with_yaw_rate = (weights @ moments.covariances() @ weights.T)[:, at]
+    expected = MIN_WHEEL_DIFFERENCE * TRACK_M / RADIUS_M * with_yaw_rate[:, at]
+    for i in (i for i, name in enumerate(names) if name in AXLES):
+        is_equal = np.abs(with_yaw_rate[:, i]) < expected
+        correlations[is_equal, i] = correlations[is_equal, :, i] = 0.0
+    return correlations
