@@ -37,7 +37,6 @@ from fleet_slip.models.request import (
 )
 from fleet_slip.models.select import Selection
 from fleet_slip.models.training_checks import (
-    require_in_time,
     require_sound_course,
     require_sound_drives,
 )
@@ -199,8 +198,7 @@ def build_challenger(
     manifest = with_straight_intercept(warehouse, manifest_of(selection, name))
     manifest = with_assumptions(warehouse, manifest, selection)
     if manifest.learned_from and not force:
-        delays_s = require_in_time(warehouse, manifest)
-        require_sound_course(warehouse, manifest, delays_s)
+        require_sound_course(warehouse, manifest)
     is_simulated = selection.label_noise_deg is not None  # only campaigns state it
     if not (force or candidate or is_simulated):
         champion = registry.champion(name)

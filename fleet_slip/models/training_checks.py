@@ -9,17 +9,19 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.calibration.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
+from fleet_slip.catalog.course import YAW_RATE
 from fleet_slip.catalog.drive_sources import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.course_relation import relate
+from fleet_slip.quality.course_relation import COLUMNS, relate
 from fleet_slip.quality.plausibility import inspect_drives
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, parse_predicate
@@ -81,13 +83,39 @@ def require_sound_drives(
 
 # A late course looks like a side-slip angle in all figures, and so does a heading.
 
-MAX_DELAY_S, MAX_ERROR_S = 0.01, 0.005
-"""Largest remaining delay, and its standard error: 20 ms cost 0.4 deg on a real car."""
+MAX_ANGLE_ERROR_DEG = 0.15
+"""Error of the label that an unknown or remaining delay may cause: as much as the intercept has
+from the mounting of reference sensors (`calibration.intercept`)."""
+USUAL_YAW_RATE_RAD_S = 0.25
+"""Of cars without moments of the course."""
 MAX_CARS, MAX_FAULTS = 5, 3
 """Cars and faults in a message."""
 
 
-def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float]:
+def require_sound_course(warehouse: Warehouse, manifest: Manifest) -> None:
+    """Raise `RefusedError` unless the course is in time, and that of a car.
+
+    A course that is late by d shifts the label by d times the yaw rate.
+    """
+    predicate = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
+    with GramReader(warehouse) as reader:
+        drives = course_moments(reader, predicate)
+    moments = {car: np.sum(list(of_car.values()), axis=0) for car, of_car in drives.items()}
+    yaw_rates = {car: _yaw_rate_rad_s(of_car) for car, of_car in moments.items()}
+    delays_s = _require_in_time(warehouse, manifest, yaw_rates)
+    _require_course_of_cars(manifest, moments, delays_s)
+
+
+def _yaw_rate_rad_s(moments: FloatArray) -> float:
+    """Return the standard deviation of the yaw rate: that of its changes over the root of two."""
+    at = 1 + COLUMNS.index(YAW_RATE)
+    changes, total, square = moments[0, 0], moments[0, at], moments[at, at]
+    return math.sqrt(max(square / changes - (total / changes) ** 2, 0.0) / 2)
+
+
+def _require_in_time(
+    warehouse: Warehouse, manifest: Manifest, yaw_rates: Mapping[str, float]
+) -> dict[str, float]:
     """Return the remaining delays of courses in Gram rows, in s, by car of the training drives.
 
     Raises `RefusedError` unless all are estimated and corrected, `DataError` without Gram rows.
@@ -105,12 +133,23 @@ def require_in_time(warehouse: Warehouse, manifest: Manifest) -> dict[str, float
         for car, corrected in cars.items()
         if car in delays
     }
-    unsure = [car for car in remaining if (delays[car].uncertainty or math.inf) > MAX_ERROR_S]
-    late = [car for car, delay_s in remaining.items() if abs(delay_s) > MAX_DELAY_S]
+
+    def error_deg(car: str, delay_s: float) -> float:
+        return math.degrees(abs(delay_s) * yaw_rates.get(car, USUAL_YAW_RATE_RAD_S))
+
+    unsure = {
+        car: error_deg(car, math.inf if (error := delays[car].uncertainty) is None else error)
+        for car in remaining
+    }
+    unsure = {car: error for car, error in unsure.items() if error > MAX_ANGLE_ERROR_DEG}
+    late = [c for c, delay_s in remaining.items() if error_deg(c, delay_s) > MAX_ANGLE_ERROR_DEG]
     problems = []
     if unsure:
+        worst = max(unsure.values())
+        effect = "" if math.isinf(worst) else f", an error of the label of {worst:.2f} deg"
         problems.append(
-            f"delays are not estimated to {1000 * MAX_ERROR_S:g} ms ({_named(delays, unsure)})"
+            f"delays are too uncertain ({_named(delays, list(unsure))}{effect}; "
+            f"at most {MAX_ANGLE_ERROR_DEG:g} deg)"
         )
     if unknown := len(cars) - len(remaining):
         cars_text = pluralize(unknown, "car")
@@ -137,16 +176,13 @@ def _named(delays: Mapping[str, ReceiverDelay], cars: Sequence[str]) -> str:
     return f"{shown}, and {len(cars) - MAX_CARS} more" if len(cars) > MAX_CARS else shown
 
 
-def require_sound_course(
-    warehouse: Warehouse, manifest: Manifest, delays_s: Mapping[str, float]
+def _require_course_of_cars(
+    manifest: Manifest, moments: Mapping[str, FloatArray], delays_s: Mapping[str, float]
 ) -> None:
     """Raise `RefusedError` if a course, `delays_s` late in Gram rows, is not that of a car."""
-    predicate = parse_cohort(warehouse.catalog.signals, manifest.trained_on.cohort)
-    with GramReader(warehouse) as reader:
-        cars = course_moments(reader, predicate)
     faults: dict[str, Fault] = {}
-    for car, drives in sorted(cars.items()):
-        relation = relate(np.sum(list(drives.values()), axis=0), delays_s.get(car, 0.0))
+    for car, of_car in sorted(moments.items()):
+        relation = relate(of_car, delays_s.get(car, 0.0))
         if relation and (fault := relation.fault or relation.misplaced):
             faults[car] = fault
     if not faults:
@@ -156,7 +192,7 @@ def require_sound_course(
     more = f", and {len(faults) - MAX_FAULTS} more" if len(faults) > MAX_FAULTS else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
-        f"{pluralize(len(cars), 'car')} is implausible ({named}{more}). {first.remedy} Then "
+        f"{pluralize(len(moments), 'car')} is implausible ({named}{more}). {first.remedy} Then "
         "ingest again, or choose other cars; fleet-slip quality lists the drives. To publish it "
         f"anyway: fleet-slip publish {manifest.name} --label course --force"
     )
