@@ -110,8 +110,11 @@ class FleetCohort:
 
         return self.run_request(SelectionRequest(**options))
 
-    def run_request(self, request: "SelectionRequest") -> "Selection":
-        """Select as `select` does, with the options of a request."""
+    def run_request(self, request: "SelectionRequest", *, nested: bool = False) -> "Selection":
+        """Select as `select` does, with the options of a request.
+
+        With `nested` the choice is repeated without each measured drive, for an error to expect.
+        """
         from fleet_slip.models.request import SelectionPlan
         from fleet_slip.models.select import run_plan
         from fleet_slip.models.stacking import ensure_rows
@@ -120,7 +123,7 @@ class FleetCohort:
         screen = self.examine()
         with screen.explaining():
             plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)
-            selection = run_plan(self.warehouse, plan, screen.cohort)
+            selection = run_plan(self.warehouse, plan, screen.cohort, nested=nested)
         return replace(selection, examined=str(screen))
 
     def diagnose(

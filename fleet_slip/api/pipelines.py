@@ -23,7 +23,13 @@ from fleet_slip.errors import (
 )
 from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.models.registry import CANDIDATE
-from fleet_slip.models.request import COURSE_MODELS, DEFAULT_MODELS, Label, load_model_list
+from fleet_slip.models.request import (
+    COURSE_MODELS,
+    DEFAULT_MODELS,
+    Label,
+    SelectionRequest,
+    load_model_list,
+)
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, NightStep, State
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import step
@@ -104,8 +110,9 @@ class Training:
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, whose drives are checked already."""
+        request = SelectionRequest(models=self.models, tolerance=self.tolerance, label=self.label)
         cohort = fleet.cohort(self.cohort, include_faulty=True)
-        return cohort.select(models=self.models, tolerance=self.tolerance, label=self.label)
+        return cohort.run_request(request, nested=True)
 
     def publish(
         self, fleet: "Fleet", *, replace_marked: bool = False

@@ -142,7 +142,7 @@ def publish(
         say(f"{name}: {recipe.explanation}")
     drives = fleet.cohort(recipe.cohort, include_faulty=include_faulty)
     with step("select"):
-        selection = drives.run_request(recipe.request)
+        selection = drives.run_request(recipe.request, nested=True)
     publish_or_preview = fleet.models.preview if dry_run else fleet.models.publish
     answer: DryRun | Publication = publish_or_preview(
         name, selection, force=force, candidate=candidate

@@ -22,24 +22,16 @@ from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
-from fleet_slip.grams.folding import FOLD_KEYS, Folding
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionPlan, SelectionRequest
-from fleet_slip.models.select import Selection, select_models
+from fleet_slip.models.select import MIN_DRIVES, Selection, deal_trips, select_without
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Segments of drives: a drive and a quarter of its time. All four quarters are a whole drive.
 
 QUARTERS = 4
-MIN_DRIVES = 3
-"""With fewer trips, quarters of their time are held out, not whole drives."""
-
-MAX_FOLDS = 10
-GROUPED_FOLDS = 8
-"""Up to `MAX_FOLDS` trips are held out one by one; more are dealt into this number of groups."""
-
 SPEEDS_MPS = (8.0, 15.0, 25.0)
 LATERAL_MPS2 = (1.0, 2.5, 4.0)
 """Limits between kinds of driving, by mean speed and by root mean square of ay."""
@@ -117,13 +109,13 @@ def _segments(
 
 def folds_of(drives: Sequence[HeldOutDrive]) -> list[Segments]:
     """Return the folds: whole drives, together with all of their trip, or quarters."""
-    trips = list(dict.fromkeys(drive.trip for drive in drives))
-    if len(trips) < MIN_DRIVES:
+    trips = [drive.trip for drive in drives]
+    if len(set(trips)) < MIN_DRIVES:
         return [_segments(drives, [quarter]) for quarter in range(QUARTERS)]
-    count = len(trips) if len(trips) <= MAX_FOLDS else GROUPED_FOLDS
+    groups = deal_trips(trips)
     return [
-        _segments(drive for drive in drives if trips.index(drive.trip) % count == fold)
-        for fold in range(count)
+        _segments(drive for drive, group in zip(drives, groups, strict=True) if group == fold)
+        for fold in range(max(groups) + 1)
     ]
 
 
@@ -199,20 +191,17 @@ class Learner:
         trip, on which `publish` refuses. Quarters never count as drives.
         """
         training = _segments(self.drives) - held_out
-        names, plan = {name for name, _ in training}, self.plan
+        names = {name for name, _ in training}
         trips = {drive.trip for drive in self.drives if drive.name in names}
         if len(training) == QUARTERS * len(names) and len(trips) > 1:
             cohort = self.cohort
-            cohort = cohort.filter(np.isin(cohort.drives["drive_id"].to_pylist(), [*names]))
+            left_out = ~np.isin(cohort.drives["drive_id"].to_pylist(), [*names])
         else:
             cohort = self.quarters
-            segments = _segments_of(cohort)
-            cohort = cohort.filter(np.array([segment in training for segment in segments]))
-        if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
-            plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
-        if plan.folds.by == "drive" and len(trips) == 1:
+            left_out = np.array([segment not in training for segment in _segments_of(cohort)])
+        if len(trips) == 1:
             cohort = replace(cohort, drives=_quarters_as_trips(cohort))
-        return select_models(replace(cohort, prior=prior) if prior else cohort, plan)
+        return select_without(replace(cohort, prior=prior), self.plan, left_out)
 
     def train(self, held_out: Segments, prior: Cohort | None = None) -> tuple[list[str], Predictor]:
         """Train without held-out segments; return the chosen columns and the model."""

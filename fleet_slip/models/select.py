@@ -12,14 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from fleet_slip.base import canonical_json, document_of, pluralize, sha256_of
+from fleet_slip.arrays import BoolArray
+from fleet_slip.base import Record, canonical_json, document_of, pluralize, sha256_of
 from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
 from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights
-from fleet_slip.grams.folding import PARTS, Folding
+from fleet_slip.grams.folding import FOLD_KEYS, PARTS, Folding
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     DEFAULT_MODELS,
@@ -53,7 +54,10 @@ from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winne
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
+    ErrorSums,
+    Figures,
     cross_validate,
+    error_sums,
     least_squares,
 )
 from fleet_slip.regression.inference import DriveMoments
@@ -99,6 +103,8 @@ class Selection(Answer):
         Why another list than the usual one was compared.
     examined
         Which drives were left out for faulty sensors, as a sentence.
+    nested
+        Errors with the whole choice repeated without the drives to test; None if not computed.
     """
 
     cohort: Cohort
@@ -121,6 +127,7 @@ class Selection(Answer):
     asked_condition: str = TRAINING_DRIVES
     remark: str = ""
     examined: str = ""
+    nested: "NestedErrors | None" = None
 
     def __repr__(self) -> str:
         winner = self.winner.model
@@ -208,6 +215,7 @@ class Selection(Answer):
             "without_label": self.without_label,
             "remark": self.remark,
             "examined": self.examined,
+            "nested_cross_validation": self.nested,
         }
         if self.cohort.prior:
             optional["prior"] = {
@@ -225,10 +233,13 @@ def run_selection(
     return run_plan(warehouse, SelectionPlan.from_request(warehouse.catalog, request), predicate)
 
 
-def run_plan(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selection:
+def run_plan(
+    warehouse: Warehouse, plan: SelectionPlan, predicate: str, *, nested: bool = False
+) -> Selection:
     """Select on the drives of a predicate. Raises as `load_cohort` and `select`.
 
-    Compares the list of logged signals if the default list has no Gram rows.
+    Compares the list of logged signals if the default list has no Gram rows. With `nested` a choice
+    on labels of measured drives is repeated without the drives to test.
     """
     remark = ""
     try:
@@ -243,13 +254,84 @@ def run_plan(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Selec
     rmse_deg = selection.winner.model.pooled.rmse_deg
     read = selection.cohort
     quality = assess_course_label(warehouse, read.feature_set, read.predicate, rmse_deg)
+    noise_deg = None if quality else label_noise_deg(warehouse, read)
+    is_measured = quality is None and noise_deg is None
     return replace(
         selection,
         without_label=quality,
-        label_noise_deg=None if quality else label_noise_deg(warehouse, read),
+        label_noise_deg=noise_deg,
         remark=remark,
         asked_condition=predicate,
+        nested=cross_validate_choice(cohort, plan) if nested and is_measured else None,
     )
+
+
+# Nested cross-validation: the figure of a winner is that of the folds that chose it.
+
+MIN_DRIVES = 3
+"""Minimum number of trips to hold out whole trips; of fewer, parts of the time are held out."""
+
+MAX_HELD_OUT = 10
+GROUPED = 8
+"""Up to `MAX_HELD_OUT` trips are held out one by one; more are dealt into this number of groups."""
+
+MAX_NESTED_DRIVES = 500
+"""Maximum number of drives for which a choice is repeated; of more the optimism is small."""
+
+
+@dataclass(frozen=True)
+class NestedErrors(Record):
+    """Held-out errors of a choice that is repeated without each group of drives."""
+
+    DOCUMENT = "groups correlation=figures.correlation rmse_deg=figures.rmse_deg"
+
+    groups: int
+    figures: Figures
+
+
+def deal_trips(trips: Sequence[str]) -> list[int]:
+    """Return the group of each trip, to be held out together."""
+    order = list(dict.fromkeys(trips))
+    count = len(order) if len(order) <= MAX_HELD_OUT else GROUPED
+    return [order.index(trip) % count for trip in trips]
+
+
+def select_without(cohort: Cohort, plan: SelectionPlan, held_out: BoolArray) -> Selection:
+    """Select as a plan does, without the Gram rows of a mask.
+
+    Folds are trips where the key of the plan has a single value.
+    """
+    cohort = cohort.filter(~held_out)
+    if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
+        plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
+    return select_models(cohort, plan)
+
+
+def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors | None:
+    """Repeat a selection without each group of trips; return its errors on the held-out drives.
+
+    Returns None if nothing is chosen, there are few trips or many drives, or a group cannot be held
+    out.
+    """
+    if cohort.sums is not None and cohort.source is not None:
+        if cohort.drive_count > MAX_NESTED_DRIVES:
+            return None
+        cohort = load_cohort(cohort.source, cohort.predicate, cohort.feature_set)
+    groups = np.array(deal_trips(cohort.drives["trip"].to_pylist()))
+    compared = len(plan.compared_list(cohort).model)
+    has_choice = plan.searches or plan.request.is_ordered or compared > 1
+    if len(np.unique(groups)) < MIN_DRIVES or not has_choice:
+        return None
+    errors: list[ErrorSums] = []
+    for group in np.unique(groups):
+        try:
+            model = select_without(cohort, plan, groups == group).winner.model.counts
+            test = cohort.filter(groups == group).complete_cases(model.signals)
+        except (DataError, QuestionError):
+            return None
+        errors.append(error_sums(model, test.table.total()))
+    unit = cohort.catalog.input_scales[cohort.catalog.signals.label]
+    return NestedErrors(len(errors), sum(errors[1:], errors[0]).figures(unit))
 
 
 def load_training_set(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Cohort:

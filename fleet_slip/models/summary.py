@@ -79,6 +79,12 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         more = pluralize(len(relations), "relation")
         more = f"; and {more} more, see --json." if relations else ""
         yield Remark(f"Skipped {names}: {first}{more}")
+    if selection.nested is not None:
+        yield Remark(
+            f"RMSE of {winner.model.name}: {winner.model.pooled.rmse_deg:.4f} deg in the folds "
+            f"that chose it; {selection.nested.figures.rmse_deg:.4f} deg on held-out drives with the "
+            f"choice repeated without them, in {selection.nested.groups} groups: expect this one."
+        )
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
             "with the whole selection repeated inside every fold: correlation "

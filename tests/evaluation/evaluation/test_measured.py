@@ -186,7 +186,8 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     done_on(root, "gram")
     fleet = fleet_slip.open(root)
     search: Any = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
-    fleet.models.publish("again", fleet.cohort().select(**search), force=True)
+    selection = fleet.cohort().run_request(SelectionRequest(**search), nested=True)
+    fleet.models.publish("again", selection, force=True)
     chosen = fleet_slip.open(root).models.get("again").manifest.signals
     fleet.models.publish("once", fleet.cohort().select(model=",".join(chosen)), force=True)
     found = fleet_slip.open(root).evaluation.evaluate_measured("again", "true", ["once"]).content
@@ -194,6 +195,11 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     errors = {name: one["rmse_deg"] for name, one in found["estimators"].items()}
     assert errors["once@1"] < 0.7 * spread_deg
     assert errors["again@1"] > spread_deg
+    assert selection.nested is not None
+    assert selection.nested.figures.rmse_deg == pytest.approx(errors["again@1"], rel=1e-6)
+    assert selection.winner.model.pooled.rmse_deg < selection.nested.figures.rmse_deg
+    assert f"{errors['again@1']:.4f} deg on held-out drives" in str(selection)
+    assert fleet.cohort().select(**search).nested is None, "only for publications"
     columns_of_parts = found["estimators"]["again@1"]["found"]
     assert len({tuple(one) for one in columns_of_parts}) > 1
 
