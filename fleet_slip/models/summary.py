@@ -80,10 +80,11 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         more = f"; and {more} more, see --json." if relations else ""
         yield Remark(f"Skipped {names}: {first}{more}")
     if selection.nested is not None:
+        chosen_deg, nested = winner.model.pooled.rmse_deg, selection.nested
         yield Remark(
-            f"RMSE of {winner.model.name}: {winner.model.pooled.rmse_deg:.4f} deg in the folds "
-            f"that chose it; {selection.nested.figures.rmse_deg:.4f} deg on held-out drives with the "
-            f"choice repeated without them, in {selection.nested.groups} groups: expect this one."
+            f"RMSE of {winner.model.name}: {chosen_deg:.4f} deg in the folds that chose it; "
+            f"{nested.figures.rmse_deg:.4f} deg on held-out drives with the choice repeated "
+            f"without them, in {nested.groups} groups: expect this one."
         )
     if selection.choice is not None and (honest := selection.choice.honest) is not None:
         yield (
