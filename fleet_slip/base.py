@@ -154,6 +154,15 @@ def no_progress(_more: int, _all: int) -> None:
     """Ignore progress."""
 
 
+Steps = Callable[[str], Progress]
+"""Returns the progress of a step by its name."""
+
+
+def no_steps(_name: str) -> Progress:
+    """Ignore the progress of all steps."""
+    return no_progress
+
+
 # Names of cars, drives and places.
 
 MAX_NAME_CHARACTERS = 200

@@ -9,7 +9,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypedDict, TypeVar
 
-from fleet_slip.base import Progress, no_progress, require_extra
+from fleet_slip.base import Progress, Steps, no_progress, require_extra
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import current_run_id, recording
 
@@ -116,6 +116,11 @@ def total_progress(show: ShowProgress | None) -> Progress:
 def step_progress(show: ShowStep | None, name: str) -> ShowProgress | None:
     """Return the callback that shows the progress of one step."""
     return None if show is None else lambda done, total: show(name, done, total)
+
+
+def progress_of_steps(show: ShowStep | None) -> Steps:
+    """Return a function that returns the progress of a step."""
+    return lambda name: total_progress(step_progress(show, name))
 
 
 @contextmanager

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import (
     ShowProgress,
+    ShowStep,
     Workers,
     for_workers,
     open_workers,
+    progress_of_steps,
     record_call,
     remote_executor,
     total_progress,
@@ -175,7 +177,7 @@ class FleetMaintenance:
         repair: bool = False,
         accept_loss: Sequence[str] = (),
         workers: Workers = None,
-        progress: ShowProgress | None = None,
+        progress: ShowStep | None = None,
     ) -> "Verification":
         """Verify every byte against its checksum, and all tables against each other.
 
@@ -192,7 +194,7 @@ class FleetMaintenance:
         workers
             A number of threads, the address of a Dask scheduler, or an executor.
         progress
-            Called with the bytes done so far and the bytes in total.
+            Called with the name of the step, and the bytes or files done so far and in total.
 
         Returns
         -------
@@ -212,13 +214,14 @@ class FleetMaintenance:
         from fleet_slip.operations.verify import verify
 
         accepted = self.accept_losses(accept_loss) if accept_loss else ()
+        steps = progress_of_steps(progress)
         with open_workers(self.warehouse.root, workers) as executor:
 
             def verify_all() -> "Verification":
                 return verify(
                     for_workers(self.warehouse, executor),
                     full=full,
-                    progress=total_progress(progress),
+                    steps=steps,
                     executor=remote_executor(executor),
                 )
 
@@ -229,7 +232,7 @@ class FleetMaintenance:
                 result.rebuilt, result.repaired = rebuilt, True
         result.accepted = accepted
         if grams and not result.damage:
-            result.compared = check_grams(self.warehouse)
+            result.compared = check_grams(self.warehouse, progress=steps("compare Gram rows"))
         return result
 
     def check_grams(

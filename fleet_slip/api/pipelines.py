@@ -183,7 +183,7 @@ class Trained(Answer):
             if gram.changed or gram in self.grams[:2]:
                 yield Remark(f"{name}: {pluralize(gram.rows_read, 'row')} read, {gram.total}")
         if self.selection:
-            yield from self.selection.parts(everything)
+            yield from self.selection.parts(everything, "--all")
         if self.publication:
             yield from self.publication.parts()
         else:
@@ -258,8 +258,12 @@ class LearnReport(Trained):
     @property
     def problem(self) -> FleetSlipError | None:
         """The error of a file, the refusal, or the first alarm of a file."""
-        if self.failure or self.refusal:
-            return self.failure or RefusedError(self.refusal)
+        if self.failure:
+            return self.failure
+        if self.refusal:
+            refused = RefusedError(self.refusal)
+            refused.headline = f"{self.model} was not published, see above"
+            return refused
         alarms = (f"{log.file}: {alarm}" for log in self.ingested for alarm in log.alarms)
         return next((AlarmError(alarm) for alarm in alarms), None)
 

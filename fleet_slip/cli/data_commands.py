@@ -13,7 +13,7 @@ from fleet_slip.api.calls import open_workers
 from fleet_slip.base import last_day, pluralize
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
-from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
+from fleet_slip.cli.output import print_answer, print_json, print_parts, print_text, progress, say
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 
@@ -247,7 +247,7 @@ def suggest(
             output.write_text(text, encoding="utf-8")
         say(f"draft written to {output}")
     elif not json:
-        print_parts(["\n" + text])
+        print_text("\n" + text)
 
 
 @mapping_app.command(name="list")

@@ -9,7 +9,14 @@ from fleet_slip.base import date_of
 from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
-from fleet_slip.cli.output import print_answer, print_json, print_parts, progress, say
+from fleet_slip.cli.output import (
+    print_answer,
+    print_json,
+    print_parts,
+    progress,
+    progress_of_steps,
+    say,
+)
 from fleet_slip.errors import UsageError
 
 
@@ -126,7 +133,7 @@ def verify(
 
     Example: fleet-slip verify --full
     """
-    with progress("verify") as show:
+    with progress_of_steps() as show:
         verification = fleet_of(context).maintenance.verify(
             full=full,
             grams=grams,

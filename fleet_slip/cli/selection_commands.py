@@ -81,7 +81,7 @@ def select(
     )
     drives = fleet_of(context).cohort(cohort, include_faulty=include_faulty)
     selection = drives.run_request(request)
-    print_answer(selection, json, everything=everything)
+    print_answer(selection, json, everything=everything, hint="--all")
     if save is not None:
         with storage_errors(save):
             save.write_text(selection.as_model_list().as_toml(), encoding="utf-8")

@@ -1,6 +1,6 @@
 """Comparison of stored Gram rows with the kernel and with SQL, bit for bit."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -66,10 +66,6 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         )
     files = _evenly(logs.files, count, begin)
     gram_files = find_gram_files(warehouse, grams.files)
-    drives = wide_drives = 0
-    for file in files:
-        drives += _compare_ways(warehouse, file, PLAIN, gram_files.get(file.path, ()))
-        progress(1, len(files))
     catalog = warehouse.catalog
     wide = tuple(
         name
@@ -77,12 +73,19 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         if catalog.feature_set(name).windows
         and grams.transaction_version(transaction_name(catalog.identity(name))) is not None
     )
+    work = [(file, PLAIN, gram_files.get(file.path, ())) for file in files]
     for name in wide:
         missing = find_backlog(logs, grams, catalog.identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
-        for file in _evenly(computed, max(1, count // SQL_COSTS), begin):
-            wide_drives += _compare_ways(warehouse, file, name, [f.path for f in grams.files])
-    return CheckReport(len(files), sum(file.rows for file in files), drives, wide, wide_drives)
+        paths = tuple(file.path for file in grams.files)
+        sample = _evenly(computed, max(1, count // SQL_COSTS), begin)
+        work += [(file, name, paths) for file in sample]
+    drives = Counter[bool]()
+    for file, name, paths in work:
+        drives[name == PLAIN] += _compare_ways(warehouse, file, name, paths)
+        progress(1, len(work))
+    rows = sum(file.rows for file in files)
+    return CheckReport(len(files), rows, drives[True], wide, drives[False])
 
 
 def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFile]:

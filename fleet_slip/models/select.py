@@ -138,9 +138,9 @@ class Selection(Answer):
             f"{self.cohort.predicate.text}>"
         )
 
-    def parts(self, everything: bool = False) -> Iterator[Part]:
-        """Return the winner and why, the best models or all, and how sure that is."""
-        return summarize(self, everything)
+    def parts(self, everything: bool = False, hint: str = "") -> Iterator[Part]:
+        """Return the winner and why, the best models or all; `hint` is the option for all."""
+        return summarize(self, everything, hint)
 
     @property
     def searched_winner(self) -> SearchedModels | None:

@@ -49,8 +49,11 @@ BEST = 10
 CONDITION_WIDTH = 120
 
 
-def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part]:
-    """Return the winner and why, the best models or all, and how sure that is."""
+def summarize(selection: "Selection", everything: bool = False, hint: str = "") -> Iterator[Part]:
+    """Return the winner and why, the best models or all, and how sure that is.
+
+    `hint` is the option that prints all models.
+    """
     if selection.examined:
         yield Remark(selection.examined)
     winner = selection.winner
@@ -61,7 +64,7 @@ def summarize(selection: "Selection", everything: bool = False) -> Iterator[Part
         yield from _choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):
         yield from _distances(selection.distances)
-    yield _models(selection, everything)
+    yield _models(selection, everything, hint)
     yield from _left_out(selection)
     if selection.folds.by in (PARTS, BANDS):
         model = winner.model
@@ -119,29 +122,34 @@ def group_skipped(skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
         yield ", ".join(searches), reason
 
 
-def _shortened(predicate: str, everything: bool) -> str:
+def _shortened(predicate: str, everything: bool, hint: str) -> str:
     """Return a predicate, of a long one its beginning."""
     predicate = predicate if everything else describe_cohort(predicate)
     long = not everything and len(predicate) > CONDITION_WIDTH
-    return f"{predicate[:CONDITION_WIDTH].rstrip()} … (--all)" if long else predicate
+    beginning = predicate[:CONDITION_WIDTH].rstrip()
+    return f"{beginning} …{hint and f' ({hint})'}" if long else predicate
 
 
-def _models(selection: "Selection", everything: bool) -> TextTable:
-    """Return a table of the models, or of the best; without signals if a table above has them.
+def _models(selection: "Selection", everything: bool, hint: str) -> TextTable:
+    """Return a table of the models, or of the best listed ones and the winner.
 
-    For models of a search it has the number of columns: these change from size to size.
+    It omits signals if a table above has them. For models of a search it has the number of columns:
+    these change from size to size.
     """
     cohort, models, where = selection.cohort, selection.models, selection.cohort.predicate.text
-    ranked = sorted(models, key=lambda model: model.pooled.rmse)
-    shown = models if everything else [model for model in models if model in ranked[:BEST]]
     searched = [] if everything else [m for s in selection.searched for m in s.models]
+    listed = [model for model in models if model not in searched] or list(models)
+    best = sorted(listed, key=lambda model: model.pooled.rmse)[:BEST]
+    names = {selection.winner.model.name, *(model.name for model in best)}
+    shown = models if everything else [model for model in models if model.name in names]
     title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
-    title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything)}"
+    title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything, hint)}"
     title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.folds.by}"
     title += "" if selection.intercept else "; no intercept"
-    title += "" if len(shown) == len(models) else f"; the {BEST} best of {len(models)} (--all)"
+    title += "" if len(shown) == len(models) else f"; {len(shown)} of {len(models)} models"
+    title += f" ({hint})" if hint and len(shown) < len(models) else ""
     header, row = "model", "{model.name}"
-    if listed := selection.choice is None:
+    if has_signals := selection.choice is None:
         header, row = f"{header}|signals", f"{row}|{{signals}}"
     header += "|correlation|RMSE deg"
     row += "|{pooled.correlation:.4f}|{pooled.rmse_deg:.4f}"
@@ -161,7 +169,7 @@ def _models(selection: "Selection", everything: bool) -> TextTable:
         }
         for model in shown
     )
-    return TextTable(title, header, rows, row, text_columns=1 + listed)
+    return TextTable(title, header, rows, row, text_columns=1 + has_signals)
 
 
 def _label_noise(selection: "Selection") -> Remark:

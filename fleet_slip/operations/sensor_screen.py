@@ -196,8 +196,10 @@ def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
 def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     """Screen a cohort like `screen_computed_drives`; compute missing Gram rows first.
 
-    Raises `NotScreenedError` if that takes more than seconds.
+    Raises `NotScreenedError` if that takes more than seconds, and `QuestionError` for columns of
+    rows.
     """
+    parse_predicate(warehouse.catalog.signals, cohort)
     screen = screen_computed_drives(warehouse, cohort)
     if screen.missing:
         ensure_grams(warehouse, PLAIN, reason="the sensor check needs them", max_rows=CHECK_ROWS)

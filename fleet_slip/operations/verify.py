@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from fleet_slip.base import Progress, no_progress, pluralize
+from fleet_slip.base import Progress, Steps, no_steps, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import (
@@ -158,32 +158,36 @@ def verify(
     warehouse: Warehouse,
     *,
     full: bool = False,
-    progress: Progress = no_progress,
+    steps: Steps = no_steps,
     executor: Executor | None = None,
 ) -> Verification:
     """Verify a data root; `full` computes the Gram rows of all log files again.
 
-    Workers of an executor, or threads, read; `progress` counts bytes. Files that jobs remove
-    meanwhile are looked up again.
+    Workers of an executor, or threads, read; `steps` returns the progress of a step, which counts
+    bytes or files. Files that jobs remove meanwhile are looked up again.
     """
     warehouse.require()
-    look = partial(_verify, warehouse, full, progress, executor)
+    look = partial(_verify, warehouse, full, steps, executor)
     return retry_if_stale(warehouse.tables, look, lambda report: bool(report.damage))
 
 
 def _verify(
-    warehouse: Warehouse, full: bool, progress: Progress, executor: Executor | None
+    warehouse: Warehouse, full: bool, steps: Steps, executor: Executor | None
 ) -> Verification:
     report = Verification()
     snapshots = _open_tables(warehouse, report)
-    read = {table: verify_files(s, report, progress, executor) for table, s in snapshots.items()}
+    read = {
+        table: verify_files(snapshot, report, steps(f"read {table}"), executor)
+        for table, snapshot in snapshots.items()
+    }
     logs, grams = ([result.file for result in read.get(table, [])] for table in ("logs", "grams"))
     verify_names(warehouse, read, report, full)
     verify_rows(warehouse, logs, grams, report)
     _report_missing_logs(snapshots, grams, report)
     if grams:
         active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
-        verify_grams(warehouse, logs, grams, active, report, full, executor)
+        progress = steps("compute Gram rows")
+        verify_grams(warehouse, logs, grams, active, report, progress, full, executor)
     verify_documents(warehouse.root, report)
     verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
@@ -354,6 +358,7 @@ def verify_grams(
     grams: Sequence[TableFile],
     active: Collection[str],
     report: Verification,
+    progress: Progress,
     full: bool,
     executor: Executor | None,
 ) -> None:
@@ -372,7 +377,8 @@ def verify_grams(
     covered = [file for file in logs if file.path in where]
     step = 1 if full else max(1, len(covered) // SAMPLE)
     by_place: dict[tuple[str, ...], list[TableFile]] = {}
-    for file in covered[::step]:
+    chosen = covered[::step]
+    for file in chosen:
         by_place.setdefault(where[file.path], []).append(file)
     for places, files in by_place.items():
         stored = stored_grams(warehouse, files, places)
@@ -384,6 +390,7 @@ def verify_grams(
                 problem = f"the stored Gram row of drive {drive} does not match its rows"
                 report.note("gram", f"logs/{file.path}", problem)
             report.log_files_recomputed += 1
+            progress(1, len(chosen))
     missing = len(logs) - len(covered)
     stale = where.keys() - set(active)
     if missing or stale:

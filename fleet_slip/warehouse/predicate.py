@@ -7,6 +7,7 @@ user's text.
 """
 
 import contextlib
+import difflib
 import functools
 import json
 import re
@@ -321,7 +322,9 @@ def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
     if len(names) == 1 and names[0].lower() in columns:
         return None
     named = printable(".".join(map(str, names)))
-    return f"has an unknown column {named!r}. Columns: {', '.join(sorted(columns))}."
+    nearest = difflib.get_close_matches(named.lower(), columns, n=1)
+    hint = f" Did you mean {nearest[0]}?" if nearest else ""
+    return f"has an unknown column {named!r}.{hint} Columns: {', '.join(sorted(columns))}."
 
 
 def _function_problem(node: Tree) -> str | None:

@@ -20,7 +20,7 @@ from fleet_slip.models import select
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable
 from fleet_slip.warehouse.warehouse import Warehouse
-from tests.support.commands import RunCommand
+from tests.support.commands import RunCommand, run_on
 
 QUERY = "SELECT drive_id, rows, 52.660000000000004::DOUBLE AS exact FROM drives ORDER BY 1"
 
@@ -311,4 +311,12 @@ def test_the_winner_stands_first(smoke_root: Path, shown: Shown) -> None:
     lines = shown(lambda: app(["--root", str(smoke_root), "select"], standalone_mode=False), 80)
     assert lines[0].startswith(("winner: physical ", "winner: windows "))
     at = next(i for i, line in enumerate(lines) if "(--all)" in line)
-    assert len(lines) - at - 2 == 10
+    names = [line.split("  ")[0] for line in lines[at + 2 :] if not line.startswith(" ")]
+    assert names == [*"12345", lines[0].removeprefix("winner: ").partition(".")[0]]
+
+
+def test_a_typo_in_a_condition_names_the_nearest_column_that_may_be_used(smoke_root: Path) -> None:
+    done = run_on(smoke_root, "select", "--cohort", "speed_facto > 1")
+    assert done.exit_code == 5
+    assert "Did you mean speed_factor? Columns: adhesion, campaign, day" in done.stderr
+    assert "ay_mps2" not in done.stderr, "a cohort is of drives"

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from fleet_slip.api.fleet_maintenance import FleetMaintenance
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams import check
 from fleet_slip.grams.check import check_grams
@@ -60,6 +61,19 @@ def test_nothing_is_found_where_nothing_is_wrong(filled: Warehouse) -> None:
     report = verify(filled, full=True)
     assert report.findings == []
     assert (report.files, report.log_files_recomputed, report.documents) == (3, 2, 1)
+
+
+def test_progress_counts_what_is_done_in_each_step(filled: Warehouse) -> None:
+    """A bar at 100 % while Gram rows are computed is wrong."""
+    steps: dict[str, list[tuple[int, int]]] = {}
+    FleetMaintenance(filled).verify(
+        grams=True, progress=lambda name, *done: steps.setdefault(name, []).append(done)
+    )
+    assert steps.pop("compute Gram rows") == steps.pop("compare Gram rows") == [(1, 2), (2, 2)]
+    for counts in steps.values():  # bytes of the tables
+        assert counts == sorted(counts)
+        assert counts[-1][0] == counts[-1][1]
+    assert {*steps} == {"read logs", "read grams"}
 
 
 def test_a_folder_without_a_warehouse_is_not_called_sound(tmp_path: Path) -> None:
