@@ -60,7 +60,7 @@ class CarEstimate:
 Estimates = dict[CalibrationParameterName, "CarEstimate | str"]
 """Estimates of the parameters that sums determine, or the reasons for missing ones."""
 
-MIN_TURNING_RAD_S = Fraction(2, 100)
+MIN_COURSE_RATE_STD_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
 noise of accelerometers is a third of it."""
 
@@ -178,7 +178,7 @@ def _by_own_sensors(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> 
         return dict.fromkeys(names, NO_COURSE)
     of_course = ExactSums(course, terms.course)
     noise = gyroscope_noise(terms, course, steering)
-    if of_course.variance("course_rate") < MIN_TURNING_RAD_S**2 or noise is None:
+    if of_course.variance("course_rate") < MIN_COURSE_RATE_STD_RAD_S**2 or noise is None:
         return dict.fromkeys(names, STRAIGHT)
     change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:

@@ -48,11 +48,10 @@ from fleet_slip.ingest.formats.file_formats import (
     read_can_database,
 )
 from fleet_slip.ingest.formats.source import describe_unknown
-from fleet_slip.quality.drive_signals import RADIUS_M
+from fleet_slip.quality.drive_signals import OWN_SPEEDS, RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 
-OWN_SPEEDS = ("vx", "vehicle_speed")
 FRONT_WHEELS = ("steer_fl", "steer_fr")
 MAX_CONDITIONS = 64
 """Conditions of one mapping. Evaluating them takes more than linear time and memory."""

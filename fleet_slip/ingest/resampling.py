@@ -21,8 +21,14 @@ from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.counts import round_chunks
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
-from fleet_slip.ingest.mapping import OWN_SPEEDS, LabelSensor, Mapping
-from fleet_slip.quality.drive_signals import RADIUS_M, TICKS_PER_S, wrap_angle
+from fleet_slip.ingest.mapping import LabelSensor, Mapping
+from fleet_slip.quality.drive_signals import (
+    MOVING_MPS,
+    OWN_SPEEDS,
+    RADIUS_M,
+    TICKS_PER_S,
+    wrap_angle,
+)
 
 # Fixes of a satellite receiver: which are valid, and at which ticks.
 
@@ -33,7 +39,7 @@ HELD_RAD = 0.005
 """Turn of the car with an unchanged course: half a degree is the step of coarse receivers."""
 BACKWARDS_MPS = 8.0
 """Nobody drives backwards faster."""
-MIN_TURNING_RAD_S = 0.1
+MIN_YAW_RATE_BACKWARDS_RAD_S = 0.1
 """An accelerometer that is off by 0.15 m/s² seems to drive backwards at 1.5 m/s then, no faster."""
 
 GRIDS = tuple(ticks for ticks in range(1, TICKS_PER_S + 1) if TICKS_PER_S % ticks == 0)
@@ -71,7 +77,7 @@ def is_backwards(
         np.convolve(np.nan_to_num(signal), second)[second.size // 2 :][place]
         for signal in (yaw_rate**2, yaw_rate * ay)
     )
-    turning = squares > second.size * MIN_TURNING_RAD_S**2
+    turning = squares > second.size * MIN_YAW_RATE_BACKWARDS_RAD_S**2
     backwards: BoolArray = turning & (speed < BACKWARDS_MPS) & (products < -0.5 * speed * squares)
     return backwards
 
@@ -145,8 +151,6 @@ SNAP_TOLERANCE_S = 0.1 * STEP_S
 TIME_EPSILON_S = 1e-6
 """Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
-MIN_SPEED_MPS = 2.0
-"""Below, receivers freeze the course or report noise; two velocities give no angle of side-slip."""
 
 
 def choose_method(time_s: FloatArray, interval_s: float) -> Method:
@@ -294,7 +298,7 @@ def fixes_on_ticks(
     `fixes` are two columns of the resampler's samples: the velocities to the north and to the east,
     or course and speed, depending on `source`; `yaw_rate` in rad/s and `ay` in m/s² are of the
     ticks. A sample that repeats the previous one is no fix. The course is NaN without a yaw rate,
-    below `MIN_SPEED_MPS`, and where it `is_held` or `is_backwards`.
+    below `MOVING_MPS`, and where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
     yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
@@ -318,7 +322,7 @@ def fixes_on_ticks(
     along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
     turned = course - np.arctan2(across, along) + r * late_s
     speeds[place] = along + r * (source.antenna_y_m or 0.0)
-    sound = (speed >= MIN_SPEED_MPS) & ~is_held(course, yaw_rate, place)
+    sound = (speed >= MOVING_MPS) & ~is_held(course, yaw_rate, place)
     if ay is not None:
         sound &= ~is_backwards(yaw_rate, ay, speed, place)
     courses[place] = np.where(sound, turned, np.nan)
@@ -351,7 +355,7 @@ def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) ->
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:
     """Return the counts of the label at the centre of gravity, and of velocities it is made of.
 
-    There is no label below `MIN_SPEED_MPS`, where sensors of angles report noise.
+    There is no label below `MOVING_MPS`, where sensors of angles report noise.
     """
     sensor, signals = mapping.label, mapping.signal_catalog
     columns: dict[str, FloatArray] = {}
@@ -360,7 +364,7 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
     elif signals.label in counts and (speed := _speed(mapping, counts)) is not None:
         if sensor is not None and sensor.is_elsewhere:
             columns = _angle(signals, sensor, speed, counts)
-        elif (slow := speed < MIN_SPEED_MPS).any():
+        elif (slow := speed < MOVING_MPS).any():
             angle = physical(signals, counts, signals.label)
             columns = {signals.label: np.where(slow, np.nan, angle)}
     return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
@@ -373,7 +377,7 @@ def _velocities(
     if sensor.is_elsewhere:
         yaw_rate = physical(signals, counts, "yaw_rate")
         vx, vy = vx + yaw_rate * sensor.sensor_y_m, vy - yaw_rate * sensor.sensor_x_m
-    fast = np.hypot(vx, vy) >= MIN_SPEED_MPS
+    fast = np.hypot(vx, vy) >= MOVING_MPS
     return {"vx": vx, "vy": vy, signals.label: np.where(fast, np.arctan2(vy, vx), np.nan)}
 
 
@@ -387,7 +391,7 @@ def _angle(
     angle, yaw_rate = physical(signals, counts, label), physical(signals, counts, "yaw_rate")
     vx = speed * np.cos(angle) + yaw_rate * sensor.sensor_y_m
     vy = speed * np.sin(angle) - yaw_rate * sensor.sensor_x_m
-    return {label: np.where(speed >= MIN_SPEED_MPS, np.arctan2(vy, vx), np.nan)}
+    return {label: np.where(speed >= MOVING_MPS, np.arctan2(vy, vx), np.nan)}
 
 
 def _speed(mapping: Mapping, counts: Named[str, pa.Array]) -> FloatArray | None:

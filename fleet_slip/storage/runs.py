@@ -24,7 +24,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fleet_slip.errors import HIDDEN, StorageError, hide_passwords
+from fleet_slip.errors import HIDDEN, INTERRUPTED, StorageError, hide_passwords
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.folder import Folder
 
@@ -112,7 +112,6 @@ def _checksum(body: bytes) -> bytes:
 
 
 LOGGER = logging.getLogger("fleet_slip")
-INTERRUPTED = 130
 ARGUMENTS_MAX = 50
 """So many arguments are kept; a glob may have given a hundred thousand."""
 ERROR_MAX = 2000
