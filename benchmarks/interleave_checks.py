@@ -20,7 +20,7 @@ from fleet_slip.operations.forget import marked_models
 from fleet_slip.operations.verify import verify
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import fit
-from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.local import data_root
 from fleet_slip.storage.table import Table
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS

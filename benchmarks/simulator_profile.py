@@ -19,7 +19,7 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.sensors import Recorder
 from fleet_slip.simulation.simulate import lane_drive, simulate_logs, tabulate
-from fleet_slip.storage.checksums import checksum_of
+from fleet_slip.storage.data_files import checksum_of
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
 from fleet_slip.warehouse.warehouse import Warehouse

@@ -10,7 +10,7 @@ from typing import Self, TypeVar
 import duckdb
 import pyarrow as pa
 
-from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QueryGoesOnError, QuestionError
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs

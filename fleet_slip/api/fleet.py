@@ -21,8 +21,8 @@ from fleet_slip.api.calls import (
     total_progress,
 )
 from fleet_slip.base import date_of, last_day
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import LOGGER, step
 

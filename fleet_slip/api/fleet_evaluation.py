@@ -13,7 +13,7 @@ from fleet_slip.api.calls import (
     total_progress,
 )
 from fleet_slip.api.fleet_models import FleetModels
-from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import UsageError
 from fleet_slip.models.registry import ModelVersion
 

@@ -17,7 +17,7 @@ from fleet_slip.api.calls import (
     total_progress,
 )
 from fleet_slip.base import date_of, normalize_name, pluralize
-from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.runs import step

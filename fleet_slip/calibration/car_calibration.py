@@ -49,7 +49,7 @@ from fleet_slip.catalog.calibration_parameters import (
     CalibrationParameterName,
 )
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.drive_sources import ALL_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram, GramTable

@@ -21,8 +21,7 @@ import pyarrow.compute as pc
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import LATE_PARTS, MOST_EARLY, MOST_LATE
-from fleet_slip.catalog.drive_sources import RECEIVER
-from fleet_slip.catalog.signals import SAMPLE_TIME_S
+from fleet_slip.catalog.signals import RECEIVER, SAMPLE_TIME_S
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
 from fleet_slip.storage.table import Snapshot

@@ -15,16 +15,15 @@ from pydantic import (
 )
 
 from fleet_slip.catalog.course import BESIDE, LONGEST_TICKS
-from fleet_slip.catalog.drive_sources import RECEIVED
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, Identifier, SignalCatalog
+from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, Identifier, SignalCatalog
 from fleet_slip.catalog.time_columns import (
     Calibrated,
     ColumnFamily,
+    ColumnSources,
     EstimateColumn,
     Factor,
     Feature,
     GateFamily,
-    KnownColumns,
     NotYetMadeError,
     ProductColumn,
     SlopeColumn,
@@ -160,7 +159,7 @@ def _make_time_columns(features: FeatureFile, signals: SignalCatalog) -> dict[st
 
     Raises `ValueError` for a column that refers to an unknown one, or for a repeated name.
     """
-    columns = KnownColumns(signals, features.features)
+    columns = ColumnSources(signals, features.features)
     waiting: list[tuple[str, str, ColumnFamily]] = [
         (f"{kind}.{name}", name, family)
         for kind in FAMILIES
@@ -175,7 +174,7 @@ def _make_time_columns(features: FeatureFile, signals: SignalCatalog) -> dict[st
     return columns.over_time
 
 
-def _make(where: str, name: str, family: ColumnFamily, columns: KnownColumns) -> bool:
+def _make(where: str, name: str, family: ColumnFamily, columns: ColumnSources) -> bool:
     """Add the columns of a family; return False if it refers to columns not made yet."""
     try:
         members = family.make(name, columns)

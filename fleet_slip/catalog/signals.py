@@ -3,7 +3,7 @@
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -82,6 +82,29 @@ class Signal(Scaled):
         """Largest valid count."""
         return COUNT_MAX if self.cyclic else int(self.max / self.scale)
 
+
+# Columns of drives, the values of their column `source`, and the drives that may train a model.
+
+SCENARIO: Final = "scenario"
+"""Drives for evaluation alone: no model is trained on them."""
+
+MEASURED: Final = "measured"
+"""Drives from logs of real cars."""
+
+RECEIVED: Final = "received"
+"""Drives whose cars sent Gram rows and no log."""
+
+RECEIVED_FILES: Final = "received/"
+"""Prefix of the column `file` of Gram rows without a log file; a digest follows."""
+
+RECEIVER: Final = "receiver"
+"""Drive column with the type of the satellite receiver."""
+
+LONGEST_PAUSE_S: Final = 600
+"""Longest pause within a trip, in s. Road, load and tyre temperature may change in longer ones."""
+
+ALL_DRIVES: Final = "true"
+TRAINING_DRIVES: Final = f"source <> '{SCENARIO}'"
 
 _SQL_TYPES = {
     "string": "VARCHAR",

@@ -119,7 +119,7 @@ class NotYetMadeError(Exception):
 
 
 @dataclass
-class KnownColumns:
+class ColumnSources:
     """Sources of columns: signals, features, and the columns over time made so far.
 
     `missing` contains the names of columns that have not been made yet.
@@ -167,7 +167,7 @@ class ColumnFamily(Config):
         """Return the names of the columns."""
         return (name,)
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
         """Return the columns by name. Raises `ValueError`, and `NotYetMadeError`."""
         raise NotImplementedError
 
@@ -212,7 +212,7 @@ class Window(ColumnFamily):
         """Return the name of each length, or that of the mean since the drive began."""
         return tuple(f"{name}_{n}" for n in self.ticks) or (name,)
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
         """Return a column for each length."""
         row = columns.definition(self.of)
         if self.of in columns.over_time and not (row.made and row.of == self.of):
@@ -248,7 +248,7 @@ class Factor(ColumnFamily):
     unit: SIUnit
     column: Identifier
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
         """Return the product."""
         base = columns.definition(self.of)
         if base.fact is not None:
@@ -271,7 +271,7 @@ class Calibrated(ColumnFamily):
     running: Identifier | None = None
     column: Identifier
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
         """Return the column times a number.
 
         Raises `ValueError` if `running` has another grain than the number, or `less` is between
@@ -328,7 +328,7 @@ class EstimateColumn(MadeColumn):
 
     unit: Literal["rad"] = "rad"
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:  # noqa: ARG002
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:  # noqa: ARG002
         """Return the estimate of a model that has not been fitted."""
         return self._single(name, Combination(line=""))
 
@@ -339,7 +339,7 @@ class ProductColumn(MadeColumn):
     of: tuple[Identifier, ...] = Field(max_length=2)
     bits: Bits = 20
 
-    def make(self, name: str, columns: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
         """Return the product."""
         factors = tuple(map(columns.definition, self.of))
         scale = math.prod(
@@ -374,7 +374,7 @@ class SlopeColumn(MadeColumn):
     equations: tuple[EquationColumns, ...] = Field(min_length=1)
     ridge: tuple[int, ...] = Field(min_length=1)
 
-    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return a slope. Raises `ValueError` if a scale of its equations does not fit others."""
         equations, values = [], set()
         for number, equation in enumerate(self.equations, 1):
@@ -433,7 +433,7 @@ class GateFamily(ColumnFamily):
         knots = range(1, len(self.knots))
         return tuple(f"{column}_{name}_{knot}" for knot in knots for column in self.columns)
 
-    def make(self, name: str, sources: KnownColumns) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return the columns of each knot."""
         by, *bases = sources.columns(self.of, *self.columns)
         counts = [round(Fraction(knot) / by.exact_scale) for knot in self.knots]

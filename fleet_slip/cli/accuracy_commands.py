@@ -9,7 +9,7 @@ import typer
 
 from fleet_slip.api.calls import CarMeasures
 from fleet_slip.base import require_extra
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, progress, say

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleet_slip.base import date_of
-from fleet_slip.catalog.drive_sources import ALL_DRIVES, TRAINING_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import (

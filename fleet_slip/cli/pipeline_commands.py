@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleet_slip.base import date_of, last_day, pluralize
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
 from fleet_slip.errors import FleetSlipError, UsageError
-from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.local import data_root
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet

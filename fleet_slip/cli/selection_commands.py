@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.drive_sources import MEASURED
+from fleet_slip.catalog.signals import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import Status, evaluate_claims
 from fleet_slip.evaluation.evaluation_document import evaluations_of

@@ -17,7 +17,7 @@ from fleet_slip.calibration.car_calibration import calibration_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.course import BESIDE, TURNED
 from fleet_slip.catalog.definitions import ParameterFactor
-from fleet_slip.catalog.drive_sources import ALL_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
 from fleet_slip.warehouse.gram_reader import OpenedGrams, by_signals, gram_table
 from fleet_slip.warehouse.predicate import parse_predicate

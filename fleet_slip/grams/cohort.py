@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray, Hashes, IntArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.drive_sources import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import RECEIVED, SCENARIO, TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError
 from fleet_slip.grams.calibrated_columns import expansion_of
 from fleet_slip.grams.drive_weights import FULL, weighted

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import Field
 
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
+from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
 from fleet_slip.regression.folds import FoldAssignment, by_band, by_hash, by_value

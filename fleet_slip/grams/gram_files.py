@@ -14,8 +14,8 @@ from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import BoolArray, Hashes, IntArray
 from fleet_slip.catalog.course import COURSE_LATE
-from fleet_slip.catalog.drive_sources import RECEIVED_FILES
 from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import RECEIVED_FILES
 from fleet_slip.errors import ConflictError
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql

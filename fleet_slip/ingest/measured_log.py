@@ -18,7 +18,7 @@ import polars as pl
 import pyarrow as pa
 
 from fleet_slip.base import canonical_ascii, pluralize, quote_name
-from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
+from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.checked_columns import CheckedBlock, RowChecker, describe_refused, no_rows

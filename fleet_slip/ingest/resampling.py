@@ -152,7 +152,6 @@ TIME_EPSILON_S = 1e-6
 """Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
 
-
 def choose_method(time_s: FloatArray, interval_s: float) -> Method:
     """Snap samples of 100 Hz that are near ticks, average a faster log, interpolate others."""
     if interval_s < STEP_S - SNAP_TOLERANCE_S:

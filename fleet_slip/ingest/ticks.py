@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.counts import digest_counts, round_chunks
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalog.drive_sources import MEASURED
+from fleet_slip.catalog.signals import MEASURED
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.drives import DriveRows
 from fleet_slip.ingest.formats.source import EARLIEST_S

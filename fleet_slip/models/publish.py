@@ -12,7 +12,7 @@ from fleet_slip.calibration.car_calibration import three_digits
 from fleet_slip.calibration.intercept import InterceptEstimate, estimate_intercept
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
-from fleet_slip.catalog.drive_sources import MEASURED, TRAINING_DRIVES
+from fleet_slip.catalog.signals import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.models.acceptance import review_challenger
 from fleet_slip.models.manifest import (

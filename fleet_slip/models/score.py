@@ -11,8 +11,7 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.car_calibration import calibrate
-from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibrated_columns import CarCounts

@@ -16,7 +16,7 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.base import Record, canonical_json, document_of, pluralize, sha256_of
 from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
 from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from fleet_slip.catalog.catalog import FirstStageModel, integer_combination
 from fleet_slip.catalog.definitions import Combination, Definition
-from fleet_slip.catalog.first_stage import FirstStageModel, integer_combination
 from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import assign_folds

@@ -15,7 +15,7 @@ from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.calibration.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import YAW_RATE
-from fleet_slip.catalog.drive_sources import ALL_DRIVES
+from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.models.acceptance import load_thresholds, missing_evidence

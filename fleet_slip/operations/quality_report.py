@@ -12,8 +12,8 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Record, pluralize
 from fleet_slip.calibration.course_label import course_moments
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
 from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import AlarmError
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.ingest.recordings import SourceRef

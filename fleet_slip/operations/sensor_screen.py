@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fleet_slip.base import canonical_json, pluralize, sha256_of
-from fleet_slip.catalog.drive_sources import MEASURED, RECEIVED
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, RECEIVED, SignalCatalog
 from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
 from fleet_slip.grams.update import ensure_grams
 from fleet_slip.operations.quality_report import SensorFault, examine_drives

@@ -43,10 +43,9 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
-from fleet_slip.storage.checksums import checksum_in, checksum_of
 from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
+from fleet_slip.storage.data_files import checksum_in, checksum_of, read_names
 from fleet_slip.storage.documents import document_folders
-from fleet_slip.storage.encoding import read_names
 from fleet_slip.storage.folder import Folder, StoredFile
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors

@@ -14,8 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.drive_sources import RECEIVED
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.drive_signals import DriveBatches
 from fleet_slip.quality.peers import MAD_TO_STD, QualityThresholds, solve

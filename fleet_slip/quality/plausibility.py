@@ -14,8 +14,7 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.course import SATELLITE_SPEED
-from fleet_slip.catalog.drive_sources import MEASURED
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.course_relation import check_course
 from fleet_slip.quality.delays import find_delays

@@ -19,8 +19,7 @@ from pydantic import Field, TypeAdapter, ValidationInfo, model_validator
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import canonical_ascii, sha256_of
-from fleet_slip.catalog.drive_sources import SCENARIO
-from fleet_slip.catalog.signals import Identifier
+from fleet_slip.catalog.signals import SCENARIO, Identifier
 from fleet_slip.config import Config, load_config, load_toml
 from fleet_slip.errors import ConfigError, UsageError
 from fleet_slip.resources import Configs

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, ValidationInfo, model_validator
 
-from fleet_slip.catalog.drive_sources import SCENARIO
-from fleet_slip.catalog.signals import Identifier, load_signals
+from fleet_slip.catalog.signals import SCENARIO, Identifier, load_signals
 from fleet_slip.config import Config, load_config
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.campaign import Batch, DriveSpec, PacePoint, load_base, merged

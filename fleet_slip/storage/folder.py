@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import duckdb
     import pyarrow as pa
 
+
 TEMPORARY_PREFIX = ".tmp-"
 """Prefix of an unfinished file."""
 

@@ -24,7 +24,7 @@ import pyarrow as pa
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
-from fleet_slip.storage.checksums import require_content
+from fleet_slip.storage.data_files import require_content
 from fleet_slip.storage.folder import Content, Folder, StoredFile
 from fleet_slip.storage.storage_errors import NoSuchObjectError, object_errors
 

@@ -25,7 +25,7 @@ from fleet_slip.storage.commits import (
     read_removals,
     read_transactions,
 )
-from fleet_slip.storage.encoding import Encoded, Encoding, read_names
+from fleet_slip.storage.data_files import Encoded, Encoding, read_names
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.storage_errors import first_line, storage_errors
 
@@ -442,6 +442,41 @@ class Snapshot:
             table.folder.settle_commits(self.version)
 
 
+class _NewestSnapshot:
+    """The newest snapshot of a table: opening it takes milliseconds, a look for commits does not.
+
+    Threads may use it at once: assignments are atomic. It is pickled empty.
+    """
+
+    def __init__(self) -> None:
+        self._snapshot: tuple[Snapshot, object] | None = None
+
+    def __reduce__(self) -> tuple[type[_NewestSnapshot], tuple[()]]:
+        return _NewestSnapshot, ()
+
+    def find(self) -> Snapshot | None:
+        """Return the snapshot if nobody committed since; otherwise None."""
+        if self._snapshot is None:
+            return None
+        snapshot, stamp = self._snapshot
+        return snapshot if _stamp(snapshot) == stamp else None
+
+    def keep(self, snapshot: Snapshot) -> Snapshot:
+        """Keep a snapshot if the folder can detect later commits; return it."""
+        stamp = _stamp(snapshot)
+        self._snapshot = None if stamp is None else (snapshot, stamp)
+        return snapshot
+
+
+def _stamp(snapshot: Snapshot) -> object:
+    """Return a value that identifies the log up to a snapshot; None after a newer commit."""
+    log, version = snapshot.table.folder / LOG, snapshot.version
+    if version is None or log.stamp(f"{version + 1:020}.json") is not None:
+        return None
+    commit = log.stamp(f"{version:020}.json")
+    return None if commit is None else (commit, log.stamp(LATEST))
+
+
 FENCE = "fleet_slip.fence"
 """Table property whose change makes pending commits conflict."""
 
@@ -460,6 +495,9 @@ class Table:
     description: str = ""
     optional: tuple[str, ...] = ()
     """Columns that a file has only if they have values."""
+    _newest: _NewestSnapshot = field(
+        default_factory=_NewestSnapshot, init=False, repr=False, compare=False
+    )
 
     @property
     def usual_schema(self) -> pa.Schema:
@@ -471,17 +509,17 @@ class Table:
     def snapshot(self, version: int | None = None, *, anew: bool = False) -> Snapshot:
         """Return the newest version, or a given one; empty if unwritten. Raises `StorageError`.
 
-        Returns a cached snapshot while nobody commits. `anew` reads the whole log instead, which
+        Returns the same snapshot while nobody commits. `anew` reads the whole log instead, which
         detects later damage.
         """
         if version is not None:
             return Snapshot(self, self.open_delta(version))
-        if not anew and (opened := _cached_if_newest(self)):
+        if not anew and (opened := self._newest.find()):
             return opened
         delta = self.open_delta()
         if delta is not None:
             self.require_readable(delta)
-        return _cache_snapshot(Snapshot(self, delta))
+        return self._newest.keep(Snapshot(self, delta))
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
         """Return the newest Delta table, or a version; None if unwritten."""
@@ -662,41 +700,3 @@ class Table:
             commit_properties=CommitProperties(custom_metadata={NOTE: checked_note({}, [], {})}),
         )
         return (self.open_delta(version=0) if delta.version() else delta) or delta
-
-
-# A cache of the newest snapshots: opening a table takes milliseconds, a look for commits does not.
-
-MAX_CACHED_SNAPSHOTS = 16
-
-_snapshot_cache: dict[str, tuple[Snapshot, object]] = {}
-"""The last snapshot of each table, with its stamp."""
-
-
-def _cache_snapshot(snapshot: Snapshot) -> Snapshot:
-    """Cache a snapshot if the folder can detect later commits; return it."""
-    stamp = _stamp(snapshot)
-    if stamp is not None:
-        uri = snapshot.table.folder.uri
-        _snapshot_cache.pop(uri, None)
-        _snapshot_cache[uri] = snapshot, stamp
-        for oldest in list(_snapshot_cache)[:-MAX_CACHED_SNAPSHOTS]:
-            _snapshot_cache.pop(oldest, None)
-    return snapshot
-
-
-def _cached_if_newest(table: Table) -> Snapshot | None:
-    """Return the cached snapshot of a table if nobody committed since; otherwise None."""
-    snapshot, stamp = _snapshot_cache.get(table.folder.uri, (None, None))
-    if snapshot is None or snapshot.table != table or _stamp(snapshot) != stamp:
-        return None
-    same = snapshot.table.schema.equals(table.schema, check_metadata=True)  # the scales of counts
-    return snapshot if same else None
-
-
-def _stamp(snapshot: Snapshot) -> object:
-    """Return a value that identifies the log up to a snapshot; None after a newer commit."""
-    log, version = snapshot.table.folder / LOG, snapshot.version
-    if version is None or log.stamp(f"{version + 1:020}.json") is not None:
-        return None
-    commit = log.stamp(f"{version:020}.json")
-    return None if commit is None else (commit, log.stamp(LATEST))

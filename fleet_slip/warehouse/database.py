@@ -25,7 +25,7 @@ from fleet_slip.errors import (
 )
 from fleet_slip.limits import data_needed, memory_bytes
 from fleet_slip.resources import folder
-from fleet_slip.storage.checksums import check_local_files, missing_file_error
+from fleet_slip.storage.data_files import check_local_files, missing_file_error
 from fleet_slip.storage.folder import SPILL_PREFIX, Folder
 
 if TYPE_CHECKING:  # functions import it: it takes as long to start as all else of most commands

@@ -16,14 +16,14 @@ from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import TURNED
-from fleet_slip.catalog.drive_sources import (
+from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.signals import (
     ALL_DRIVES,
     LONGEST_PAUSE_S,
     RECEIVED_FILES,
     RECEIVER,
     TRAINING_DRIVES,
 )
-from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.regression.gram import GramTable, packed_size
 from fleet_slip.resources import read_sql

@@ -18,8 +18,7 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.drive_sources import SCENARIO, TRAINING_DRIVES
-from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.catalog.signals import SCENARIO, TRAINING_DRIVES, SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,

@@ -10,8 +10,7 @@ import pyarrow as pa
 from pydantic import Field, RootModel
 
 from fleet_slip.catalog.course import COURSE_LATE
-from fleet_slip.catalog.drive_sources import ALL_DRIVES
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import ALL_DRIVES, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.column_sql import with_absent
 from fleet_slip.config import Config, load_toml
 from fleet_slip.errors import ConflictError

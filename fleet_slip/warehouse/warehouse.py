@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import ValidationError
 
-from fleet_slip.catalog.catalog import Catalog, load_catalog
+from fleet_slip.catalog.catalog import Catalog, FirstStageModel, load_catalog
 from fleet_slip.catalog.course import COURSE_LATE
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import StorageError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
-from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.data_files import Encoding
 from fleet_slip.storage.documents import DocumentFolder
-from fleet_slip.storage.encoding import Encoding
 from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import data_root
 from fleet_slip.storage.table import SCALE, Snapshot, Table
 
 if TYPE_CHECKING:
@@ -167,9 +166,11 @@ class Warehouse:
         return _unpickle, (self.root, self.configs, self.catalog)
 
     def close(self) -> None:
-        """Release the idle connection and the first-stage models that were read."""
+        """Release the idle connection, the tables, and the first-stage models that were read."""
         self.connections.close()
         self.stacked_models.clear()
+        for table in ("logs", "grams", "quarantine"):
+            self.__dict__.pop(table, None)
 
     @cached_property
     def catalog(self) -> Catalog:

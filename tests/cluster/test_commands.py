@@ -13,7 +13,7 @@ from distributed import Client
 from fleet_slip.compute.cluster import Marker, cluster_executor, environment, pickled, work
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import RefusedError, StorageError
-from fleet_slip.storage.checksums import checksum_in
+from fleet_slip.storage.data_files import checksum_in
 from fleet_slip.storage.local import LocalFolder
 from tests.support.commands import RunCommand, finish, run, start_on, until
 from tests.support.dask_processes import DaskProcesses, Order, dask_processes, obey

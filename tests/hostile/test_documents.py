@@ -13,9 +13,8 @@ from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 from fleet_slip.models.registry import Registry
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import load_track
-from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
-from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.local import LocalFolder, data_root
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand
 from tests.support.logs import path_of

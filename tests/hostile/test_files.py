@@ -22,8 +22,7 @@ from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.models.acceptance import PublishThresholds
 from fleet_slip.models.registry import Registry
 from fleet_slip.resources import Configs
-from fleet_slip.storage.data_root import data_root
-from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.local import LocalFolder, data_root
 from fleet_slip.storage.runs import recording
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from fleet_slip.base import no_progress
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.update import update_grams
-from fleet_slip.storage.checksums import check_local_files
+from fleet_slip.storage.data_files import check_local_files
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import (

@@ -9,8 +9,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.catalog.catalog import FirstStageModel, integer_combination
 from fleet_slip.catalog.definitions import Combination
-from fleet_slip.catalog.first_stage import FirstStageModel, integer_combination
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import compute_columns
 from fleet_slip.errors import DataError, QuestionError, StorageError

@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalog.drive_sources import TRAINING_DRIVES
+from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotScreenedError, RefusedError
 from fleet_slip.models import training_checks
 from fleet_slip.models.acceptance import load_thresholds

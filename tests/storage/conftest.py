@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.local import data_root
 from tests.support.s3_server import Server, ServerApart, forget_clients
 
 

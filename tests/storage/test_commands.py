@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip.storage.checksums import checksum_in
-from fleet_slip.storage.data_root import data_root
+from fleet_slip.storage.data_files import checksum_in
 from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.local import LocalFolder, data_root
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import finish, start_on
 from tests.support.dask_processes import dask_processes

@@ -18,8 +18,8 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.operations.verify import verify
-from fleet_slip.storage import checksums, objects
-from fleet_slip.storage.checksums import check_local_files, checksum_in
+from fleet_slip.storage import data_files, objects
+from fleet_slip.storage.data_files import check_local_files, checksum_in
 from fleet_slip.storage.folder import Folder
 from fleet_slip.views import connect
 from fleet_slip.warehouse.database import reading_files
@@ -121,7 +121,7 @@ def test_a_file_is_read_once_while_it_stays_the_same(
     paths = filled.logs.snapshot().paths
     assert all(checksum_in(path) for path in paths)
     check_local_files(paths)
-    monkeypatch.setattr(checksums, "_require", lambda *_: pytest.fail("read again"))
+    monkeypatch.setattr(data_files, "_require", lambda *_: pytest.fail("read again"))
     check_local_files(paths)
 
 

@@ -19,10 +19,9 @@ import fleet_slip
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.storage import objects
-from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.local import LocalFolder, data_root
 from fleet_slip.storage.objects import ObjectFolder, client
 from fleet_slip.storage.storage_errors import known_meaning, meaning_of, object_errors
 from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts

@@ -1,9 +1,12 @@
 """Delta tables below a data root: whole commits or nothing, and transactions that land once."""
 
+import gc
 import hashlib
 import json
+import pickle
 import shutil
 import threading
+import weakref
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -18,8 +21,13 @@ from deltalake import DeltaTable
 from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
-from fleet_slip.storage.checksums import CHECKSUM_DIGITS, checksum_in, checksum_of
-from fleet_slip.storage.encoding import ROW_GROUP_ROWS, Encoding
+from fleet_slip.storage.data_files import (
+    CHECKSUM_DIGITS,
+    ROW_GROUP_ROWS,
+    Encoding,
+    checksum_in,
+    checksum_of,
+)
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import SCALE, AppTransaction, Change, retry_conflicts
@@ -234,7 +242,7 @@ def test_a_table_is_opened_again_after_a_commit_of_anybody(
     first = warehouse.logs.snapshot()
     assert len(first.files) == 1
     opened.clear()
-    again = Warehouse(warehouse.root).logs.snapshot()
+    again = warehouse.logs.snapshot()
     assert (again is first, first.refresh() is first, opened) == (True, True, [])
     delta = DeltaTable(first.table.uri("")[:-1])  # as another process does
     delta.alter.set_table_properties({"by": "another"}, raise_if_not_exists=False)
@@ -244,6 +252,18 @@ def test_a_table_is_opened_again_after_a_commit_of_anybody(
     land(warehouse, "two", log_rows("two", COUNTS))
     assert len(warehouse.logs.snapshot().files) == 2
     assert len(newer.files) == len(first.files) == 1
+
+
+def test_a_warehouse_owns_its_snapshots_and_releases_them(warehouse: Warehouse) -> None:
+    land(warehouse, "one", log_rows("one", COUNTS))
+    snapshot = warehouse.logs.snapshot()
+    assert Warehouse(warehouse.root).logs.snapshot() is not snapshot
+    assert pickle.loads(pickle.dumps(warehouse.logs)) == warehouse.logs  # noqa: S301
+    released = weakref.ref(snapshot)
+    warehouse.close()
+    del snapshot
+    gc.collect()
+    assert released() is None
 
 
 def test_a_table_in_the_place_of_another_is_opened(warehouse: Warehouse) -> None:

@@ -9,8 +9,8 @@ import duckdb
 import numpy as np
 import pytest
 
+from fleet_slip.catalog.catalog import FirstStageModel
 from fleet_slip.catalog.definitions import Combination
-from fleet_slip.catalog.first_stage import FirstStageModel
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams

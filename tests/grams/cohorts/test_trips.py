@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.catalog.drive_sources import LONGEST_PAUSE_S
+from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.folding import EACH
 from fleet_slip.ingest.mapping import Mapping

@@ -38,9 +38,8 @@ from fleet_slip.resources import SHIPPED_CONFIGS, folder
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.storage.data_root import data_root
 from fleet_slip.storage.documents import DocumentFolder
-from fleet_slip.storage.local import LocalFolder
+from fleet_slip.storage.local import LocalFolder, data_root
 from fleet_slip.storage.table import AppTransaction, Change
 from fleet_slip.vehicle.parameters import load_vehicle
 from fleet_slip.views import connect
