@@ -18,12 +18,14 @@ from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches
 from fleet_slip.ingest.columns import (
+    NO_NUMBER,
     DateColumn,
     SignalColumn,
     as_moments,
     conversion_factor,
     count_range,
     describe,
+    parse_numbers,
 )
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
 from fleet_slip.ingest.formats.source import BASE
@@ -92,6 +94,10 @@ def _time_problems(name: str, text: pl.Expr, *more: tuple[pl.Expr, str]) -> pl.E
     return find_problems((text.is_null(), "missing"), (unread, "not_a_time"), *more)
 
 
+MAX_WHOLE = 2.0**53
+"""From here on neighbouring whole numbers are the same float."""
+
+
 def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     """Return a column as text, whole numbers without a point, null for missing."""
     raw = pl.col(RAW + column)
@@ -109,15 +115,15 @@ def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr
     match schema[RAW + column]:
         case pl.String:
             text = without_missing(raw, mapping)
-            if mapping.csv.decimal_comma:
-                text = text.str.replace(",", ".", literal=True)
-            number = text.cast(pl.Float64, strict=False)
-            if not absent:
-                return number, text.is_not_null()
-            is_present = text.is_not_null() & ~number.is_in(absent).fill_null(value=False)
+            number = parse_numbers(text, decimal_comma=mapping.csv.decimal_comma)
+            is_absent = number.is_nan() | text.str.contains(NO_NUMBER)
+            if absent:
+                is_absent |= number.is_in(absent)
+            is_present = text.is_not_null() & ~is_absent.fill_null(value=False)
             return pl.when(is_present).then(number), is_present
-        case pl.Float64:
-            number = pl.when(~raw.is_in(absent)).then(raw) if absent else raw
+        case pl.Float64 | pl.Int64 | pl.UInt64:
+            number = raw.cast(pl.Float64).fill_nan(None)
+            number = pl.when(~number.is_in(absent)).then(number) if absent else number
             return number, pl.lit(value=False)
         case other:
             raise unfit_column(column, other, "numbers")
@@ -299,6 +305,8 @@ def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowFie
     text = as_text(column, schema, mapping)
     value = text.map_batches(partial(_map_texts, normalize_name, pl.String), pl.String)
     faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
+    if schema[RAW + column] == pl.Float64:  # which has lost digits of longer numbers
+        faulty |= pl.col(RAW + column).abs() >= MAX_WHOLE
     problem = find_problems((pl.col(name).is_null(), "missing"), (faulty, "out_of_range"))
     return RowField(name, "key", pl.col(RAW + column), value, problem)
 

@@ -77,6 +77,23 @@ def measures(unit: str, si_unit: str) -> bool:
     return False
 
 
+NO_NUMBER = r"(?i)^[+-]?(nan|1\.#(qnan|snan|ind))\b"
+"""How programs write NaN, which is a missing value."""
+_GROUPED = r"^[+-]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?$"
+
+
+def parse_numbers(text: pl.Expr, *, decimal_comma: bool) -> pl.Expr:
+    """Return texts as float64, null for others.
+
+    With a decimal comma a point groups digits: 1.320 is 1320, and 0.5 is no number.
+    """
+    if decimal_comma:
+        has_point = text.str.contains(".", literal=True)
+        plain = pl.when(~has_point | text.str.contains(_GROUPED)).then(text)
+        text = plain.str.replace_all(".", "", literal=True).str.replace(",", ".", literal=True)
+    return text.cast(pl.Float64, strict=False)
+
+
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
 OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEEL_PREFIX = "wheel_"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.columns import parse_numbers
 from fleet_slip.ingest.formats.csv import decompressed, first_lines
 from fleet_slip.ingest.formats.file_formats import CanBus, CsvFormat, Encoding, FileFormats
 from fleet_slip.ingest.formats.reading import (
@@ -29,8 +30,11 @@ from fleet_slip.ingest.vocabulary import unit_called, vocabulary
 
 _SEPARATORS = (";", "\t", "|", ",", " ")
 _LINES = 120
-_NUMBER = re.compile(r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*")
-_DECIMAL_COMMA = re.compile(r"\s*[-+]?\d*,\d+([eE][-+]?\d+)?\s*")
+_NUMBER = re.compile(
+    r"\s*[-+]?(\d+([.,]\d*)?|[.,]\d+|\d{1,3}(\.\d{3})+(,\d*)?)([eE][-+]?\d+)?\s*|[-+]?nan",
+    re.IGNORECASE,
+)
+_DECIMAL_COMMA = re.compile(r"\s*[-+]?[\d.]*,\d+([eE][-+]?\d+)?\s*")
 _BOMS = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -290,8 +294,9 @@ def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: Cs
         return Profile(channel, rate_hz, seconds, first, time_format="" if is_time else None)
     if not column.dtype.is_numeric():
         texts = column.cast(pl.String).str.strip_chars()
-        plain = texts.str.replace(",", ".", literal=True) if csv.decimal_comma else texts
-        numbers = plain.cast(pl.Float64, strict=False)
+        numbers = texts.to_frame().select(
+            parse_numbers(pl.col(texts.name), decimal_comma=csv.decimal_comma)
+        )[texts.name]
         if numbers.is_not_null().any():
             odd = texts.filter(numbers.is_null() & (texts != "")).unique()[:20].to_list()
             return Profile(
@@ -304,12 +309,12 @@ def _profile(channel: Channel, rate_hz: float | None, column: pl.Series, csv: Cs
             )
         return Profile(channel, rate_hz, np.zeros(0), examples, _keys(texts))
     values = column.cast(pl.Float64).fill_null(np.nan)
-    return Profile(channel, rate_hz, values.to_numpy(), keys=_keys(values))
+    return Profile(channel, rate_hz, values.to_numpy(), keys=_keys(column))
 
 
 def _keys(column: pl.Series) -> NDArray[np.int64]:
     """Return a number for each text or whole number, the first ones first; empty for others."""
-    if column.dtype.is_float() and not (column == column.round()).all():
+    if column.dtype.is_float() and not (column == column.round()).fill_null(value=True).all():
         return np.zeros(0, dtype=np.int64)
     return column.rank("dense").fill_null(0).cast(pl.Int64).to_numpy()
 

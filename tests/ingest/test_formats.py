@@ -311,7 +311,7 @@ def test_a_package_that_is_absent_is_named_with_its_extra(
 ) -> None:
     file = write_mdf(tmp_path, [a_x(), beta()])
     monkeypatch.setitem(__import__("sys").modules, "asammdf", None)
-    with pytest.raises(ExtraError, match=r"asammdf, which is not installed. Run: pip install 'fl"):
+    with pytest.raises(ExtraError, match=r"asammdf, which is not installed. Run: pip install .fl"):
         failure(file, mdf_mapping())
 
 

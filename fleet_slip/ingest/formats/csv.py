@@ -1,6 +1,7 @@
 """Reads CSV in blocks of whole lines, as text or plain numbers."""
 
 import csv
+import re
 from collections.abc import Iterator, Set
 from functools import cached_property
 from io import BufferedReader, BytesIO
@@ -91,31 +92,69 @@ class CsvSource(FormatSource):
         return "", find_column(self._file, self._names, column)
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
-        """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`."""
+        """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`.
+
+        A line that repeats the header, in any order, gives the places of the columns behind it.
+        """
         with self._file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
             names = _csv_header(plain, self._file, self.csv_format)
             numbers = set(self._numbers.columns & set(places))
-
-            def parse(block: bytes) -> pl.DataFrame:
-                # Reading on over bad numbers is reading on over bad quotes.
-                fit = frozenset() if b'"' in block else frozenset(numbers)
-                parsed = self._parse(block, len(names), places, fit)
-                texts = {name for name in fit if not self._numbers.are_in(parsed[name])}
-                if texts:
-                    numbers.difference_update(texts)  # so that others need not be parsed twice
-                    again = self._parse(block, len(names), {n: places[n] for n in texts}, set())
-                    parsed = parsed.with_columns(again.select(sorted(texts)))
-                return parsed
-
-            # A line of separators before each block fixes the number of fields and keeps a block
-            # from looking like a compressed file.
-            padding = self.csv_format.separator.encode() * len(names) + b"\n"
-            unfolded = 0
+            padding, unfolded = self._padding(names), 0
             for block in _whole_lines(plain, self._file, padding):
                 unfolded += len(block) - len(padding)
                 self._budget.require_unfolded(unfolded)
-                yield parse(block)
+                for lines, header in self._split_at_headers(block, padding, names):
+                    yield self._parse_lines(lines, len(names), places, numbers)
+                    if header:
+                        places = {name: find_column(self._file, header, name) for name in places}
+                        names = header
+
+    def _padding(self, names: list[str]) -> bytes:
+        """Return a line of separators before a block.
+
+        It fixes the number of fields, and keeps a block from looking like a compressed file.
+        """
+        return self.csv_format.separator.encode() * len(names) + b"\n"
+
+    def _split_at_headers(
+        self, block: bytes, first: bytes, names: list[str]
+    ) -> Iterator[tuple[bytes, list[str] | None]]:
+        """Yield a block of whole lines up to each header in it, and the names of that header.
+
+        `first` is the padding that the block has, of as many fields as the file's first header.
+        """
+        words = [name for name in names if not _NUMBER.fullmatch(name)]
+        probe = max(words, key=len, default="").encode()
+        padding = self._padding(names)
+        start, padding = (0, b"") if padding == first else (len(first), padding)
+        place = block.find(probe, len(first)) if probe else -1
+        while place >= 0:
+            begin = block.rfind(b"\n", 0, place) + 1
+            end = block.find(b"\n", place) + 1 or len(block)
+            fields = _fields(block[begin:end].decode().rstrip("\r\n"), self.csv_format)
+            header = [field.strip() for field in fields or ()]
+            if len(set(header) & set(names)) >= max(2, len(set(names)) / 2):
+                yield padding + block[start:end], header
+                start, padding = end, self._padding(header)
+            place = block.find(probe, end)
+        yield padding + block[start:], None
+
+    def _parse_lines(
+        self, block: bytes, width: int, places: dict[str, int], numbers: set[str]
+    ) -> pl.DataFrame:
+        """Parse lines behind one of padding; `numbers` loses columns that are not only numbers."""
+        # Reading on over bad numbers is reading on over bad quotes. Beside a decimal comma a point
+        # groups digits, but Polars reads it as one.
+        grouped = self.csv_format.decimal_comma and b"." in block
+        fit = frozenset() if b'"' in block or grouped else frozenset(numbers)
+        parsed = self._parse(block, width, places, fit)
+        texts = {name for name in fit if not self._numbers.are_in(parsed[name])}
+        if texts:
+            numbers.difference_update(texts)  # so that others need not be parsed twice
+            again = self._parse(block, width, {n: places[n] for n in texts}, set())
+            parsed = parsed.with_columns(again.select(sorted(texts)))
+        return parsed
 
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
@@ -153,13 +192,24 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
             "file?"
         )
     text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
-    try:
-        names = next(csv.reader([text], delimiter=csv_format.separator, strict=True))
-    except csv.Error as error:
-        raise InputError(f"{quote_name(file)}: its header is not CSV: {error}.") from None
+    names = _fields(text, csv_format)
+    if names is None:
+        raise InputError(f"{quote_name(file)}: its header is not CSV: a quote is not closed.")
     for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
         stream.readline(MAX_LINE_BYTES)
     return [name.strip() for name in names]
+
+
+_NUMBER = re.compile(r"[-+\d.,eE ]*")
+"""A name that may as well be a value of a row."""
+
+
+def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
+    """Return the fields of a line, None if it is not CSV."""
+    try:
+        return next(csv.reader([line], delimiter=csv_format.separator, strict=True), [])
+    except csv.Error:
+        return None
 
 
 def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes]:

@@ -87,8 +87,8 @@ class Source(ABC):
         """Return the rows of each time base that has one of the columns; without a clock of one.
 
         They come in the file's order, in bounded batches, at least one, with the columns of their
-        base as text, 64-bit floats, dates or timestamps, and `OWN_TIME` with a clock. Raises
-        `InputError`, for a missing or ambiguous column too.
+        base as text, 64-bit floats or integers, dates or timestamps, and `OWN_TIME` with a clock.
+        Raises `InputError`, for a missing or ambiguous column too.
         """
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
@@ -140,7 +140,11 @@ def unreadable(file: object, error: BaseException) -> InputError:
 
 
 def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
-    """Return an array as text, timestamps or 64-bit floats. Raises `InputError` for others."""
+    """Return an array as text, timestamps, 64-bit integers or floats.
+
+    Integers of 64 bits may be identifiers, whose digits a float would lose. Raises `InputError` for
+    other types.
+    """
     if values.ndim != 1:
         raise InputError(
             f"{quote_name(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} "
@@ -159,7 +163,9 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
             "nor "
             "text. Map another one."
         )
-    return pl.Series(name, np.ascontiguousarray(values, dtype=np.float64))
+    is_long = values.dtype.kind in "iu" and values.dtype.itemsize == 8
+    kind = values.dtype.newbyteorder("=") if is_long else np.dtype(np.float64)
+    return pl.Series(name, np.ascontiguousarray(values, dtype=kind))
 
 
 def find_column(file: Path, names: Sequence[str], column: str) -> int:

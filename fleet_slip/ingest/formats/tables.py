@@ -1,4 +1,4 @@
-"""Reads Parquet: text, numbers as float64, dates and timestamps."""
+"""Reads Parquet: text, numbers, dates and timestamps."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -141,7 +141,10 @@ def _is_text(arrow_type: pa.DataType) -> bool:
 
 
 def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
-    """Return a readable column as text, float64, date or timestamp. Raises `InputError`."""
+    """Return a readable column as text, float64, date or timestamp. Raises `InputError`.
+
+    Integers of 64 bits, and decimals as text, keep all digits: they may be identifiers.
+    """
     array.validate(full=True)  # text of Parquet may be invalid UTF-8, which Polars does not check
     if pa.types.is_dictionary(array.type):
         longest = pc.max(pc.utf8_length(array.dictionary)).as_py() if _is_text(array.type) else 0
@@ -156,6 +159,10 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
         return array
     if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
         return _in_calendar(array)
+    if kind in {pa.int64(), pa.uint64()}:
+        return array
+    if pa.types.is_decimal(kind):
+        return pc.cast(array, pa.string())
     return pc.cast(array, pa.float64(), safe=False)
 
 

@@ -1,0 +1,139 @@
+"""Values as other programs write them: long numbers, grouped digits, NaN, second headers."""
+
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import polars as pl
+import pytest
+
+from fleet_slip.errors import InputError
+from fleet_slip.ingest.mapping import Mapping
+from tests.support.measured import a_mapping, csv_text, read_measured, read_text, reasons
+
+IDS = (1234567890123456785, 1234567890123456786, 1234567890123456799)
+AX = {"ax": {"column": "ax", "unit": "m/s^2"}}
+
+
+def cars() -> dict[str, Any]:
+    """Return three cars in turns, of which each has 20 rows."""
+    return {"t": np.repeat(np.arange(20) / 100, 3), "ax": np.tile([1.0, 2.0, 3.0], 20)}
+
+
+@pytest.mark.parametrize("column", ["vehicle_id", "column"])
+@pytest.mark.parametrize("kind", [pl.Int64, pl.UInt64, pl.Decimal(38, 0), pl.String])
+def test_identifiers_keep_all_digits(tmp_path: Path, kind: Any, column: str) -> None:
+    file = tmp_path / "log.parquet"
+    numbers = pl.Series("id", IDS * 20, dtype=pl.Int64).cast(kind)
+    pl.DataFrame(cars()).with_columns(numbers).write_parquet(file)
+    drive = {"vehicle_id": {"column": "id"}} if column == "vehicle_id" else {"column": "id"}
+    log = read_measured(file, a_mapping(signals=AX, drive=drive))
+    name = "vehicle_id" if column == "vehicle_id" else "drive_name"
+    values = zip(log.drives[name].to_pylist(), log.drives["ax"].to_pylist(), strict=True)
+    assert set(values) == {(str(number), 1000 * (i + 1)) for i, number in enumerate(IDS)}
+
+
+def test_identifiers_of_hdf5_keep_all_digits(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        for name, values in (cars() | {"id": np.array(IDS * 20)}).items():
+            file[name] = values
+    log = read_measured(
+        tmp_path / "log.h5", a_mapping(signals=AX, drive={"vehicle_id": {"column": "id"}})
+    )
+    assert set(log.drives["vehicle_id"].to_pylist()) == set(map(str, IDS))
+
+
+def test_identifiers_that_a_float_has_rounded_are_refused(tmp_path: Path) -> None:
+    table = pl.DataFrame(cars()).with_columns(id=pl.Series([*IDS[:2], 7] * 20, dtype=pl.Float64))
+    table.write_parquet(tmp_path / "log.parquet")
+    mapping = a_mapping(signals=AX, drive={"vehicle_id": {"column": "id"}})
+    log = read_measured(tmp_path / "log.parquet", mapping)
+    assert set(log.drives["vehicle_id"].to_pylist()) == {"7"}
+    assert log.counts.quarantined == {"out_of_range": 40}
+
+
+def test_conditions_on_long_numbers_and_decimals_as_signals(tmp_path: Path) -> None:
+    table = (
+        pl.DataFrame(cars())
+        .filter(pl.col("ax") == 2)
+        .with_columns(ax=pl.lit(Decimal("2.50")), frame=pl.Series([*IDS[:2]] * 10))
+    )
+    table.write_parquet(tmp_path / "log.parquet")
+    where = [{"column": "frame", "one_of": [str(IDS[1])]}]
+    log = read_measured(tmp_path / "log.parquet", a_mapping(signals=AX, where=where))
+    assert log.drives["ax"].to_pylist() == [2500] * 19  # on ticks between rows, too
+
+
+def german(**drive: Any) -> Mapping:
+    layout = {"separator": ";", "decimal_comma": True}
+    return a_mapping(signals=AX, csv=layout, drive=drive)
+
+
+def test_points_group_digits_beside_a_decimal_comma(tmp_path: Path) -> None:
+    rows = [f"0,{i:02};{v};1.320" for i, v in enumerate(["1,5", "-12,25", "0,5", "2", "10"])]
+    log = read_text(tmp_path, "\n".join(["t;ax;m", *rows]), german(mass_kg={"column": "m"}))
+    assert log.drives["mass_kg"].to_pylist() == [1320.0] * 5
+    assert log.drives["ax"].to_pylist() == [1500, -12250, 500, 2000, 10000]
+    grouped = {
+        "-1.000,5": "out_of_range", "1.234.567": "out_of_range", "1.000,5": "out_of_range",
+        "0.5": "not_a_number", "1.5": "not_a_number", "12.3456": "not_a_number",
+        "1,000.5": "not_a_number", "1.0005,5": "not_a_number", "0.320": "not_a_number",
+    }  # fmt: skip
+    rows = [f"0,{i:02};{v};1" for i, v in enumerate(["1", *grouped, "2"])]
+    log = read_text(tmp_path, "\n".join(["t;ax;m", *rows]), german())
+    assert [reason for _, reason, _ in reasons(log)] == [*grouped.values()]
+
+
+def test_grouped_digits_of_quoted_fields_are_no_numbers(tmp_path: Path) -> None:
+    text = 't,ax\n0,1\n0.01,"1,320"\n0.02,"1,5"\n0.03,2\n'
+    log = read_text(tmp_path, text, a_mapping(signals=AX))
+    assert [row[1] for row in reasons(log)] == ["not_a_number"] * 2
+
+
+HEADER, ROWS = "t,ax,beta", [f"{i / 100},{i % 7},0.5" for i in range(100)]
+SWAPPED = [f"0.5,{i / 100},{i % 7}" for i in range(100, 200)]
+
+
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        ("t,ax,beta", [f"{i / 100},{i % 7},0.5" for i in range(100, 200)]),
+        ("beta,t,ax", SWAPPED),
+        ('"beta",t, ax', SWAPPED),
+        ("new,beta,t,ax", [f"8,{row}" for row in SWAPPED]),
+        ("beta,t,ax,new", [f"{row},8" for row in SWAPPED]),
+    ],
+)
+@pytest.mark.parametrize("block_bytes", [2**22, 200])
+def test_a_second_header_gives_the_places_of_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, header: str, rows: list[str], block_bytes: int
+) -> None:
+    monkeypatch.setattr("fleet_slip.ingest.formats.csv.BLOCK_BYTES", block_bytes)
+    log = read_text(tmp_path, "\n".join([HEADER, *ROWS, header, *rows]))
+    assert log.drives["ax"].to_pylist() == [1000 * (i % 7) for i in range(200)]
+    assert set(log.drives["sideslip"].to_pylist()) == {87}
+    assert [row[0] for row in reasons(log)] == [101]
+
+
+def test_a_second_header_without_a_mapped_column_refuses_the_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no column 'ax'"):
+        read_text(tmp_path, "\n".join([HEADER, *ROWS, "t,beta,gamma", *SWAPPED]))
+
+
+@pytest.mark.parametrize("text", ["NaN", "nan", "-nan", "-nan(ind)", "1.#QNAN", "-1.#IND", "+NaN"])
+def test_nan_is_a_missing_value_of_its_signal(tmp_path: Path, text: str) -> None:
+    columns = {"t": np.arange(5) / 100, "ax": [1, text, 3, text, 5], "beta": [0.5] * 5}
+    log = read_text(tmp_path, csv_text(columns))
+    assert log.drives["ax"].to_pylist() == [1000, None, 3000, None, 5000]
+    assert log.drives["sideslip"].to_pylist() == [87] * 5
+    assert log.counts.quarantined == {}
+
+
+def test_nan_of_parquet_is_missing_and_infinity_is_refused(tmp_path: Path) -> None:
+    table = {"t": np.arange(4) / 100, "ax": [1.0, np.nan, np.inf, 2.0], "beta": np.zeros(4)}
+    pl.DataFrame(table).write_parquet(tmp_path / "log.parquet")
+    log = read_measured(tmp_path / "log.parquet", a_mapping())
+    assert log.counts.rows_kept == 3
+    assert log.counts.quarantined == {"not_finite": 1}
