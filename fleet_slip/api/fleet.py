@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.recordings import Replace
     from fleet_slip.operations.night import NightReport
     from fleet_slip.simulation.campaign import Campaign
-    from fleet_slip.simulation.simulate import SimulationReport
+    from fleet_slip.simulation.simulate import Engine, SimulationReport
     from fleet_slip.views import Session
     from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -185,6 +185,7 @@ class Fleet:
         *,
         days: int | None = None,
         through: date | str | None = None,
+        engine: "Engine" = "kernel",
         workers: Workers = None,
         progress: ShowProgress | None = None,
     ) -> "SimulationReport":
@@ -198,6 +199,9 @@ class Fleet:
             Simulate only the first days of the campaign. None means all.
         through
             Last day to simulate: a date, `YYYY-MM-DD`, or `today`. None means all days.
+        engine
+            `kernel`, the compiled loop, or `highway-env`: its vehicle drives each sample, which
+            is slower and writes the same logs.
         workers
             A number of threads, the address of a Dask scheduler, or an executor.
         progress
@@ -227,6 +231,7 @@ class Fleet:
                 chosen_days,
                 executor,
                 total_progress(progress),
+                engine,
             )
             figures.rows, figures.size_bytes = report.rows, report.size_bytes
         return report

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -35,6 +35,10 @@ def simulate(
     campaign: Annotated[str, typer.Argument(help="Campaign of configs/campaigns, or a TOML file.")],
     days: opt.CampaignDays = None,
     through: opt.Through = None,
+    engine: Annotated[
+        Literal["kernel", "highway-env"],
+        typer.Option(help="The compiled kernel, or highway-env's vehicle: slower, the same logs."),
+    ] = "kernel",
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     json: opt.Json = False,
@@ -48,6 +52,7 @@ def simulate(
             campaign,
             days=days,
             through=last_day(through),
+            engine=engine,
             workers=cluster or threads,
             progress=show,
         )

@@ -5,11 +5,12 @@ derived from the content of the batch, so that a changed campaign is detected.
 """
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from datetime import date
 from functools import partial
+from typing import Literal
 
 import numpy as np
 import pyarrow as pa
@@ -31,6 +32,7 @@ from fleet_slip.simulation.sensors import (
     Recorder,
 )
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts, retrying
+from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
 from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
@@ -125,7 +127,11 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
     require_agreement(perfect, spec.drive_id, TOLERANCE)
 
 
-def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
+Engine = Literal["kernel", "highway-env"]
+"""Advances the cars: the compiled kernel, or highway-env's vehicle sample by sample."""
+
+
+def simulate_batch(signals: SignalCatalog, batch: Batch, engine: Engine = "kernel") -> pa.Table:
     """Simulate and measure the drives of a batch. The result depends on the batch alone.
 
     Columns are in the order of `SignalCatalog.log_schema`, without extra signals that no drive has.
@@ -133,7 +139,8 @@ def simulate_batch(signals: SignalCatalog, batch: Batch) -> pa.Table:
     """
     logs: list[DriveLog] = []
     for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
-        logs += simulate_logs(signals, batch.drives[first : first + DRIVES_AT_ONCE])
+        drives = batch.drives[first : first + DRIVES_AT_ONCE]
+        logs += simulate_logs(signals, drives, engine=engine)
     return tabulate(signals, batch, logs)
 
 
@@ -142,7 +149,10 @@ MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
 
 
 def simulate_logs(
-    signals: SignalCatalog, specs: Sequence[DriveSpec], channels: Sequence[str] = ()
+    signals: SignalCatalog,
+    specs: Sequence[DriveSpec],
+    channels: Sequence[str] = (),
+    engine: Engine = "kernel",
 ) -> list[DriveLog]:
     """Simulate drives together and measure each block by block with its own sensors.
 
@@ -155,7 +165,13 @@ def simulate_logs(
     ]
     motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in channels} for _ in specs]
     logs: dict[int, DriveLog] = {}
-    for block in simulate_blocks([lane_drive(spec) for spec in specs]):
+    drives = [lane_drive(spec) for spec in specs]
+    simulate_lanes: Callable[..., None] = batch_kernel.simulate_lanes
+    if engine == "highway-env":
+        from fleet_slip.vehicle.highway import HighwayLanes  # noqa: PLC0415 - imports highway-env
+
+        simulate_lanes = HighwayLanes(drives)
+    for block in simulate_blocks(drives, simulate_lanes=simulate_lanes):
         recorder, receiver = recorders[block.drive], receivers[block.drive]
         truth = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
         for name, values in motions[block.drive].items():
@@ -305,6 +321,7 @@ def simulate_campaign(
     days: Iterable[date],
     executor: Executor,
     progress: Progress = no_progress,
+    engine: Engine = "kernel",
 ) -> SimulationReport:
     """Simulate and commit the batches of days that are not in the logs.
 
@@ -319,7 +336,7 @@ def simulate_campaign(
             for batch in campaign.batches(day):
                 has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)
-    report = _simulate(warehouse, plan, len(open_days), executor, progress)
+    report = _simulate(warehouse, plan, len(open_days), executor, progress, engine)
     report.campaign, report.days_present = campaign.name, len(days) - len(open_days)
     _complete(warehouse, campaign, open_days)
     report.logs_version = warehouse.logs.snapshot().version
@@ -364,6 +381,7 @@ def _simulate(
     days: int,
     executor: Executor,
     progress: Progress,
+    engine: Engine = "kernel",
 ) -> SimulationReport:
     start = time.perf_counter()
     snapshot, report = warehouse.logs.snapshot(), SimulationReport()
@@ -381,7 +399,9 @@ def _simulate(
             rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
             yield from missing
 
-    for _, result in run_tasks(executor, partial(_write, warehouse), backlog(), _task_name):
+    for _, result in run_tasks(
+        executor, partial(_write, warehouse, engine=engine), backlog(), _task_name
+    ):
         if landed := _commit(warehouse, result):
             report.batches_written += 1
             report.drives += len(landed.drives)
@@ -400,12 +420,12 @@ def _task_name(batch: Batch) -> str:
     return f"{batch.campaign}, {batch.day}, file {batch.index}"
 
 
-def _write(warehouse: Warehouse, batch: Batch) -> _Written:
+def _write(warehouse: Warehouse, batch: Batch, engine: Engine = "kernel") -> _Written:
     drives = _not_erased(warehouse, batch.drives)
     if not drives:
         return _Written(batch, (), None, 0)
     check_against_highway_env(drives)
-    rows = simulate_batch(warehouse.catalog.signals, replace(batch, drives=drives))
+    rows = simulate_batch(warehouse.catalog.signals, replace(batch, drives=drives), engine)
     name = f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"  # before its checksum
     action = warehouse.logs.put(name, warehouse.logs.encode(rows), batch.day)
     return _Written(batch, drives, action, rows.num_rows)

@@ -1,7 +1,7 @@
 """Simulates many drives at once: each is a lane of a loop that the compiler vectorises."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -156,7 +156,9 @@ class TruthBlock:
 
 
 def simulate_blocks(
-    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
+    drives: Sequence[LaneDrive],
+    steps_per_sample: int = STEPS_PER_SAMPLE,
+    simulate_lanes: Callable[..., None] = batch_kernel.simulate_lanes,
 ) -> Iterator[TruthBlock]:
     """Simulate drives, sampled at 100 Hz from their start.
 
@@ -170,6 +172,8 @@ def simulate_blocks(
         The drives. The blocks of all lanes take at most 76 MB.
     steps_per_sample
         Integration steps of each sample of 10 ms.
+    simulate_lanes
+        The loop over time and lanes: the kernel, or `highway.HighwayLanes` of these drives.
 
     Yields
     ------
@@ -202,7 +206,7 @@ def simulate_blocks(
             batch_kernel.start_drive(memory, lane_table, lane, index, car, speed_mps)
         if (lane_table[DRIVE] == ABSENT).all():
             return
-        batch_kernel.simulate_lanes(
+        simulate_lanes(
             routes, roads, surfaces, steps_per_sample, memory, lane_table, truth, results
         )
         for lane, (index, tick, _, first) in enumerate(lane_table.T.tolist()):

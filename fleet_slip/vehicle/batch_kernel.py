@@ -392,6 +392,21 @@ def _finish_sample(memory: Any, lane_table: Any, routes: Any, truth: Any, result
 
 
 @kernel
+def begin_sample(
+    routes: Any, roads: Any, surfaces: Any, memory: Any, lane_table: Any, truth: Any, results: Any
+) -> None:
+    """Record the state of all cars, and compute the demands of their drivers."""
+    _record(memory, lane_table, routes, roads, surfaces, truth, results)
+    decide_lanes(memory)
+
+
+@kernel
+def finish_sample(routes: Any, memory: Any, lane_table: Any, truth: Any, results: Any) -> int:
+    """Record forces and angles, count samples and laps; return the number of complete blocks."""
+    return _finish_sample(memory, lane_table, routes, truth, results)
+
+
+@kernel
 def simulate_lanes(
     routes: Any,
     roads: Any,

@@ -53,6 +53,10 @@ class Environment(NamedTuple):
     """Cornering stiffness over that of warm tyres."""
 
 
+CALM = Environment(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
+"""A flat, even and calm road, and warm tyres."""
+
+
 class Compliance(NamedTuple):
     """Elastic states of steering and tyres, which follow the car with a lag."""
 
@@ -446,6 +450,5 @@ def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> De
     ideal = ImperfectionConstants(
         0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     )
-    calm = Environment(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
-    rates, _ = imperfect_derivative(x, u, rigid, calm, brakes, c, ideal)
+    rates, _ = imperfect_derivative(x, u, rigid, CALM, brakes, c, ideal)
     return rates

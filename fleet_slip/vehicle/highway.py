@@ -5,48 +5,62 @@ so that a positive steering angle turns the car to the right of the picture.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple, Self
 
 import highway_env
 import numpy as np
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
+from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
+from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import LaneDrive, simulate_samples
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
+    CALM,
     NO_BRAKES,
     Acceleration,
+    Compliance,
+    ComplianceRates,
     Derivative,
+    Environment,
     WheelForce,
     Wheels,
     body_acceleration,
-    derivative,
+    imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
     STEP_S,
+    Path,
+    Pose,
+    PoseSlopes,
     Slopes,
     advance,
+    advance_compliance,
+    advance_pose,
     extrapolate,
+    pose_slopes,
 )
 from fleet_slip.vehicle.parameters import (
+    PERFECT,
+    CarImperfections,
     Constants,
     Controls,
+    ImperfectionConstants,
     State,
     VehicleParameters,
     constants,
+    imperfection_constants,
     load_vehicle,
 )
 from fleet_slip.vehicle.tyre import cornering_stiffness
-
-NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
-
 
 CHECKED_SAMPLES = 150
 """Samples of a drive that are compared with highway-env: 1.5 s."""
@@ -65,17 +79,45 @@ class PlanePose(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """State and pose of the car, and the slopes of the previous step."""
+    """State and poses of the car, and their rates in the previous step."""
 
     state: State
+    compliance: Compliance
     pose: PlanePose
+    place: Pose
+    """Position relative to the line of a road."""
     slopes: Slopes
+    compliance_rates: ComplianceRates
     pose_rates: PlanePose
+    place_rates: PoseSlopes
+    force: tuple[float, float]
+    """Specific force ax, ay at the beginning of the last call, in m/s²."""
+
+
+AT_REST = Motion(
+    State(*len(State._fields) * (0.0,)),
+    Compliance(*len(Compliance._fields) * (0.0,)),
+    PlanePose(0.0, 0.0, 0.0),
+    Pose(0.0, 0.0, 1.0, 0.0),
+    Slopes(*len(Slopes._fields) * (0.0,)),
+    ComplianceRates(*len(ComplianceRates._fields) * (0.0,)),
+    PlanePose(0.0, 0.0, 0.0),
+    PoseSlopes(*len(PoseSlopes._fields) * (0.0,)),
+    (0.0, 0.0),
+)
+STRAIGHT = Path(*len(Path._fields) * (0.0,))
 
 
 @kernel
-def _rates(x: State, u: Controls, c: Constants) -> Derivative:
-    return derivative(x, u, NO_BRAKES, c)
+def _rates(
+    x: State,
+    u: Controls,
+    compliance: Compliance,
+    environment: Environment,
+    c: Constants,
+    t: ImperfectionConstants,
+) -> Derivative:
+    return imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)[0]
 
 
 @kernel
@@ -96,10 +138,23 @@ def _pose_rates(x: State, heading: float) -> PlanePose:
 
 @kernel
 def _steps(
-    motion: Motion, u: Controls, c: Constants, step: float, count: int, order: float
+    motion: Motion,
+    u: Controls,
+    environment: Environment,
+    path: Path,
+    c: Constants,
+    t: ImperfectionConstants,
+    step: float,
+    count: int,
+    order: float,
 ) -> Motion:
-    x, pose, slopes, previous = motion
-    for _ in range(count):
+    x, compliance, pose, place, slopes, yielding, previous, travel, (ax, ay) = motion
+    for k in range(count):
+        d, compliance_rates = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
+        if k == 0:
+            ax, ay = d.ax, d.ay
+        place_rates = pose_slopes(x, place, path)
+        place, travel = advance_pose(place, place_rates, travel, step, order), place_rates
         rates = _pose_rates(x, pose.heading)
         pose = PlanePose(
             pose.x + step * extrapolate(rates.x, previous.x, order),
@@ -107,9 +162,12 @@ def _steps(
             pose.heading + step * extrapolate(rates.heading, previous.heading, order),
         )
         previous = rates
-        x, slopes = advance(x, derivative(x, u, NO_BRAKES, c), slopes, c, step, order)
-        order = SECOND_ORDER
-    return Motion(x, pose, slopes, previous)
+        x, slopes = advance(x, d, slopes, c, step, order)
+        compliance = advance_compliance(
+            compliance, compliance_rates, yielding, x.steering_wheel, t, step, order
+        )
+        yielding, order = compliance_rates, SECOND_ORDER
+    return Motion(x, compliance, pose, place, slopes, yielding, previous, travel, (ax, ay))
 
 
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
@@ -133,6 +191,8 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         The car; by default `PARAMETERS`.
     adhesion
         Adhesion coefficient of the road; by default `ADHESION`.
+    imperfections
+        Imperfections of the car; by default none.
     """
 
     PARAMETERS: VehicleParameters = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
@@ -154,10 +214,16 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         speed: float = 0,
         parameters: VehicleParameters | None = None,
         adhesion: float | None = None,
+        imperfections: CarImperfections = PERFECT,
     ) -> None:
         self.parameters = self.PARAMETERS if parameters is None else parameters
         self.adhesion = self.ADHESION if adhesion is None else adhesion
         c = self.constants = constants(self.parameters, self.adhesion)
+        self.imperfections = imperfections
+        self.imperfection_constants = imperfection_constants(
+            self.parameters, imperfections, SAMPLE_S
+        )
+        self.environment, self.path = CALM, STRAIGHT
         self.MASS = c.mass
         self.INERTIA_Z = c.yaw_inertia
         self.LENGTH_A, self.LENGTH_B = c.front, c.rear
@@ -166,8 +232,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         super().__init__(road, position, heading, speed)
         rolling = speed * c.inverse_radius
         self._internal = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
-        self._slopes = NO_SLOPES
-        self._pose_rates = PlanePose(0.0, 0.0, 0.0)
+        self.last_motion = AT_REST
         self._step_s = 0.0
 
     @classmethod
@@ -182,9 +247,10 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
             vehicle.speed,
             vehicle.parameters,
             vehicle.adhesion,
+            vehicle.imperfections,
         )
         copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
-        copy._internal = vehicle._internal
+        copy._internal, copy.last_motion = vehicle._internal, vehicle.last_motion
         if hasattr(vehicle, "color"):
             copy.color = vehicle.color
         return copy
@@ -195,6 +261,13 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         return self._internal._replace(
             vx=float(self.speed), vy=float(self.lateral_speed), yaw_rate=float(self.yaw_rate)
         )
+
+    @property
+    def compliance(self) -> Compliance:
+        """Elastic states of steering and tyres; the rack is within its play."""
+        column, play = self._internal.steering_wheel, self.imperfection_constants.half_lash
+        last = self.last_motion.compliance
+        return last._replace(rack=min(max(last.rack, column - play), column + play))
 
     @property
     def sideslip(self) -> float:
@@ -223,7 +296,10 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         return np.array([*pose_rates, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
     def _rates_of(self, x: State) -> Derivative | Acceleration:
-        return _rates(x, self.controls, self.constants)
+        imperfections = self.imperfection_constants
+        return _rates(
+            x, self.controls, self.compliance, self.environment, self.constants, imperfections
+        )
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds in steps of at most `STEP_S`."""
@@ -232,9 +308,11 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         step_s = dt / count
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
         pose = PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading))
-        motion = Motion(self.motion, pose, self._slopes, self._pose_rates)
-        motion = _steps(motion, self.controls, self.constants, step_s, count, order)
-        self._internal, pose, self._slopes, self._pose_rates = motion
+        motion = self.last_motion._replace(state=self.motion, compliance=self.compliance, pose=pose)
+        surroundings = self.environment, self.path
+        constants = self.constants, self.imperfection_constants
+        motion = _steps(motion, self.controls, *surroundings, *constants, step_s, count, order)
+        self._internal, pose, self.last_motion = motion.state, motion.pose, motion
         self._step_s = step_s
         self.position, self.heading = np.array([pose.x, pose.y]), pose.heading
         self.speed, self.lateral_speed, self.yaw_rate = motion.state[:3]
@@ -268,6 +346,75 @@ class LinearTyreVehicle(FourWheelVehicle):
         return _rates_on_axles(x, along, front, rear, c)
 
 
+class HighwayLanes:
+    """Advances lanes as `batch_kernel.simulate_lanes`, each car by `FourWheelVehicle.step`.
+
+    Roads, drivers and records are those of the kernel.
+    """
+
+    def __init__(self, drives: Sequence[LaneDrive]) -> None:
+        self._drives = drives
+        self._vehicles: dict[int, FourWheelVehicle] = {}
+
+    def __call__(
+        self,
+        routes: NDArray[np.void],
+        roads: FloatArray,
+        surfaces: FloatArray,
+        steps: int,
+        memory: FloatArray,
+        lane_table: IntArray,
+        truth: FloatArray,
+        results: IntArray,
+    ) -> None:
+        """Simulate sample by sample until the block of a lane is complete."""
+        del steps
+        lanes = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES).T
+        complete = 0
+        while complete == 0:
+            batch_kernel.begin_sample(routes, roads, surfaces, memory, lane_table, truth, results)
+            for lane, drive in enumerate(lane_table[batch_kernel.DRIVE].tolist()):
+                if drive != batch_kernel.ABSENT:
+                    self._step(drive, lanes[lane])
+            complete = batch_kernel.finish_sample(routes, memory, lane_table, truth, results)
+
+    def _step(self, drive: int, column: FloatArray) -> None:
+        """Advance the vehicle of a drive by a sample; `column` is the lane's memory."""
+        vehicle = self._vehicles.get(drive)
+        if vehicle is None:
+            vehicle = self._vehicles[drive] = vehicle_of(self._drives[drive], float(column[0]))
+        demands = Controls(*_read(column, batch_kernel.CONTROLS, Controls))
+        vehicle.environment = Environment(*_read(column, batch_kernel.ENVIRONMENT, Environment))
+        vehicle.path = Path(*_read(column, batch_kernel.PATH, Path))
+        place = Pose(*_read(column, batch_kernel.POSE, Pose))  # in this lap
+        vehicle.last_motion = vehicle.last_motion._replace(place=place)
+        wheel = math.atan(demands.steering_wheel / vehicle.parameters.steering.ratio)
+        vehicle.act({"steering": wheel, "acceleration": demands.traction})
+        vehicle.step(SAMPLE_S)
+        motion = vehicle.last_motion
+        for row, values in (
+            (batch_kernel.STATE, motion.state),
+            (batch_kernel.SLOPES, motion.slopes),
+            (batch_kernel.POSE, motion.place),
+            (batch_kernel.FORCE, motion.force),
+            (batch_kernel.COMPLIANCE, motion.compliance),
+        ):
+            column[row : row + len(values)] = values
+
+
+def _read(column: FloatArray, row: int, fields: type[NamedTuple]) -> list[float]:
+    return column[row : row + len(fields._fields)].tolist()  # type: ignore[no-any-return]
+
+
+def vehicle_of(
+    drive: LaneDrive, speed_mps: float, kind: type[FourWheelVehicle] = FourWheelVehicle
+) -> FourWheelVehicle:
+    """Return the car of a drive as a vehicle of highway-env, without a limit of its speed."""
+    vehicle = kind(None, [0.0, 0.0], 0.0, speed_mps, drive.vehicle, drive.adhesion, drive.flaws)
+    vehicle.MAX_SPEED, vehicle.MIN_SPEED = math.inf, -math.inf
+    return vehicle
+
+
 def highway_twin(car: FourWheelVehicle) -> BicycleVehicle:
     """Return highway-env's own vehicle with the mass, inertia, axles and motion of a car."""
     twin = BicycleVehicle(None, car.position, car.heading, car.speed)
@@ -297,11 +444,7 @@ def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
         If a quantity differs by more than the tolerance.
     """
     speed = float(drive.road.speed_mps[0])
-    car, linear = (
-        kind(None, [0.0, 0.0], speed=speed, parameters=drive.vehicle, adhesion=drive.adhesion)
-        for kind in (FourWheelVehicle, LinearTyreVehicle)
-    )
-    car.MAX_SPEED = linear.MAX_SPEED = math.inf
+    car, linear = (vehicle_of(drive, speed, kind) for kind in (FourWheelVehicle, LinearTyreVehicle))
     bicycle = highway_twin(linear)
     kernel_states, car_states, linear_states, bicycle_states = [], [], [], []
     for demands, state in simulate_samples(drive, CHECKED_SAMPLES):

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from highway_env.vehicle.dynamics import BicycleVehicle
 
@@ -13,12 +15,18 @@ from fleet_slip.base import no_progress
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
-from fleet_slip.simulation.simulate import SimulationReport, simulate_batches, simulate_campaign
+from fleet_slip.simulation.simulate import (
+    SimulationReport,
+    lane_drive,
+    simulate_batches,
+    simulate_campaign,
+)
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.highway import FourWheelVehicle
+from fleet_slip.vehicle.highway import FourWheelVehicle, HighwayLanes
 from fleet_slip.warehouse.warehouse import Warehouse
-from tests.support.commands import RunCommand
+from tests.support.commands import RunCommand, run_on
+from tests.support.rolling import simulate_drives
 
 DAYS = 5
 
@@ -140,6 +148,38 @@ def test_what_is_not_as_highway_env_drives_is_not_written(
     assert "the simulated car departs from highway-env" in done.stderr
     assert f"in {vehicle}. The file was not written" in done.stderr
     assert not list((tmp_path / "data").rglob("*.parquet"))
+
+
+def test_highway_env_drives_whole_drives_as_the_kernel() -> None:
+    """Within 2e-11: its action is an angle of the road wheels, whose tangent is rounded.
+
+    One car and its road are imperfect; both drives are longer than a lap.
+    """
+    plan = load_campaign("fleet_realistic", SHIPPED_CONFIGS)
+    smoke = load_campaign("smoke", SHIPPED_CONFIGS)
+    specs = [*plan.drives(plan.first_day)[:1], *smoke.drives(smoke.first_day)[:1]]
+    drives = [lane_drive(replace(spec, laps=min(spec.laps, 1.2))) for spec in specs]
+    by_kernel = simulate_drives(drives)
+    by_highway_env = simulate_drives(drives, simulate_lanes=HighwayLanes(drives))
+    for expected, truth in zip(by_kernel, by_highway_env, strict=True):
+        assert truth.lost_control_tick == expected.lost_control_tick
+        for name in batch_kernel.CHANNELS:
+            values = getattr(truth, name)
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=2e-11, atol=2e-11)
+
+
+def test_a_campaign_that_highway_env_drives_has_the_same_logs(
+    run_command: RunCommand, tmp_path: Path
+) -> None:
+    words = ("simulate", "smoke", "--days", "1")
+    assert run_command(*words, "--engine", "highway-env").exit_code == 0
+    run_on(tmp_path / "other", *words)
+    logs, by_kernel = (
+        {file.name: file.read_bytes() for file in (tmp_path / root).rglob("smoke-*.parquet")}
+        for root in ("data", "other")
+    )
+    assert logs
+    assert logs == by_kernel
 
 
 def test_what_was_compared_with_highway_env_is_said_in_one_line(run_command: RunCommand) -> None:

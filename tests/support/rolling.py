@@ -1,6 +1,6 @@
 """Cars stepped by the package, under constant demands or through whole drives."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.resources import SHIPPED_CONFIGS
+from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.dynamics import NO_BRAKES, Derivative, derivative
@@ -94,12 +95,14 @@ class Truth:
 
 
 def simulate_drives(
-    drives: Sequence[LaneDrive], steps_per_sample: int = STEPS_PER_SAMPLE
+    drives: Sequence[LaneDrive],
+    steps_per_sample: int = STEPS_PER_SAMPLE,
+    simulate_lanes: Callable[..., None] = batch_kernel.simulate_lanes,
 ) -> list[Truth]:
     """Return what happens in each drive as a whole; see `simulate_blocks`."""
     parts: list[list[dict[str, FloatArray]]] = [[] for _ in drives]
     lost: dict[int, int | None] = {}
-    for block in simulate_blocks(drives, steps_per_sample):
+    for block in simulate_blocks(drives, steps_per_sample, simulate_lanes):
         parts[block.drive].append({name: x.copy() for name, x in block.channels.items()})
         lost[block.drive] = block.lost_control_tick
     return [
