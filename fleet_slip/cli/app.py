@@ -76,6 +76,7 @@ GROUPS = {
     "Operations": {
         "nightly": "pipeline_commands",
         "status": "operation_commands",
+        "contract": "operation_commands",
         "quality": "operation_commands",
         "calibrate": "operation_commands",
         "monitor": "operation_commands",
@@ -247,6 +248,14 @@ def options(
             "Default: $FLEET_SLIP_CONFIG.",
         ),
     ] = None,
+    lineage: Annotated[  # noqa: ARG001 - read by `recorded`
+        str | None,
+        typer.Option(
+            envvar="FLEET_SLIP_LINEAGE",
+            help="File or URL (http://HOST:PORT) for OpenLineage events of commands that change "
+            "the data root.",
+        ),
+    ] = None,
     _version: Annotated[
         bool,
         typer.Option(
@@ -312,8 +321,8 @@ def _exit_code_of_app() -> int:
 
 
 def _explain_late_options(arguments: list[str], code: object) -> None:
-    """Explain the place of --root and --config if they follow the command."""
-    early = "--root", "--config"
+    """Explain the place of --root, --config and --lineage if they follow the command."""
+    early = "--root", "--config", "--lineage"
     while arguments and arguments[0] in early:
         arguments = arguments[2:]
     late = [option for option in early if option in arguments]

@@ -1,6 +1,7 @@
-"""Commands of operations: status, quality, calibrate, monitor, verify, compact, forget, migrate."""
+"""Commands of operations, such as status, contract, quality, monitor, verify and forget."""
 
 import logging
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -13,6 +14,7 @@ from fleet_slip.cli.output import (
     print_answer,
     print_json,
     print_parts,
+    print_text,
     progress,
     progress_of_steps,
     say,
@@ -42,6 +44,28 @@ def status(
         say(f"- {problem}", logging.ERROR)
     if report.problem:
         raise report.problem
+
+
+def contract(
+    context: typer.Context,
+    output: Annotated[
+        Path | None, typer.Option(help="File to write, such as fleet.odcs.yaml. Default: stdout.")
+    ] = None,
+) -> None:
+    """Write the data contract of the views in ODCS 3.1: columns, units, ranges and keys.
+
+    Example: fleet-slip contract --output fleet.odcs.yaml
+    """
+    from fleet_slip.operations.data_contract import data_contract
+    from fleet_slip.storage.storage_errors import storage_errors
+
+    text = data_contract(fleet_of(context).warehouse)
+    if output is None:
+        print_text(text.removesuffix("\n"))
+        return
+    with storage_errors(output):
+        output.write_text(text, encoding="utf-8")
+    say(f"{output}: {len(text):,} characters. Check it by: datacontract lint {output}")
 
 
 def quality(

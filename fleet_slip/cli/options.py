@@ -3,14 +3,16 @@
 import functools
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, cast
 
 import typer
 
-from fleet_slip.storage.runs import recording
+from fleet_slip.storage.runs import Run, recording
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
+    from fleet_slip.warehouse.warehouse import Warehouse
 
 P = ParamSpec("P")
 
@@ -28,11 +30,27 @@ def recorded(command: Callable[P, None]) -> Callable[P, None]:
     def run(*arguments: P.args, **options: P.kwargs) -> None:
         if options.get("dry_run"):
             return command(*arguments, **options)
-        root = fleet_of(cast(typer.Context, options["context"])).root
-        with recording(root, command.__name__, sys.argv[1:]):
+        context = cast(typer.Context, options["context"])
+        warehouse = fleet_of(context).warehouse
+        with (
+            recording(warehouse.root, command.__name__, sys.argv[1:]) as current_run,
+            _lineage(context, warehouse, current_run, options),
+        ):
             return command(*arguments, **options)
 
     return run
+
+
+def _lineage(
+    context: typer.Context, warehouse: "Warehouse", current_run: Run, options: dict[str, object]
+) -> AbstractContextManager[None]:
+    """Return what emits the events of a run, if --lineage names a file or a URL."""
+    target = context.find_root().params.get("lineage")
+    if not target:
+        return nullcontext()
+    from fleet_slip.operations.lineage import emit_lineage
+
+    return emit_lineage(target, warehouse, current_run, options)
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]

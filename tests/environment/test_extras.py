@@ -17,6 +17,7 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 MODULES = {
     "mcap-ros2-support": "mcap_ros2",
+    "openlineage-python": "openlineage",
     "mlflow-skinny": "mlflow",
     "python-can": "can",
     "scikit-learn": "sklearn",
