@@ -1,6 +1,6 @@
 """Published models: publish, list, compare, promote and export them."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from fleet_slip.api.fleet_cohort import FleetCohort
     from fleet_slip.export.program import Target
     from fleet_slip.export.stepping import Estimator
+    from fleet_slip.ingest.mapping import Mapping as LogMapping
+    from fleet_slip.models.log_predictions import Predictions
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
     from fleet_slip.models.select import Selection
@@ -264,6 +266,52 @@ class FleetModels:
         for name, content in files.items():
             folder.put(name, content)
         return [output / name for name in files]
+
+    def predict(
+        self,
+        model: str | ModelVersion | None,
+        files: "Iterable[Path | str] | Path | str",
+        mapping: "str | LogMapping",
+        output: Path,
+        *,
+        replace: bool = False,
+    ) -> "Predictions":
+        """Predict the side-slip angle of log files, beside the reference where they have one.
+
+        The files are read like those of `Fleet.ingest`, and not stored.
+
+        Parameters
+        ----------
+        model
+            A reference or a version.
+        files
+            Log files, folders at any depth, or patterns.
+        mapping
+            The mapping of columns, units and axes: a name, the path of a TOML file, or a `Mapping`.
+        output
+            File to write, `.parquet`, `.csv` or `.mf4`: `drive_id`, `time_s` since the drive began,
+            `sideslip_estimate_deg` and `sideslip_reference_deg`. An MDF file has a channel group
+            for each drive.
+        replace
+            Replace an existing file.
+
+        Raises
+        ------
+        UsageError
+            If the output has another suffix, or exists.
+        InputError
+            If a file cannot be read.
+        DataError
+            If the logs lack a signal of the model.
+        """
+        from fleet_slip.ingest.log_files import find_logs
+        from fleet_slip.ingest.mapping import load_mapping
+        from fleet_slip.models.log_predictions import predict_logs
+
+        if isinstance(mapping, str):
+            mapping = load_mapping(mapping, self.warehouse.catalog)
+        logs = find_logs([files] if isinstance(files, Path | str) else list(files))
+        return predict_logs(self.warehouse, self.get(model), logs, mapping, output, replace=replace)
 
     def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:
         """Register a version in an MLflow server, once, as a pyfunc model.

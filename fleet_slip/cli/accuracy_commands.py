@@ -37,6 +37,28 @@ def score(
     print_answer(result, json)
 
 
+def predict(
+    context: typer.Context,
+    model: opt.Version,
+    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files or folders.")],
+    mapping: opt.Mapping,
+    output: Annotated[Path, typer.Option(help="File to write: .parquet, .csv or .mf4.")],
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the file if it exists.")
+    ] = False,
+    json: opt.Json = False,
+) -> None:
+    """Predict the side-slip angle of log files, beside the reference where they have one.
+
+    Writes drive_id, time_s since the drive began, sideslip_estimate_deg and
+    sideslip_reference_deg. Nothing is ingested.
+
+    Example: fleet-slip predict waterford drive.csv --mapping logger.toml --output beta.parquet
+    """
+    predictions = fleet_of(context).models.predict(model, logs, mapping, output, replace=replace)
+    print_answer(predictions, json)
+
+
 @recorded
 def evaluate(
     context: typer.Context,

@@ -67,6 +67,7 @@ GROUPS = {
     },
     "Accuracy": {
         "score": "accuracy_commands",
+        "predict": "accuracy_commands",
         "identify": "accuracy_commands",
         "report": "accuracy_commands",
         "watch": "accuracy_commands",

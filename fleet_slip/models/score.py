@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from fleet_slip.arrays import FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
@@ -161,7 +161,6 @@ def _estimate_rows(
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []
     total = 0
-    unit = float(warehouse.catalog.input_scales[label])
     with (
         connect_tables(warehouse, text) as database,
         guarded_query(database, predicate),
@@ -171,11 +170,8 @@ def _estimate_rows(
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
             estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
-            truth = _physical(rows, label, unit)
-            chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_)
-            chosen &= ~is_slow(
-                {name: _physical(rows, name, float(signals[name].scale)) for name in speeds}
-            )
+            truth, slow = label_of(signals, rows)
+            chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_) & ~slow
             total += int(chosen.sum())
             complete = chosen & np.isfinite(estimate) & np.isfinite(truth)
             estimates.append(estimate[complete])
@@ -186,10 +182,17 @@ def _estimate_rows(
     return estimate_rad, truth_rad, total
 
 
-def _physical(rows: pa.Table, name: str, scale: float) -> FloatArray:
+def label_of(signals: SignalCatalog, rows: pa.Table) -> tuple[FloatArray, BoolArray]:
+    """Return the label of rows in rad, NaN where null, and the rows where the car `is_slow`."""
+    names = [name for name in SPEEDS if name in signals.signals and name in rows.column_names]
+    slow = is_slow({name: _physical(signals, rows, name) for name in names})
+    return _physical(signals, rows, signals.label), np.broadcast_to(slow, len(rows))
+
+
+def _physical(signals: SignalCatalog, rows: pa.Table, name: str) -> FloatArray:
     """Return a column of counts in SI units, NaN where null."""
     counts = rows[name].to_numpy(zero_copy_only=False)
-    return np.asarray(counts.astype(np.float64) * scale)
+    return np.asarray(counts.astype(np.float64) * float(signals[name].scale))
 
 
 def calibrated_cars(warehouse: Warehouse) -> CarCounts:

@@ -1,0 +1,242 @@
+"""Predictions of a published model for log files, as a table beside the reference."""
+
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.arrays import FloatArray
+from fleet_slip.base import pluralize, require_extra
+from fleet_slip.columns.drive_columns import Workspace
+from fleet_slip.errors import AlarmError, DataError, UsageError
+from fleet_slip.grams.calibrated_columns import CarCounts
+from fleet_slip.grams.compute import counts_of
+from fleet_slip.ingest.logs import log_table
+from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_log import open_measured
+from fleet_slip.models.predict import Predictor
+from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.score import calibrated_cars, label_of
+from fleet_slip.quality.drive_signals import TICKS_PER_S
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.warehouse.warehouse import Warehouse
+
+FORMATS = (".parquet", ".csv", ".mf4")
+"""Suffixes of the output."""
+
+ESTIMATE, REFERENCE = "sideslip_estimate_deg", "sideslip_reference_deg"
+
+
+@dataclass(frozen=True)
+class PredictedDrive:
+    """Predictions of a drive: `table` has `drive_id`, `time_s`, estimate and reference in deg."""
+
+    drive_id: str
+    vehicle_id: str
+    table: pa.Table
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.table)
+
+    @property
+    def rows_estimated(self) -> int:
+        """Number of rows with an estimate."""
+        return self.rows - int(self.table[ESTIMATE].null_count)
+
+    @property
+    def errors_deg(self) -> FloatArray:
+        """Estimate minus reference on the rows that have both."""
+        errors = self._values(ESTIMATE) - self._values(REFERENCE)
+        return errors[np.isfinite(errors)]
+
+    @property
+    def rmse_deg(self) -> float | None:
+        """Root mean square error; None without a reference."""
+        return _root_mean_square(self.errors_deg)
+
+    def _values(self, name: str) -> FloatArray:
+        return np.asarray(self.table[name].to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def _root_mean_square(values: FloatArray) -> float | None:
+    return math.sqrt(float(np.mean(values**2))) if len(values) else None
+
+
+@dataclass(frozen=True)
+class Predictions(Answer):
+    """The predictions of log files, and what looks wrong in the files."""
+
+    DOCUMENT = "model output drives rows rows_estimated rmse_deg rows_quarantined suspicions"
+
+    model: str
+    output: str
+    predicted: tuple[PredictedDrive, ...]
+    rows_quarantined: int
+    suspicions: tuple[str, ...]
+    alarms: tuple[str, ...]
+
+    @property
+    def drives(self) -> list[dict[str, object]]:
+        """The figures of each drive."""
+        names = ("drive_id", "vehicle_id", "rows", "rows_estimated", "rmse_deg")
+        return [{name: getattr(drive, name) for name in names} for drive in self.predicted]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return sum(drive.rows for drive in self.predicted)
+
+    @property
+    def rows_estimated(self) -> int:
+        """Number of rows with an estimate."""
+        return sum(drive.rows_estimated for drive in self.predicted)
+
+    @property
+    def rmse_deg(self) -> float | None:
+        """Root mean square error over all rows with a reference; None without one."""
+        return _root_mean_square(np.concatenate([d.errors_deg for d in self.predicted]))
+
+    def parts(self) -> Iterator[Part]:
+        """Return the figures of each drive, and rows without an estimate."""
+        yield TextTable(
+            f"{self.model}: {pluralize(self.rows, 'row')} of "
+            f"{pluralize(len(self.predicted), 'drive')}",
+            "drive|rows|RMSE deg",
+            self.predicted,
+            "{drive_id}|{rows:,}|{rmse_deg:.4f}",
+        )
+        if missing := self.rows - self.rows_estimated:
+            yield Remark(f"{pluralize(missing, 'row')} without an estimate: a signal is missing.")
+        if self.rows_quarantined:
+            yield Remark(f"{pluralize(self.rows_quarantined, 'row')} of the files unusable.")
+        yield from (Remark(f"looks wrong: {text}") for text in self.suspicions)
+        yield Remark(f"written to {self.output}")
+
+    @property
+    def problem(self) -> AlarmError | None:
+        """The first alarm of a file."""
+        return AlarmError(self.alarms[0]) if self.alarms else None
+
+
+def predict_logs(
+    warehouse: Warehouse,
+    version: ModelVersion,
+    logs: Sequence[Path],
+    mapping: Mapping,
+    output: Path,
+    *,
+    replace: bool = False,
+) -> Predictions:
+    """Predict the side-slip angle of log files; write a table, and nothing to the data root.
+
+    Raises `UsageError` for an unknown suffix or an existing output, `InputError` for a file, and
+    `DataError` if the logs lack a signal of the model.
+    """
+    if output.suffix.lower() not in FORMATS:
+        raise UsageError(f"{output}: choose a name in {', '.join(FORMATS)}.")
+    if output.exists() and not replace:
+        raise UsageError(f"{output} exists. Choose another name, or replace it: --replace")
+    predictor = Predictor.from_manifest(version.catalog.signals, version.manifest)
+    missing = [name for name in predictor.plan.signals if name not in mapping.signal_names]
+    if missing:
+        raise DataError(
+            f"{version.reference} needs {', '.join(missing)}, which the mapping {mapping.name} "
+            "lacks. Map them, or publish a model without them: fleet-slip publish NAME --models"
+        )
+    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
+    drives: list[PredictedDrive] = []
+    rejected, suspicions, alarms = 0, list[str](), list[str]()
+    workspace = Workspace(predictor.plan)
+    for log in logs:
+        with open_measured(log, mapping) as stream:
+            for drive in stream.drives():
+                rows = log_table([drive], mapping)
+                label_rad, slow = label_of(mapping.signal_catalog, rows)
+                reference = np.where(slow, np.nan, label_rad)
+                drives.append(_predict_drive(rows, reference, predictor, workspace, cars))
+            faults = stream.suspicions()
+        rejected += sum(stream.counts.quarantined.values())
+        suspicions += [f"{log}: {fault}" for fault in faults]
+        alarms += [f"{log}: {fault}" for fault in faults if fault.does_harm]
+    predictions = Predictions(
+        version.reference, str(output), tuple(drives), rejected, tuple(suspicions), tuple(alarms)
+    )
+    if not predictions.rows_estimated:
+        raise DataError(
+            f"no row of the logs has all of {', '.join(predictor.plan.signals)}, which "
+            f"{version.reference} needs. Check them: fleet-slip ingest LOG --mapping "
+            f"{mapping.name} --dry-run"
+        )
+    about = {"model": version.reference, "model_sha256": version.sha256, "mapping": mapping.name}
+    content = _encode(output.suffix.lower(), [drive.table for drive in drives], about)
+    LocalFolder(output.parent).put(output.name, content)
+    return predictions
+
+
+def _predict_drive(
+    rows: pa.Table,
+    reference_rad: FloatArray,
+    predictor: Predictor,
+    workspace: Workspace,
+    cars: CarCounts,
+) -> PredictedDrive:
+    """Predict the rows of one drive."""
+    drive_id, vehicle_id = (rows[name][0].as_py() for name in ("drive_id", "vehicle_id"))
+    counts = counts_of(rows, predictor.plan, None, cars.get(vehicle_id))
+    columns = {ESTIMATE: predictor(counts, workspace), REFERENCE: reference_rad}
+    table = pa.table(
+        {
+            "drive_id": pa.array([drive_id] * len(rows)).dictionary_encode(),
+            "time_s": rows["tick"].to_numpy() / TICKS_PER_S,
+            **{n: pa.array(np.degrees(v), from_pandas=True) for n, v in columns.items()},
+        }
+    )
+    return PredictedDrive(drive_id, vehicle_id, table)
+
+
+def _encode(suffix: str, tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:
+    """Return the content of the output file."""
+    if suffix == ".mf4":
+        return _encode_mdf(tables, about)
+    table = pa.concat_tables(tables).unify_dictionaries()
+    stream = io.BytesIO()
+    if suffix == ".csv":
+        import polars as pl  # noqa: PLC0415 - slow to import
+
+        pl.DataFrame(table).write_csv(stream)
+    else:
+        import pyarrow.parquet as pq  # noqa: PLC0415 - slow to import
+
+        pq.write_table(table.replace_schema_metadata(about), stream)
+    return stream.getvalue()
+
+
+def _encode_mdf(tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:
+    """Return an MDF 4 file with a channel group for each drive, named after it."""
+    with require_extra("logs", "an output in .mf4"):
+        from asammdf import MDF, Signal  # noqa: PLC0415 - an extra
+    stream = io.BytesIO()
+    with MDF(version="4.10") as file:
+        file.header.comment = "; ".join(f"{key}: {value}" for key, value in about.items())
+        for table in tables:
+            time_s, name = table["time_s"].to_numpy(), table["drive_id"][0].as_py()
+            signals = [
+                Signal(
+                    table[column].to_numpy(zero_copy_only=False).astype(np.float64),
+                    time_s,
+                    unit="deg",
+                    name=column.removesuffix("_deg"),
+                )
+                for column in (ESTIMATE, REFERENCE)
+                if table[column].null_count < len(table)
+            ]
+            file.append(signals, acq_name=name, comment=name, common_timebase=True)
+        file.save(stream)
+    return stream.getvalue()
