@@ -5,7 +5,7 @@ floats, dates or timestamps. CSV fields stay text, so that what is not a number 
 as it was written.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -48,7 +48,8 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
                 for time_column, columns in columns_by_time.items()
             ]
         held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
-        for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s):
+        signals = {signal.column for signal in mapping.signals.values()}
+        for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s, signals):
             yield from rows.iter_slices(BATCH_ROWS)
 
 
@@ -84,14 +85,19 @@ WINDOW_ROWS = 2**16
 
 
 def merge_bases(
-    bases: Sequence[Iterator[pl.DataFrame]], time: str, held: Sequence[str], split_gap_s: float
+    bases: Sequence[Iterator[pl.DataFrame]],
+    time: str,
+    held: Sequence[str],
+    split_gap_s: float,
+    signals: Collection[str],
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
     Times are in s. A row whose time does not increase within its base has the reason in
     `DISORDER`, and is sorted at the base's last right time. Every row gets the last value of the
-    `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. The rows
-    of a single base are yielded unchanged.
+    `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. A base
+    without columns of `signals` has no rows of its own. The rows of a single base are yielded
+    unchanged.
     """
     opened = [_PendingBase(base, time, split_gap_s) for base in bases]
     columns = {name: kind for base in opened for name, kind in base.columns.items()}
@@ -109,11 +115,15 @@ def merge_bases(
     held_columns = [
         _HeldColumn(name, base_of_column.get(name, -1), time, split_gap_s) for name in held
     ]
+    with_signals = [
+        n for n, base in enumerate(filled) if not base.columns.keys().isdisjoint(signals)
+    ]
     while pending := [base for base in pending if base.fill()]:
         until = min(base.reached for base in pending)
         rows = pl.concat([_completed(base.take(until), columns) for base in pending])
         rows = rows.sort(_RIGHT, maintain_order=True)
-        yield rows.with_columns(column.hold(rows) for column in held_columns).drop(_RIGHT)
+        rows = rows.with_columns(column.hold(rows) for column in held_columns).drop(_RIGHT)
+        yield rows.filter(pl.col(BASE).is_in(with_signals))
 
 
 def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:

@@ -371,3 +371,64 @@ def test_a_trace_starts_in_the_zone_of_the_mapping(tmp_path: Path, suffix: str) 
     log = read(file, text.replace('"car.dbc"', '"car.dbc"\nchannel = "1"'))
     started = log.drives["started_at"][0].as_py()
     assert started.astimezone(UTC).replace(microsecond=0) == datetime(2024, 5, 31, 16, tzinfo=UTC)
+
+
+STATES = """VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 256 Motion: 8 ECU
+ SG_ ax : 7|16@0- (0.001,0) [0|0] "m/s2" ECU
+ SG_ beta : 20|12@1- (0.01,0) [0|0] "deg" ECU
+BO_ 295 Gear: 8 ECU
+ SG_ GEAR : 0|4@1+ (1,0) [0|15] "" ECU
+ SG_ level : 8|8@1+ (1,0) [0|255] "" ECU
+VAL_ 295 GEAR 5 "P" 6 "R" 7 "N" 8 "D" 14 "Init" 15 "SNA" ;
+VAL_ 295 level 254 "Init" 255 "SNA" ;
+"""
+
+
+def write_gears(folder: Path, gears: list[int]) -> Path:
+    """Write ax = i mm/s^2 in frame i, and a gear in another message at half the rate."""
+    motions = [Frame(1 + i / 100, 1, 256, i.to_bytes(2, "big") + bytes(6)) for i in range(100)]
+    states = [
+        Frame(0.999 + i / 50, 1, 295, bytes([gear, 2 * i, *bytes(6)]))
+        for i, gear in enumerate(gears)
+    ]
+    frames = sorted([*motions, *states])
+    return write_blf(folder / "gears.blf", frames, datetime(2024, 5, 31, 12, tzinfo=UTC))
+
+
+AX_ALONE = MAPPING.replace('sideslip = { column = "Motion.beta", unit = "deg" }\n', "")
+
+
+@pytest.mark.parametrize("odd", [None, 3, 15])
+def test_a_condition_on_a_state_of_another_message_holds_by_time(
+    tmp_path: Path, odd: int | None
+) -> None:
+    gears = [6] * 20 + [8] * 30
+    if odd is not None:
+        gears[25] = odd
+    text = AX_ALONE.replace("[time]", 'where = [{ column = "Gear.GEAR", one_of = ["D"] }]\n[time]')
+    log = read(write_gears(tmp_path, gears), text, STATES)
+    # Where a gear has no name the last one with a name holds on; SNA is a name.
+    expected = [i for i in range(40, 100) if odd != 15 or i not in {50, 51}]
+    assert log.drives["ax"].to_pylist() == expected
+    assert log.counts.quarantined == {}
+    assert (log.counts.rows_read, log.counts.rows_left_out) == (100, 100 - len(expected))
+
+
+def test_a_state_as_a_signal_is_its_number(tmp_path: Path) -> None:
+    text = AX_ALONE + 'gear = { column = "Gear.GEAR", unit = "1" }\n'
+    gears = [6] * 20 + [8] * 20 + [3, 14, 15] + [7] * 7
+    log = read(write_gears(tmp_path, gears), text, STATES)
+    numbers = log.drives["gear"].to_pylist()
+    assert {numbers[i] for i in (1, 30, 41, 79, 99)} == {6, 8, 7}
+    assert set(numbers) <= {6, 7, 8, None}
+
+
+def test_a_condition_on_a_number_of_another_message_holds_by_time(tmp_path: Path) -> None:
+    text = AX_ALONE.replace("[time]", 'where = [{ column = "Gear.level", at_least = 60 }]\n[time]')
+    log = read(write_gears(tmp_path, [8] * 50), text, STATES)
+    assert log.drives["ax"].to_pylist() == list(range(60, 100))
+    assert log.counts.quarantined == {}

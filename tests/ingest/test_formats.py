@@ -426,3 +426,20 @@ def test_a_clock_without_a_zone_does_not_depend_on_the_zone_of_the_reader(
     finally:
         monkeypatch.undo()
         time.tzset()
+
+
+@pytest.mark.parametrize("default", [None, b"", b"SNA"])
+def test_a_state_of_mdf_without_a_name_is_missing(tmp_path: Path, default: bytes | None) -> None:
+    names = {"val_0": 5, "text_0": b"R", "val_1": 6, "text_1": b"D", "val_2": 7, "text_2": b"SNA"}
+    gears = np.array([5] * 30 + [6] * 30 + [9, 7] + [6] * 38, "u1")
+    state = {**names, "default_addr": default} if default is not None else names
+    gear = Signal(samples=gears, timestamps=TIME_S, name="gear", conversion=state)
+    file = write_mdf(tmp_path, [a_x()], [gear])
+    ax = {"ax": {"column": "a_x", "unit": "m/s^2"}}
+    where = [{"column": "gear", "one_of": ["D"]}]
+    log = read_measured(file, own_clock(signals=ax, where=where))
+    assert log.counts.rows_kept in {68, 70} and log.counts.quarantined == {}
+    both = {**ax, "gear": {"column": "gear", "unit": "1"}}
+    assert set(read_measured(file, own_clock(signals=both)).drives["gear"].to_pylist()) <= {
+        5, 6, None,
+    }  # fmt: skip

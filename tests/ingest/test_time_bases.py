@@ -106,7 +106,7 @@ def test_windows_say_what_the_whole_says(
     source = FakeSource(frames, batch)
     columns = [f"v{i}" for i in range(len(frames))]
     with mock.patch.object(batches, "WINDOW_ROWS", window):
-        windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S))
+        windows = list(merge_bases(source.bases(columns), OWN_TIME, ["v0"], GAP_S, columns))
     some = [rows for rows in bases if rows]
     if len(some) < 2:
         found = [row for rows in windows for row in rows.select(OWN_TIME, *columns).rows()]

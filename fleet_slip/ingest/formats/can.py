@@ -1,8 +1,9 @@
 """Reads CAN traces: BLF, ASC, candump and others of python-can, with a database of messages.
 
 Each message is a time base, a column is `Message.Signal`. Error frames and remote requests are
-skipped. A value with a name in the database, such as `SNA`, is null; in a signal with named values
-only it is the name.
+skipped. A value with a name in the database, such as `SNA`, is null. A signal whose names are
+states, such as P, R, N, D, is these names, and null without one; as a signal of a mapping it is a
+number.
 
 Start bit, byte order and multiplexing are those of the DBC format, as cantools parses it. The tests
 compare with its decoder, which takes one frame at a time.
@@ -37,8 +38,10 @@ from fleet_slip.ingest.formats.source import (
     FormatSource,
     Spool,
     clock_start_s,
+    is_missing_state,
     load_library,
     missing_column,
+    names_states,
 )
 
 Bytes = NDArray[np.uint8]
@@ -332,6 +335,7 @@ class CanSource(FormatSource):
                 f"mapping {formats.name!r}."
             )
         self._file, self._bus, self._spool, self._blocks = file, formats.can, Spool(), blocks
+        self._numbers_alone = formats.plain_numbers.columns
         self._database = parse_database(formats.can)
         self._messages = {message.name: message for message in self._database.messages}
         self._identifiers_to_keep: set[_Key] = set()
@@ -388,11 +392,12 @@ class CanSource(FormatSource):
         """Yield the signals of one message; rows are frames that have one of them."""
         message, needed = self._messages[name], max(map(needed_bytes, signals.values()))
         frames = self._require_usable(message, next(iter(signals)), needed)
-        named = {
+        states = {
             column
             for column, signal in signals.items()
-            if signal.choices and self._has_names_only(message, signal)
+            if signal.choices and self._has_states(message, signal)
         }
+        names = states - self._numbers_alone
         for times_s, payloads in frames.take(self._bus.channel, needed):
             frame = {OWN_TIME: pl.Series(times_s)}
             has_value = np.zeros(len(times_s), dtype=np.bool_)
@@ -400,20 +405,29 @@ class CanSource(FormatSource):
                 sent = is_sent(message, signal, payloads)
                 has_value |= sent
                 raw = raw_numbers(signal, payloads)
-                frame[column] = _values(signal, raw, sent, as_names=column in named).alias(column)
+                frame[column] = _values(
+                    signal, raw, sent, as_names=column in names, is_state=column in states
+                ).alias(column)
             yield pl.DataFrame(frame).filter(has_value)
 
-    def _has_names_only(self, message: Any, signal: Any) -> bool:
-        """Return True if a signal has values, and all have names in the database."""
-        is_multiplexed = False
-        needed = needed_bytes(signal)
-        for _, payloads in self._frames[_key(message)].take(self._bus.channel, needed):
+    def _has_states(self, message: Any, signal: Any) -> bool:
+        """Return True if the names of a signal are states, and at least half of its values named.
+
+        A quantity, with a unit or a factor, has names for missing values alone.
+        """
+        is_quantity = signal.is_float or signal.scale != 1 or signal.offset != 0
+        if is_quantity or not names_states(map(str, signal.choices.values())):
+            return False
+        named = total = 0
+        for _, payloads in self._frames[_key(message)].take(
+            self._bus.channel, needed_bytes(signal)
+        ):
             sent = is_sent(message, signal, payloads)
-            named = np.isin(raw_numbers(signal, payloads), list(signal.choices))
-            if not (named | ~sent).all():
-                return False
-            is_multiplexed |= bool(sent.any())
-        return is_multiplexed
+            named += int(
+                (np.isin(raw_numbers(signal, payloads), list(signal.choices)) & sent).sum()
+            )
+            total += int(sent.sum())
+        return 2 * named > total
 
     def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
         """Return the frames of a message. Raises `InputError` if their sizes differ."""
@@ -462,14 +476,18 @@ class CanSource(FormatSource):
                 self._frames[identifier].extend(block.where(chosen))
 
 
-def _values(signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool) -> pl.Series:
-    """Return a signal, null where it was not sent; values that have a name are null, or all it."""
-    named = np.isin(raw, list(signal.choices)) if signal.choices else np.zeros_like(sent)
+def _values(
+    signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool, is_state: bool
+) -> pl.Series:
+    """Return a signal, null where it was not sent: names, or numbers but those for no value."""
+    choices = {value: str(text) for value, text in (signal.choices or {}).items()}
     if as_names:
-        texts = {value: str(text) for value, text in signal.choices.items()}
-        names = [texts[v] if s else None for v, s in zip(raw, sent, strict=True)]
+        names = [choices.get(v) if s else None for v, s in zip(raw.tolist(), sent, strict=True)]
         return pl.Series(names, dtype=pl.String)
-    return pl.Series(physical(signal, raw)).set(pl.Series(~sent | named), None)
+    absent = [v for v, text in choices.items() if not is_state or is_missing_state(text)]
+    if is_state and raw.size:  # a value without a name is none
+        absent += list(set(np.unique(raw).tolist()) - set(choices))
+    return pl.Series(physical(signal, raw)).set(pl.Series(~sent | np.isin(raw, absent)), None)
 
 
 def _key(message: Any) -> _Key:

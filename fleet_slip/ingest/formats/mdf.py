@@ -24,8 +24,10 @@ from fleet_slip.ingest.formats.source import (
     FormatSource,
     as_column,
     clock_start_s,
+    is_missing_state,
     load_library,
     missing_column,
+    names_states,
 )
 
 # Applies the conversions of an MDF file, of counts to physical values.
@@ -68,15 +70,18 @@ def require_arithmetic(conversion: Any) -> None:
         raise ValueError("times with a formula or a table as conversion are not supported")
 
 
-def to_physical(conversion: Any, raw: Array) -> Array:
-    """Return physical values, texts as bytes. Raises `ValueError` for other conversions."""
+def to_physical(conversion: Any, raw: Array, *, as_numbers: bool = False) -> Array:
+    """Return physical values, texts as bytes; of named states their numbers with `as_numbers`.
+
+    Raises `ValueError` for other conversions.
+    """
     kind = _kind_of(conversion)
     if kind == _NONE:
         return raw
     if kind == _FORMULA:
         raise ValueError(_NOT_COMPUTED)
     if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
-        return _by_ranges(conversion, kind, raw)
+        return _by_ranges(conversion, kind, raw, as_numbers=as_numbers)
     if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
         raise ValueError("the table of its conversion is not sorted")
     if any(not isinstance(part, bytes) for part in conversion.referenced_blocks.values()):
@@ -102,7 +107,7 @@ def _listed(conversion: Any, name: str) -> Array:
     return np.array(numbers, dtype=np.float64)
 
 
-def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
+def _by_ranges(conversion: Any, kind: str, raw: Array, *, as_numbers: bool) -> Array:
     """Apply a table of ranges, or of single values. Integers include the upper end."""
     points = kind == _VALUES_TO_TEXT
     lower, upper = (_listed(conversion, "val" if points else end) for end in ("lower", "upper"))
@@ -118,7 +123,15 @@ def _by_ranges(conversion: Any, kind: str, raw: Array) -> Array:
     parts = [*(texts[f"text_{number}"] for number in order), texts["default_addr"]]
     if any(isinstance(part, bytes) and b"{X}" in part for part in parts):  # of MDF 3
         raise ValueError(_NOT_COMPUTED)
+    named = [part for part in parts[:-1] if isinstance(part, bytes)]
+    if parts[-1] is None and len(named) == len(order):  # a state without a name is missing
+        parts[-1] = b"" if names_states(part.decode("utf-8", "replace") for part in named) else None
     if all(isinstance(part, bytes) for part in parts):
+        if as_numbers:
+            absent = [
+                not part or is_missing_state(part.decode("utf-8", "replace")) for part in parts
+            ]
+            return np.where(np.array(absent)[place], np.nan, raw)
         return np.array(parts, dtype=bytes)[place]
     values = np.full(raw.shape, np.nan)  # of which some have a name instead
     for number in np.unique(place).tolist():
@@ -141,10 +154,11 @@ _IDENTIFIER = (1 << 29) - 1
 class MdfSource(FormatSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
-    def __init__(self, mdf: Any, budget: Budget, zone: str | None) -> None:
-        """Take a file opened by asammdf, and the zone of a clock without one."""
+    def __init__(self, mdf: Any, budget: Budget, formats: FileFormats) -> None:
+        """Take a file opened by asammdf, and what the mapping states of it."""
         self._file, self._mdf = budget.file, mdf
-        self._start_s = _start_s(mdf.header, zone)
+        self._start_s = _start_s(mdf.header, formats.zone)
+        self._numbers_alone = formats.plain_numbers.columns
 
     def channels(self) -> list[Channel]:
         """Return all channels but the groups' masters."""
@@ -219,8 +233,9 @@ class MdfSource(FormatSource):
             record_count=records,
             raw=True,
         )
-        for signal, index in zip(signals, indices.values(), strict=True):
-            signal.samples = self._physical(number, index, signal.samples)
+        for signal, (name, index) in zip(signals, indices.items(), strict=True):
+            as_numbers = name in self._numbers_alone
+            signal.samples = self._physical(number, index, signal.samples, as_numbers=as_numbers)
         self._release()
         if len(signals[0]) < records:
             raise InputError(
@@ -230,13 +245,13 @@ class MdfSource(FormatSource):
             )
         return list(signals)
 
-    def _physical(self, number: int, index: int, raw: Any) -> Any:
+    def _physical(self, number: int, index: int, raw: Any, *, as_numbers: bool = False) -> Any:
         """Return the physical values of a channel, or None without any raw ones."""
         channel = self._mdf.groups[number].channels[index]
         try:
             conversion = conversion_of(channel)
             if raw is not None:
-                return to_physical(conversion, raw)
+                return to_physical(conversion, raw, as_numbers=as_numbers)
             require_arithmetic(conversion)
         except ValueError as error:
             raise InputError(
@@ -372,7 +387,7 @@ def open_mdf(budget: Budget, formats: FileFormats) -> Iterator[MdfSource]:
         mdf._mdf.name.unlink()  # it stays open until the process ends
     mdf._mdf.extract_attachment = lambda *_, **__: (b"", Path(), b"")
     try:
-        yield MdfSource(mdf, budget, formats.zone)
+        yield MdfSource(mdf, budget, formats)
     finally:
         mdf.close()
 

@@ -7,6 +7,7 @@ A format that stores the times of samples (MDF, CAN traces) has a clock: its tim
 import difflib
 import errno
 import logging
+import re
 import tempfile
 import time
 from abc import ABC, abstractmethod
@@ -166,6 +167,24 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
     is_long = values.dtype.kind in "iu" and values.dtype.itemsize == 8
     kind = values.dtype.newbyteorder("=") if is_long else np.dtype(np.float64)
     return pl.Series(name, np.ascontiguousarray(values, dtype=kind))
+
+
+_NO_STATE = re.compile(
+    r"sna|n/?a|nan|invalid|not.?(avail|valid|defined|used)|error|fault|fail|init|reserved|undefined"
+    r"|unknown|default|nicht.?verf|ung(ue|ü)ltig|fehler|signal_?ung",
+    re.IGNORECASE,
+)
+"""How databases call the values that stand for a missing one."""
+
+
+def names_states(texts: Iterable[str]) -> bool:
+    """Return True if names are those of states, such as P, R, N, D, and not of missing values."""
+    return sum(not _NO_STATE.match(text.strip()) for text in texts) > 1
+
+
+def is_missing_state(text: str) -> bool:
+    """Return True for a name that stands for a missing value."""
+    return _NO_STATE.match(text.strip()) is not None
 
 
 def find_column(file: Path, names: Sequence[str], column: str) -> int:
