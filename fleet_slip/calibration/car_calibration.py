@@ -215,15 +215,8 @@ MAX_PAIRS = 300
 """Cars whose first two drives are compared: enough for a variance to a tenth."""
 
 SYSTEMATIC_STD: Mapping[bool, Mapping[CalibrationParameterName, float]] = {
-    False: {
-        "steering_offset": 0.00004,
-        "speed_ratio": 0.0015,
-    },
-    True: {
-        "yaw_rate_offset": 0.0007,
-        "steering_offset": 0.0002,
-        "speed_ratio": 0.03,
-    },
+    False: {"steering_offset": 0.00004, "speed_ratio": 0.0015},
+    True: {"yaw_rate_offset": 0.0007, "steering_offset": 0.0002, "speed_ratio": 0.03},
 }
 """Standard errors that drives do not average out, on flat and on banked roads, from the attenuation
 by noise and from wheel slip. In banked bends, a body that rolls by 2 to 6 degrees per g adds 3 to
@@ -374,9 +367,7 @@ class CarEvidence:
         return values
 
     def uncertainties(
-        self,
-        estimates: Mapping[CalibrationParameterName, CarEstimate],
-        slices: Mapping[str, slice],
+        self, estimates: Mapping[CalibrationParameterName, CarEstimate], slices: Mapping[str, slice]
     ) -> dict[CalibrationParameterName, float]:
         """Return the standard errors of parameters that some drives determine."""
         variances: dict[CalibrationParameterName, float] = {}

@@ -44,10 +44,7 @@ class CheckReport:
 
 
 def check_grams(
-    warehouse: Warehouse,
-    count: int = 4,
-    progress: Progress = no_progress,
-    begin: int = 0,
+    warehouse: Warehouse, count: int = 4, progress: Progress = no_progress, begin: int = 0
 ) -> CheckReport:
     """Check the Gram rows of `count` evenly spaced log files, the first one at `begin`.
 
@@ -156,10 +153,7 @@ def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[st
 
 
 def stored_grams(
-    warehouse: Warehouse,
-    files: Sequence[TableFile],
-    grams: Iterable[str],
-    identity: str = PLAIN,
+    warehouse: Warehouse, files: Sequence[TableFile], grams: Iterable[str], identity: str = PLAIN
 ) -> dict[str, DriveGrams]:
     """Return the stored Grams of log files and a feature set, by log file."""
     paths = pa.array([file.path for file in files], pa.string())

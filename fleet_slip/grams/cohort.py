@@ -459,10 +459,7 @@ def sum_days(
 
 
 def clustered_moments(
-    cases: CompleteCases,
-    cluster: ClusterUnit | None = None,
-    *,
-    intercept: bool = True,
+    cases: CompleteCases, cluster: ClusterUnit | None = None, *, intercept: bool = True
 ) -> DriveMoments:
     """Return the moments of each drive and its cluster: by default its car, for one car its trip.
 

@@ -303,10 +303,7 @@ def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
 
 
 def by_sql(
-    warehouse: Warehouse,
-    files: Sequence[TableFile],
-    feature_set: str,
-    threads: int | None = None,
+    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, threads: int | None = None
 ) -> pa.Table:
     """Return the Gram rows of log files as `jobs/gram.sql` defines them."""
     with open_database(reading=warehouse.logs.folder, threads=threads) as database:
@@ -349,10 +346,7 @@ _INT64 = 2**63
 
 
 def wide_grams(
-    warehouse: Warehouse,
-    files: Sequence[TableFile],
-    feature_set: str,
-    delays: CourseDelays = None,
+    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, delays: CourseDelays = None
 ) -> pa.Table:
     """Return the Gram rows of log files for a feature set, sorted as by `jobs/gram.sql`.
 

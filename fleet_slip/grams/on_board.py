@@ -54,11 +54,7 @@ from fleet_slip.grams.gram_files import (
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.ingest.formats.parquet_footer import (
-    DELTA_BYTE_ARRAY,
-    RowGroup,
-    read_page_headers,
-)
+from fleet_slip.ingest.formats.parquet_footer import DELTA_BYTE_ARRAY, RowGroup, read_page_headers
 from fleet_slip.ingest.formats.tables import read_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark

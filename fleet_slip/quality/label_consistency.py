@@ -68,11 +68,7 @@ def _gains(drives: DriveBatches, label: int) -> FloatArray | None:
 
 
 def _fit_signs(
-    drives: DriveBatches,
-    label: int,
-    inputs: FloatArray,
-    with_label: FloatArray,
-    signs: FloatArray,
+    drives: DriveBatches, label: int, inputs: FloatArray, with_label: FloatArray, signs: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return signs that agree with the relation fitted with them, the relation, and the gains."""
     for _ in range(ROUNDS):
@@ -138,10 +134,7 @@ def find_odd_days(
     # The gain comes first: it decides where a group differs in both.
     scale = float(signals[label].scale)
     max_offset_rad = math.radians(CHECKS["zero of a day or file"].high)
-    bounds = {
-        GAIN: math.log(CHECKS["scale of a day or file"].high),
-        OFFSET: max_offset_rad / scale,
-    }
+    bounds = {GAIN: math.log(CHECKS["scale of a day or file"].high), OFFSET: max_offset_rad / scale}
     faults: dict[int, Fault] = {}
     usual = in_order.copy()
     while usual.sum() >= limits.min_drives:

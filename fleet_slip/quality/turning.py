@@ -14,13 +14,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
-from fleet_slip.quality.drive_signals import (
-    BATCH,
-    RADIUS_M,
-    TRACK_M,
-    DriveBatches,
-    MeanMoments,
-)
+from fleet_slip.quality.drive_signals import BATCH, RADIUS_M, TRACK_M, DriveBatches, MeanMoments
 
 if TYPE_CHECKING:
     from fleet_slip.regression.gram import GramTable
