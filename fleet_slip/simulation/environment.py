@@ -16,38 +16,11 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
-from fleet_slip.compiling import kernel
 from fleet_slip.errors import UsageError
 from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.vehicle.dynamics import Wheels, derivative
-from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
-from fleet_slip.vehicle.parameters import Constants, Controls, State, constants, load_vehicle
-
-
-@kernel
-def move(
-    x: State,
-    slopes: Slopes,
-    u: Controls,
-    brakes: Wheels[float],
-    c: Constants,
-    step_s: float,
-    count: int,
-    order: float,
-) -> Any:
-    """Advance a car by `count` steps; return state, slopes, and specific force at the start.
-
-    `order` is the order of the first step.
-    """
-    ax = ay = 0.0
-    for k in range(count):
-        d = derivative(x, u, brakes, c)
-        if k == 0:
-            ax, ay = d.ax, d.ay
-        x, slopes = advance(x, d, slopes, c, step_s, order)
-        order = SECOND_ORDER
-    return x, slopes, (ax, ay)
-
+from fleet_slip.vehicle.dynamics import Wheels
+from fleet_slip.vehicle.highway import FourWheelVehicle
+from fleet_slip.vehicle.parameters import load_vehicle
 
 Observation = NDArray[np.float32]
 WHEELS = ("fl", "fr", "rl", "rr")
@@ -151,14 +124,13 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         side = 1.0 if self.np_random.random() < 0.5 else -1.0
         drawn = {"speed_mps": speed, "steering_rad": side * steering, "adhesion": adhesion}
         self.trial = Trial(**{**drawn, **(options or {})})
-        self._constants = constants(self._vehicle, self.trial.adhesion)
-        rolling = self.trial.speed_mps * self._constants.inverse_radius
-        zeros = (0.0,) * 6
-        self._state = State(self.trial.speed_mps, *zeros, *(rolling,) * 4)
-        self._slopes = Slopes(*(0.0 for _ in Slopes._fields))
+        self._car = FourWheelVehicle(
+            None, [0.0, 0.0], 0.0, self.trial.speed_mps, self._vehicle, self.trial.adhesion
+        )
+        self._car.MAX_SPEED = math.inf
         self._brakes = np.zeros(len(WHEELS))
         self._bias = self._bias_std * self.np_random.standard_normal(len(self.signals))
-        self._ticks, self._force = 0, (0.0, 0.0)
+        self._ticks = 0
         return self._observe(), self._info()
 
     def step(
@@ -167,19 +139,13 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
         """Advance by 10 ms."""
         demanded = np.clip(np.asarray(action, dtype=float), 0.0, 1.0)
         self._brakes += (demanded - self._brakes) * (1 - math.exp(-TICK_S / BRAKE_LAG_S))
-        self._state, self._slopes, self._force = move(
-            self._state,
-            self._slopes,
-            Controls(self.trial.steering_at(self._time_s), 0.0),
-            Wheels(*(float(MAX_BRAKE_N * share) for share in self._brakes)),
-            self._constants,
-            STEP_S,
-            round(TICK_S / STEP_S),
-            SECOND_ORDER if self._ticks else FIRST_ORDER,
-        )
+        self._car.brakes = Wheels(*(MAX_BRAKE_N * self._brakes).tolist())
+        angle = self.trial.steering_at(self._time_s) / self._vehicle.steering.ratio
+        self._car.act({"steering": math.atan(angle), "acceleration": 0.0})
+        self._car.step(TICK_S)
         self._ticks += 1
-        slip = self._sideslip
-        lost = abs(slip) > LOST_SLIP_RAD or self._state.vx < LOST_SPEED_MPS
+        slip = self._car.sideslip
+        lost = abs(slip) > LOST_SLIP_RAD or self._car.motion.vx < LOST_SPEED_MPS
         reward = -((slip / COMFORTABLE_SLIP_RAD) ** 2) - BRAKING_COSTS * float(np.mean(demanded))
         truncated = self._time_s >= END_S
         return self._observe(), reward, bool(lost), bool(truncated), self._info()
@@ -188,17 +154,13 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
     def _time_s(self) -> float:
         return self._ticks * TICK_S
 
-    @property
-    def _sideslip(self) -> float:
-        return math.atan2(self._state.vy, self._state.vx)
-
     def _observe(self) -> Observation:
         """Return the signals with bias, noise and rounding to counts, within their ranges."""
-        x, c = self._state, self._constants
+        x, c = self._car.motion, self._car.constants
         tangent = c.steer_per_wheel * x.steering_wheel
         true = {
-            "ax": self._force[0],
-            "ay": self._force[1],
+            "ax": self._car.last_motion.force[0],
+            "ay": self._car.last_motion.force[1],
             "yaw_rate": x.yaw_rate,
             "steering_wheel": x.steering_wheel,
             "steer_fl": math.atan2(tangent, 1 - c.ackermann * tangent),
@@ -214,10 +176,10 @@ class SideSlipEnv(gymnasium.Env[Observation, Observation]):
 
     def _info(self) -> dict[str, Any]:
         return {
-            "sideslip_rad": self._sideslip,
-            "vx_mps": float(self._state.vx),
-            "vy_mps": float(self._state.vy),
-            "yaw_rate_rad_s": float(self._state.yaw_rate),
+            "sideslip_rad": self._car.sideslip,
+            "vx_mps": self._car.motion.vx,
+            "vy_mps": self._car.motion.vy,
+            "yaw_rate_rad_s": self._car.motion.yaw_rate,
             "adhesion": self.trial.adhesion,
             "time_s": self._time_s,
         }

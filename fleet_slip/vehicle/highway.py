@@ -141,6 +141,7 @@ def _steps(
     motion: Motion,
     u: Controls,
     environment: Environment,
+    brakes: Wheels[float],
     path: Path,
     c: Constants,
     t: ImperfectionConstants,
@@ -150,7 +151,7 @@ def _steps(
 ) -> Motion:
     x, compliance, pose, place, slopes, yielding, previous, travel, (ax, ay) = motion
     for k in range(count):
-        d, compliance_rates = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
+        d, compliance_rates = imperfect_derivative(x, u, compliance, environment, brakes, c, t)
         if k == 0:
             ax, ay = d.ax, d.ay
         place_rates = pose_slopes(x, place, path)
@@ -223,7 +224,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         self.imperfection_constants = imperfection_constants(
             self.parameters, imperfections, SAMPLE_S
         )
-        self.environment, self.path = CALM, STRAIGHT
+        self.environment, self.brakes, self.path = CALM, NO_BRAKES, STRAIGHT
         self.MASS = c.mass
         self.INERTIA_Z = c.yaw_inertia
         self.LENGTH_A, self.LENGTH_B = c.front, c.rear
@@ -309,9 +310,18 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
         pose = PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading))
         motion = self.last_motion._replace(state=self.motion, compliance=self.compliance, pose=pose)
-        surroundings = self.environment, self.path
-        constants = self.constants, self.imperfection_constants
-        motion = _steps(motion, self.controls, *surroundings, *constants, step_s, count, order)
+        motion = _steps(
+            motion,
+            self.controls,
+            self.environment,
+            self.brakes,
+            self.path,
+            self.constants,
+            self.imperfection_constants,
+            step_s,
+            count,
+            order,
+        )
         self._internal, pose, self.last_motion = motion.state, motion.pose, motion
         self._step_s = step_s
         self.position, self.heading = np.array([pose.x, pose.y]), pose.heading
