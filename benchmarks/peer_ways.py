@@ -58,10 +58,7 @@ def _read(paths: list[str]) -> NDArray[np.float64]:
 
 
 def fleet_slip(threads: int) -> Fit:
-    from fleet_slip.grams.compute import (  # noqa: PLC0415
-        FILES_PER_QUERY,
-        gram_statement,
-    )
+    from fleet_slip.grams.compute import FILES_PER_QUERY, gram_statement  # noqa: PLC0415
     from fleet_slip.regression.gram import Gram  # noqa: PLC0415
     from fleet_slip.regression.least_squares import fit  # noqa: PLC0415
 

@@ -17,7 +17,7 @@ from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.compute import read_drives
+from fleet_slip.grams.drive_sums import read_drives
 from fleet_slip.grams.folding import assign_folds
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment

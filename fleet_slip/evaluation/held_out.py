@@ -21,7 +21,7 @@ from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
-from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
+from fleet_slip.grams.drive_sums import DriveBlocks, counts_of, drive_sums, gram_rows
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionPlan, SelectionRequest

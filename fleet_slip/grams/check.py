@@ -11,7 +11,8 @@ import pyarrow.compute as pc
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, StorageError
-from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
+from fleet_slip.grams.compute import by_sql, has_statement
+from fleet_slip.grams.drive_sums import wide_grams
 from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from fleet_slip.base import pluralize
-from fleet_slip.grams.cohort import Cohort, clustered_moments
-from fleet_slip.grams.drive_weights import DownweightedDrive
+from fleet_slip.grams.cohort import Cohort, DownweightedDrive, clustered_moments
 from fleet_slip.models.select import outlier_drives
 from fleet_slip.models.summary import outlier_remarks
 from fleet_slip.regression.choice import nested_fits

@@ -25,7 +25,7 @@ from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, Workspace
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
-from fleet_slip.grams.compute import counts_of
+from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.models.manifest import Manifest
 
 # Estimates of a published model, sample by sample in the order of time, from logged counts.

@@ -18,8 +18,15 @@ from fleet_slip.calibration.course_label import CourseLabelQuality, assess_cours
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotComputedError, QuestionError
-from fleet_slip.grams.cohort import Cohort, CompleteCases, load_cohort
-from fleet_slip.grams.drive_weights import FULL, DownweightedDrive, age_weights, robust_weights
+from fleet_slip.grams.cohort import (
+    FULL,
+    Cohort,
+    CompleteCases,
+    DownweightedDrive,
+    age_weights,
+    load_cohort,
+    robust_weights,
+)
 from fleet_slip.grams.folding import FOLD_KEYS, PARTS, Folding
 from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (

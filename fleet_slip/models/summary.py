@@ -16,7 +16,7 @@ from fleet_slip.warehouse.predicate import describe_cohort
 
 if TYPE_CHECKING:
     from fleet_slip.calibration.course_label import CourseLabelQuality
-    from fleet_slip.grams.drive_weights import DownweightedDrive
+    from fleet_slip.grams.cohort import DownweightedDrive
     from fleet_slip.models.search import SearchChoice
     from fleet_slip.models.select import Selection
 

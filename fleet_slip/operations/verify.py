@@ -36,7 +36,7 @@ from fleet_slip.grams.check import (
     grams_of,
     stored_grams,
 )
-from fleet_slip.grams.compute import wide_grams
+from fleet_slip.grams.drive_sums import wide_grams
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
 from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry

@@ -13,8 +13,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.measured_evaluation import identified_prior
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.drive_weights import age_weights
+from fleet_slip.grams.cohort import age_weights, load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import SelectionPlan, SelectionRequest, load_model_list

@@ -10,11 +10,13 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
-from fleet_slip.grams.cohort import Cohort, drive_folds, load_cohort
-from fleet_slip.grams.drive_weights import (
+from fleet_slip.grams.cohort import (
     FULL,
     MAX_LOST_SHARE,
+    Cohort,
     DriveWeights,
+    drive_folds,
+    load_cohort,
     robust_weights,
     weighted,
 )

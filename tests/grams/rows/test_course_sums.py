@@ -15,8 +15,8 @@ import pytest
 from fleet_slip.catalog.course import LARGEST_RAD, TURNED, course_units
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import Workspace
-from fleet_slip.grams.compute import aggregate, counts_of, wide_grams
-from fleet_slip.grams.course_changes import Fixes
+from fleet_slip.grams.compute import aggregate
+from fleet_slip.grams.drive_sums import Fixes, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with

@@ -26,7 +26,8 @@ from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_col
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
-from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
+from fleet_slip.grams.compute import aggregate, by_sql, gram_statement
+from fleet_slip.grams.drive_sums import wide_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.warehouse import Warehouse
