@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from fleet_slip.views import Session
 
 SCREEN_ROWS = 40
+SAMPLE_ROWS = 1000
+"""Rows whose texts set the width of columns."""
 UNLIMITED = 2**31 - 1
-NARROW_COLUMNS = 3
-"""Maximum number of columns that always fit side by side."""
+MIN_TEXT = 24
+"""Minimum width of a column of texts in characters: columns are left out rather than narrower."""
 FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 """First characters of a text that a spreadsheet executes."""
 
@@ -161,15 +163,25 @@ def _readable(result: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
 def _draw(result: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
     """Return a result as DuckDB's table of at most this width."""
     result = _readable(result)
-    # A text of full width leaves no room for other columns, or is left out itself.
-    for max_text in (width, width // max(2, len(result.columns)) - 3):
-        with contextlib.redirect_stdout(io.StringIO()) as output:
-            result.show(max_rows=rows, max_width=width, max_col_width=max_text)
-        table = output.getvalue()
-        lacks_narrow = len(result.columns) <= NARROW_COLUMNS and "│ … │\n" in table
-        if not lacks_narrow and not table.startswith("┌───┐\n│ … │"):
-            break
-    return table.rstrip("\n")
+    max_text = width if width == UNLIMITED else _text_width(result, width)
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        result.show(max_rows=rows, max_width=width, max_col_width=max_text)
+    return output.getvalue().rstrip("\n")
+
+
+def _text_width(result: duckdb.DuckDBPyRelation, width: int) -> int:
+    """Return the largest width of a column with which all columns fit, or else a narrow one.
+
+    A text of full width leaves no room for other columns, or is left out itself.
+    """
+    records = [result.columns, result.types, *result.limit(SAMPLE_ROWS).fetchall()]
+    widths = [max(len(str(value)) for value in column) for column in zip(*records, strict=True)]
+    fits = (
+        text
+        for text in range(width - 4, MIN_TEXT, -1)
+        if sum(min(text, wide) + 3 for wide in widths) < width
+    )
+    return next(fits, MIN_TEXT)
 
 
 def _mark_formulas(table: pa.Table) -> pa.Table:
