@@ -304,7 +304,8 @@ class FleetEvaluation:
         Parameters
         ----------
         drive
-            A scenario of `configs/scenarios`, the path of a scenario file, or a `drive_id`.
+            A scenario of `configs/scenarios`, the path of a scenario file, or a drive: its
+            `drive_id`, its name, or the name of its file.
         model
             A reference or a version.
         output

@@ -232,7 +232,8 @@ def watch(
         str,
         typer.Argument(
             metavar="SCENARIO|DRIVE",
-            help="Scenario of configs/scenarios, a TOML file, or the drive_id of a logged drive.",
+            help="Scenario of configs/scenarios, a TOML file, or a logged drive: its drive_id, its "
+            "name, or the name of its file.",
         ),
     ],
     model: opt.Model = None,
@@ -244,7 +245,7 @@ def watch(
         float | None, typer.Option("--until", help="Last second. Default: the end.")
     ] = None,
 ) -> None:
-    """Show a drive: the car on its track, its true and its estimated angle, wheels and gates.
+    """Show a drive: the car on its track, its angle and the estimate, wheels and gates.
 
     The page is one file and needs no server.
 

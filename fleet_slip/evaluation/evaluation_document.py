@@ -3,6 +3,7 @@
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from string import ascii_lowercase
 from typing import Any
 
 from fleet_slip.base import pluralize
@@ -112,19 +113,27 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     drives = pluralize(len(content["drives"]), "drive")
     is_time = content["parts_of"] == "time"
     held_out, unit = ("in quarters of their time", "quarter") if is_time else ("whole", "drive")
+    told = dict.fromkeys(row["told"] for row in content["estimators"].values())
+    sources = dict(zip(told, ascii_lowercase, strict=False))
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(
         f"{content['cohort']}: {drives}, held out {held_out}, in {content['parts']} folds",
         "estimator|source|RMSE deg|±|mean|std|correlation|rows|worst|kinds held out",
         (
-            {**row, "name": name, "kinds": (row["kinds_left_out"] or {}).get("rmse_deg")}
+            {
+                **row,
+                "name": name,
+                "kinds": (row["kinds_left_out"] or {}).get("rmse_deg"),
+                "source": sources[row["told"]],
+            }
             for name, row in content["estimators"].items()
         ),
-        "{name}|{told}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
+        "{name}|{source}|{rmse_deg:.3f}|{rmse_standard_error_deg:.3f}|{error_mean_deg:+.3f}|"
         "{error_std_deg:.3f}|{correlation:.3f}|{coverage:.0%}|{worst_drive_rmse_deg:.3f}|"
         "{kinds:.3f}",
         text_columns=2,
     )
+    yield "source: " + "; ".join(f"{letter} {text}" for text, letter in sources.items()) + "."
     yield (
         f"±: standard error over {unit}s; worst: RMSE of the worst {unit}; rows: share of the rows "
         "with an estimate. All RMSEs are of the rows that all estimators have.\n"

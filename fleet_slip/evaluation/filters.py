@@ -1,7 +1,7 @@
 """Estimators that compete: models of Table I, published models, and Kalman filters.
 
 All filters use the stated noise of the sensors and the file of the vehicle's class, and assume a
-dry road and the usual load. `ekf_told` uses the true vehicle and road. Tuned filters have the
+dry road and the usual load. `ekf_informed` uses the true vehicle and road. Tuned filters have the
 parameters with the smallest error on drives that the regression was trained on.
 """
 
@@ -202,7 +202,7 @@ FILTERS = (
         "ekf_class", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, other_starts=(LOOSE_EKF,)
     ),
     Filter(
-        "ekf_told", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, informed=True,
+        "ekf_informed", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, informed=True,
         other_starts=(LOOSE_EKF,),
     ),
 )  # fmt: skip

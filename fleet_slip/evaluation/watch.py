@@ -13,8 +13,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray, float_column
+from fleet_slip.base import pluralize
 from fleet_slip.catalog.definitions import Definition
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import as_counts, compute_columns
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
@@ -52,7 +53,7 @@ class DriveFrames:
     x_m, y_m, heading_rad
         Position and heading of the car on the ground.
     sideslip_deg
-        The reference; NaN where the drive has none.
+        The true angle, or that of a reference sensor; NaN where the drive has none.
     estimate_deg
         The estimate; NaN where the model lacks a signal.
     wheel_rad_s
@@ -63,6 +64,8 @@ class DriveFrames:
         Opening of each gate of the model, from 0 to 1.
     track
         x and y of the track's centre line; empty without a track.
+    reference
+        Word for the angle on the page: true, or reference for a measured one.
     other_cars
         x, y and heading of the other cars in traffic by frame, shape (3, cars).
     """
@@ -81,6 +84,7 @@ class DriveFrames:
     gates: Mapping[str, FloatArray]
     track: tuple[FloatArray, FloatArray]
     other_cars: NDArray[np.object_]
+    reference: str = "true"
 
     def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
         """Return the frames of a part of the drive. Raises `UsageError` if it has none."""
@@ -106,27 +110,40 @@ def is_scenario(name: str, configs: Configs) -> bool:
     return name.endswith(".toml") or name in configs.names("scenarios")
 
 
-def drive_frames(warehouse: Warehouse, drive_id: str, version: ModelVersion) -> DriveFrames:
-    """Return the frames of a drive of the logs. Raises `QuestionError`."""
+def drive_frames(warehouse: Warehouse, name: str, version: ModelVersion) -> DriveFrames:
+    """Return the frames of a drive of the logs, by its id, its name, or its file's name.
+
+    Raises `QuestionError` if there is no such drive, or several.
+    """
     names = [signal.column for signal in warehouse.catalog.signals.signals.values()]
     query = (
         "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
         f"{', '.join(names)} FROM log"
     )
-    with open_views(warehouse, query) as database:
+    with open_views(warehouse, f"{query}, drives") as database:
+        named = "SELECT drive_id FROM drives WHERE $name IN (drive_id, drive_name, source_file)"
+        ids = [drive for (drive,) in database.sql(named, params={"name": name}).fetchall()]
+        drive_id = name if name in ids or len(ids) != 1 else ids[0]
+        if len(ids) > 1 and name not in ids:
+            raise QuestionError(
+                f"{name!r} names {pluralize(len(ids), 'drive')}. Choose one: {', '.join(ids[:9])}"
+            )
         statement = f"{query} WHERE drive_id = $drive ORDER BY time_s"
         rows = database.sql(statement, params={"drive": drive_id}).to_arrow_table()
     if not rows.num_rows:
         raise QuestionError(
-            f"{drive_id!r} is neither a drive nor a scenario. See: "
-            'fleet-slip sql "SELECT drive_id FROM drives"'
+            f"{name!r} is neither a drive nor a scenario. See: "
+            'fleet-slip sql "SELECT drive_id, drive_name, source_file FROM drives"'
         )
     campaign, day = rows["campaign"][0].as_py(), rows["day"][0].as_py()
     traffic = _traffic_of(drive_id, campaign, day, warehouse.configs)
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    return frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
+    frames = frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
+    return replace(
+        frames, reference="reference" if rows["source"][0].as_py() == MEASURED else "true"
+    )
 
 
 def _traffic_of(
@@ -182,17 +199,26 @@ def frames_of(
 
 
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return true vx and vy, or those from wheels and reference angle. Raises `DataError`."""
+    """Return vx and vy, from a speed and the reference angle if need be. Raises `DataError`."""
     vx, vy = columns["vx_mps"], columns["vy_mps"]
     if np.isfinite(vx).any():
         return np.nan_to_num(vx), np.nan_to_num(vy)
     wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
     if not np.isfinite(wheels).any():
-        raise DataError("the drive has neither a velocity nor wheel speeds: nothing can be shown.")
+        speed = columns["vehicle_speed_mps"]
+        if not np.isfinite(speed).any():
+            raise DataError("the drive has neither a speed nor wheel speeds: nothing can be shown.")
+        return _with_sideslip(np.nan_to_num(speed), columns)
     logged = np.isfinite(wheels)  # nanmean would warn of a tick without any wheel
     mean = np.where(logged, wheels, 0.0).sum(axis=0) / np.maximum(logged.sum(axis=0), 1)
-    rolling = 0.31 * mean
-    return rolling, rolling * np.tan(np.nan_to_num(columns["sideslip_rad"]))
+    return _with_sideslip(0.31 * mean, columns)
+
+
+def _with_sideslip(
+    vx_mps: FloatArray, columns: Mapping[str, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return vx, and vy by the reference angle."""
+    return vx_mps, vx_mps * np.tan(np.nan_to_num(columns["sideslip_rad"]))
 
 
 def _smooth(values: FloatArray) -> FloatArray:

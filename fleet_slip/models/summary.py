@@ -59,7 +59,10 @@ def summarize(selection: "Selection", everything: bool = False, hint: str = "") 
     winner = selection.winner
     yield f"winner: {winner.model.name}. {winner.reason}"
     if selection.searched_winner is not None:
-        yield f"its columns: {in_families(selection.cohort.catalog, winner.model.signals)}"
+        count = pluralize(len(winner.model.signals), "column")
+        columns = in_families(selection.cohort.catalog, winner.model.signals)
+        search = selection.searched_winner.search
+        yield f"{count}, found by {search.method} search {search.title!r}: {columns}"
     if selection.choice is not None:
         yield from _choice(selection.choice)
     if isinstance(selection.distances, NestedDistances):

@@ -119,7 +119,7 @@ class WarehouseStatus(Answer):
             row = "{command}|{started_at:%Y-%m-%d %H:%M:%S}|{state}|{seconds:.1f}|{rows:,}"
             yield TextTable("\nlast runs", header, self.last_runs, row, text_columns=3)
         if self.champions:
-            header = "model|published|age h|logs behind|grams behind"
+            header = "model|published|age h|commits to logs since|commits to grams since"
             row = (
                 "{model}@{version}|{published_at:%Y-%m-%d %H:%M}|{age_hours:,.1f}|"
                 "{logs_behind}|{grams_behind}"
@@ -129,8 +129,8 @@ class WarehouseStatus(Answer):
     @property
     def problem(self) -> AlarmError | None:
         """Problem of a data root that calls for attention; None without one."""
-        count = pluralize(len(self.problems), "matter")
-        return AlarmError(f"{count} found, see above.") if self.problems else None
+        count = pluralize(len(self.problems), "problem")
+        return AlarmError(f"{count}, see above.") if self.problems else None
 
 
 def status_of(

@@ -214,7 +214,7 @@ def _reason(
     lacking = (
         ""
         if tolerance.relative
-        else f" (as if an independent error of {lacks_deg:.2g} deg were added)"
+        else f" (root of the difference of the squares: {lacks_deg:.2g} deg)"
     )
     return (
         f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import random
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ from fleet_slip.errors import ConfigError, QuestionError, UsageError
 from fleet_slip.evaluation import watch
 from fleet_slip.evaluation.watch import DriveFrames, drive_frames, render_watch, scenario_frames
 from fleet_slip.resources import Configs
+from tests.support.measured import OWN_MAPPING, csv_text, own_columns
 
 DRIVE = "smoke-2024-05-01-0000"
 
@@ -109,6 +111,26 @@ def test_other_suffixes_and_unknown_drives_are_refused(
         fleet.evaluation.watch(DRIVE, "smoke", tmp_path / "film.mp4")
     with pytest.raises(QuestionError, match="neither a drive nor a scenario"):
         fleet.evaluation.watch("nobody's", "smoke", tmp_path / "page.html")
+
+
+def test_a_measured_drive_is_found_by_its_file_and_has_a_reference(
+    smoke_copy: Path, tmp_path: Path
+) -> None:
+    for name, cars in (("monday", "a"), ("tuesday", "bc")):
+        seeds = [random.Random(car) for car in cars]  # noqa: S311
+        logs = [own_columns(seed) | {"car": [c] * 500} for seed, c in zip(seeds, cars, strict=True)]
+        columns = {key: [value for log in logs for value in log[key]] for key in logs[0]}
+        text = csv_text(columns | {"v": [12.0] * len(columns["t"])})
+        (tmp_path / f"{name}.csv").write_text(text)
+    mapping = tmp_path / "own.toml"
+    mapping.write_text(OWN_MAPPING + 'vehicle_speed = { column = "v", unit = "m/s" }\n')
+    fleet = fleet_slip.open(smoke_copy)
+    fleet.ingest([tmp_path / "monday.csv", tmp_path / "tuesday.csv"], str(mapping))
+    page = fleet.evaluation.watch("monday.csv", "smoke", tmp_path / "page.html").read_text()
+    assert ">reference <" in page.replace("</span>", ">")
+    assert "true" not in page.partition("<script>")[0].partition("<h2>")[2]
+    with pytest.raises(QuestionError, match="names 2 drives"):
+        drive_frames(fleet.warehouse, "tuesday.csv", fleet.models.get("smoke"))
 
 
 def test_other_cars_of_traffic_are_drawn_and_move_without_jumps(

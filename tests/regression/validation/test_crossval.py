@@ -162,7 +162,7 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
     assert choose([small, best], Tolerance(0.03, relative=True)).model is best
     reason = choose([small, best], Tolerance(0.5)).reason
     assert "fewest signals (3) of the 2 models that are about as good" in reason
-    assert "as if an independent error of 24 deg were added), is significant, but less" in reason
+    assert "root of the difference of the squares: 24 deg), is significant, but less" in reason
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
