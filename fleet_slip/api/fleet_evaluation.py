@@ -156,6 +156,7 @@ class FleetEvaluation:
         challengers: Sequence[str | ModelVersion] = (),
         *,
         vehicle: str | None = None,
+        include_faulty: bool = False,
         threads: int | None = None,
         **measures: Unpack[CarMeasures],
     ) -> "Evaluation":
@@ -174,6 +175,8 @@ class FleetEvaluation:
         vehicle
             A vehicle of `configs/vehicles`, or a TOML file, for filters. Without it and without
             measures no filter is evaluated, unless a file ships for the class of the drives.
+        include_faulty
+            Include drives with faulty sensors, which `FleetModels.publish` leaves out.
         **measures
             Measured data of the car, as keys of `CarMeasures`, instead of `vehicle`.
 
@@ -189,6 +192,7 @@ class FleetEvaluation:
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
         from fleet_slip.evaluation.identify import VehicleMeasures, measures_of
         from fleet_slip.evaluation.measured_evaluation import evaluate_measured
+        from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
         from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
 
         versions = self._versions(model, challengers)
@@ -199,8 +203,12 @@ class FleetEvaluation:
             if car is not None:
                 raise UsageError("give a vehicle file or measurements of the car, not both.")
             car = measures_of("measured", measures)
-        with open_workers(self.warehouse.root, threads) as executor:
-            content = evaluate_measured(self.warehouse, versions, cohort, car, executor)
+        screen = SensorScreen(cohort)
+        if not include_faulty:
+            screen = screen_computed_drives(self.warehouse, cohort)
+        with open_workers(self.warehouse.root, threads) as executor, screen.explaining():
+            content = evaluate_measured(self.warehouse, versions, screen.cohort, car, executor)
+        content |= {"cohort": cohort, **({"examined": str(screen)} if str(screen) else {})}
         return store_evaluation(evaluations_of(self.warehouse, "measured"), content)
 
     def evaluate_blind(

@@ -88,6 +88,7 @@ def evaluate(
             "evaluated on."
         ),
     ] = None,
+    include_faulty: opt.IncludeFaulty = False,
     vehicle: Annotated[
         str | None,
         typer.Option(help="With --cohort: vehicle file for filters, instead of --mass and axles."),
@@ -136,7 +137,13 @@ def evaluate(
         result = evaluation.evaluate_blind(model, challengers, threads=threads)
     elif cohort is not None:
         result = evaluation.evaluate_measured(
-            model, cohort, challengers, vehicle=vehicle, threads=threads, **measures
+            model,
+            cohort,
+            challengers,
+            vehicle=vehicle,
+            include_faulty=include_faulty,
+            threads=threads,
+            **measures,
         )
     else:
         with progress("simulate scenarios") as show:

@@ -111,6 +111,8 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
 def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     """Tabulate statistics on measured drives, the best estimator first."""
     drives = pluralize(len(content["drives"]), "drive")
+    if examined := content.get("examined"):
+        yield Remark(examined)
     is_time = content["parts_of"] == "time"
     held_out, unit = ("in quarters of their time", "quarter") if is_time else ("whole", "drive")
     told = dict.fromkeys(row["told"] for row in content["estimators"].values())

@@ -86,6 +86,9 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
         4,
         4,
     )
+    evaluated = run_command("evaluate", "m", "--cohort", "true")
+    assert evaluated.exit_code == 0 and "2 drives of 6 left out" in evaluated.stderr
+    assert "true: 4 drives, held out whole" in evaluated.stdout
 
 
 def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
