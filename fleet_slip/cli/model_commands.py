@@ -15,7 +15,10 @@ def models(
     context: typer.Context,
     name: Annotated[
         str | None,
-        typer.Argument(help="Name of a model: list its versions and the history of its aliases."),
+        typer.Argument(
+            help="Name of a model: list its versions and the history of its aliases.",
+            autocompletion=opt.complete_name,
+        ),
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -73,7 +76,9 @@ def show(
 @recorded
 def promote(
     context: typer.Context,
-    reference: Annotated[str, typer.Argument(help="NAME@VERSION.")],
+    reference: Annotated[
+        str, typer.Argument(help="NAME@VERSION.", autocompletion=opt.complete_reference)
+    ],
     alias: opt.Alias = "champion",
 ) -> None:
     """Point an alias, by default champion, at a version.

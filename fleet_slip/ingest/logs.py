@@ -213,6 +213,7 @@ def ingest_files(
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
     failures: list[InputError] = []
+    stored = 0
     tasks = (IngestTask(file, cache.digest_of(file) if cache else None) for file in files)
     for batch, written in _written(executor, write, _batches(tasks)):
         # Not the file's name: it may contain a car's name, and the Delta log outlives erasures.
@@ -222,6 +223,7 @@ def ingest_files(
             warehouse, written, partial(write, batch), note, build_removal
         )
         failures += committed.failures
+        stored += len(committed.files)
         for file in committed.files:
             transaction = file_transaction(file.digest).name
             yield _finished(warehouse, file, is_new=transaction in new)
@@ -229,7 +231,7 @@ def ingest_files(
             if cache is not None:
                 cache.remember(file.log, file.digest)
     if failures:
-        raise _joined(failures)
+        raise _joined(failures, stored)
 
 
 def _written(
@@ -273,19 +275,20 @@ def _finished(warehouse: Warehouse, written: WrittenFile, *, is_new: bool) -> In
     return report
 
 
-def _joined(failures: list[InputError]) -> InputError:
-    """Return one error for all failures."""
+def _joined(failures: list[InputError], stored: int) -> InputError:
+    """Return one error for all failures; `stored` is the number of the other files."""
     if len(failures) == 1:
         return failures[0]
     first = " ".join(map(str, failures[:FAILURES_SHOWN]))
     more = len(failures) - FAILURES_SHOWN
+    others = "; all others are stored" if stored else ""
     kind = (
         RepeatedError
         if all(isinstance(failure, RepeatedError) for failure in failures)
         else InputError
     )
     return kind(
-        f"{pluralize(len(failures), 'file')} cannot be used; all others are stored. {first}"
+        f"{pluralize(len(failures), 'file')} cannot be used{others}. {first}"
         + (f" And {more:,} more." if more > 0 else "")
     )
 

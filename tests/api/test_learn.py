@@ -109,11 +109,11 @@ def test_a_corrected_mapping_takes_the_place_of_the_old_one(
 
 
 def test_a_first_model_of_too_few_drives_is_refused_as_by_publish(tmp_path: Path) -> None:
-    report = fleet_slip.open(tmp_path / "root").learn(
-        "golf", write_logs(tmp_path, 2), str(tmp_path / "own.toml")
-    )
-    assert isinstance(report.problem, RefusedError)
-    assert report.publication is None
+    logs = write_logs(tmp_path, 2)
+    done = run_on(tmp_path / "root", "learn", "golf", logs, "--mapping", tmp_path / "own.toml")
+    assert done.exit_code == RefusedError.exit_code
+    assert done.stderr.count("it was trained on 2 drives, fewer than 3") == 1
+    assert "error: golf was not published, see above" in done.stderr
 
 
 def test_a_mapping_without_any_label_is_an_error_that_says_so(tmp_path: Path) -> None:
