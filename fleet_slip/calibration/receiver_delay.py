@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.calibration_parameters import DELAY
-from fleet_slip.catalog.course import LATE_PARTS, MOST_EARLY, MOST_LATE
+from fleet_slip.catalog.course import LATE_PARTS, MAX_COURSE_DELAY, MIN_COURSE_DELAY
 from fleet_slip.catalog.signals import RECEIVER, SAMPLE_TIME_S
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool
@@ -271,7 +271,7 @@ def course_delays(warehouse: Warehouse, grams: Snapshot, active: frozenset[str])
                 counts = pc.and_(counts, pc.invert(returned))
             yield from rows.filter(counts).to_batches()
 
-    earliest, latest = LATE_PARTS * MOST_EARLY, LATE_PARTS * MOST_LATE
+    earliest, latest = LATE_PARTS * MIN_COURSE_DELAY, LATE_PARTS * MAX_COURSE_DELAY
     return {
         car: min(max(round(delay.value / GRAIN_S), earliest), latest)
         for car, delay in receiver_delays(batches()).cars.items()

@@ -21,7 +21,7 @@ from fleet_slip.catalog.calibration_parameters import (
 )
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import TURNED, turned_scale
-from fleet_slip.quality.course_relation import FEWEST_CHANGES, LEAST_TURNED_RAD, LEVERS_M
+from fleet_slip.quality.course_relation import LEVERS_M, MIN_CHANGES, MIN_TURNED_RAD
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import ONE, ExactSums, Relation, Terms
@@ -64,7 +64,7 @@ MIN_COURSE_RATE_STD_RAD_S = Fraction(2, 100)
 """Standard deviation of how fast the direction changes, below which a car drove too straight. The
 noise of accelerometers is a third of it."""
 
-LEAST_CHANGE_OF_SPEED = {False: Fraction(5, 100), True: Fraction(10, 100)}
+MIN_SPEED_VARIATION = {False: Fraction(5, 100), True: Fraction(10, 100)}
 """Standard deviation of one over speed over its mean, below which a car drove too evenly to
 separate the offsets of both sensors; on banked roads also the bank from speed."""
 
@@ -81,7 +81,7 @@ OF_STEERING: tuple[CalibrationParameterName, ...] = (
 OF_SLIP: tuple[CalibrationParameterName, ...] = ("slip_lever", "slip_compliance")
 """Parameters of each relation."""
 
-LEAST_CURVATURE_1PM = Fraction(1, 1000)
+MIN_CURVATURE_1PM = Fraction(1, 1000)
 SPEED_RATIOS = {False: (Fraction(4, 5), Fraction(5, 4)), True: (Fraction(3, 4), Fraction(4, 3))}
 """Range of the wheel radii of tyres, and on banked roads of the roll of bodies. A ratio outside it
 means that noise, not driving, determined the fit."""
@@ -180,7 +180,7 @@ def _by_own_sensors(terms: CarTerms, sums: Mapping[str, Gram], banked: bool) -> 
     noise = gyroscope_noise(terms, course, steering)
     if of_course.variance("course_rate") < MIN_COURSE_RATE_STD_RAD_S**2 or noise is None:
         return dict.fromkeys(names, STRAIGHT)
-    change = LEAST_CHANGE_OF_SPEED[banked] * of_course.mean("slowness")
+    change = MIN_SPEED_VARIATION[banked] * of_course.mean("slowness")
     if of_course.variance("slowness") < change**2:
         return dict.fromkeys(names, EVEN)
     of_plane = _estimate_course(terms, of_course, noise if banked else None)
@@ -261,7 +261,7 @@ def _estimate_steering(
     columns = terms.steering(yaw_rate_offset)
     sums = ExactSums(gram, columns)
     solution = solve_rational(STEERING.system(sums, noise))
-    if solution is None or sums.variance("bend") < LEAST_CURVATURE_1PM**2:
+    if solution is None or sums.variance("bend") < MIN_CURVATURE_1PM**2:
         return dict.fromkeys(OF_STEERING, STRAIGHT)
     straight, by_bend, understeer = solution
 
@@ -284,7 +284,7 @@ def _estimate_steering(
 # Rows below 3 m/s lack the quotients by speed, and have a Gram row of their own. The turning that
 # the wheels measure is subtracted.
 
-LONGEST_ROLL_MPS, FEWEST_STILL = Fraction(1, 2), 1000
+MAX_ROLL_MPS, MIN_STILL_ROWS = Fraction(1, 2), 1000
 """Maximum mean speed of slow rows that are mostly at standstill, and minimum number of them."""
 STILL = Relation.least_squares("yaw_rate", (ONE, "wheels"))
 """The yaw rate by 1 and the wheels' differences: b, and one over the tracks. Least squares."""
@@ -297,12 +297,12 @@ def _standstill(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
     to one side only.
     """
     gram = sums.get(STANDSTILL)
-    if gram is None or gram.n < FEWEST_STILL:
+    if gram is None or gram.n < MIN_STILL_ROWS:
         return {}
     columns = {name: terms.course[name] for name in ("yaw_rate", "speed", "wheels")}
     still = ExactSums(gram, columns)
     solution = solve_rational(STILL.system(still, 0))
-    if solution is None or still.mean("speed") >= LONGEST_ROLL_MPS:
+    if solution is None or still.mean("speed") >= MAX_ROLL_MPS:
         return {}
     bias = CarEstimate(STANDSTILL, STILL, columns, Fraction(0), solution[0], (1.0, 0.0))
     return {"yaw_rate_offset": bias}
@@ -379,7 +379,7 @@ def _slip(terms: CarTerms, sums: Mapping[str, Gram]) -> Estimates:
         SLIP: terms.si(**{catalog.signals.label: 1}),
     }
     exact = ExactSums(gram, columns)
-    if gram.n < FEWEST_CHANGES or exact.variance(TURNED) < Fraction(LEAST_TURNED_RAD) ** 2:
+    if gram.n < MIN_CHANGES or exact.variance(TURNED) < Fraction(MIN_TURNED_RAD) ** 2:
         return dict.fromkeys(OF_SLIP, FEW_TURNS)
     solution = solve_rational(CHANGE.system(exact, 0))
     if solution is None or not LEVERS_M[0] <= solution[1] <= LEVERS_M[1]:

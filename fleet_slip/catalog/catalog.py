@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, hash_fold, sha256_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
-from fleet_slip.catalog.course import BESIDE, YAW_RATE, course_units
+from fleet_slip.catalog.course import AUXILIARY, YAW_RATE, course_units
 from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     Combination,
@@ -229,7 +229,7 @@ class FeatureSet:
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of a Gram row, in order; calibrated ones are derived from them."""
-        beside = BESIDE if self.change_ticks else ()
+        beside = AUXILIARY if self.change_ticks else ()
         return (*self.signals, *self.features, *self.windows, *beside, self.label)
 
 

@@ -12,7 +12,7 @@ In 65,536ths of that count
 
 less the nearest multiple of 65536 turn, is the change of the side-slip angle; it is rounded once to
 counts of the label. For T of 10 s at most |J| < 2^27, so that all of it stays below 2^53. A change
-above `LARGEST_RAD` is none: the car spun, or a reflected signal made the course.
+above `MAX_CHANGE_RAD` is none: the car spun, or a reflected signal made the course.
 
 If a car drives straight at both fixes and hardly turns between them, its side-slip angle is zero
 and L is the error of receiver and gyroscope: separate columns contain it.
@@ -27,22 +27,22 @@ from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, SignalCatalog
 
 COURSE, YAW_RATE, SATELLITE_SPEED = "course", "yaw_rate", "satellite_speed"
 TURNED = "turned"
-"""Column of a Gram row: J over `COARSER`, proportional to a scale error of the gyroscope."""
+"""Column of a Gram row: J over `TURNED_DIVISOR`, proportional to a scale error of the gyroscope."""
 STRAIGHT, STRAIGHT_COURSE = "straight", "straight_course"
 """Columns of a Gram row: 1 and the label while the car drives straight, otherwise 0."""
-BESIDE = (TURNED, STRAIGHT, STRAIGHT_COURSE)
+AUXILIARY = (TURNED, STRAIGHT, STRAIGHT_COURSE)
 """Columns about the course that models do not use, in order."""
-COARSER = 2**8
+TURNED_DIVISOR = 2**8
 """Keeps `TURNED` within 20 bits: 1.28e-4 rad a count."""
-LONGEST_TICKS = 1000
-LARGEST_RAD = Fraction(1, 2)
+MAX_CHANGE_TICKS = 1000
+MAX_CHANGE_RAD = Fraction(1, 2)
 STRAIGHT_RAD_S, STRAIGHT_RAD = Fraction(1, 50), Fraction(1, 20)
 """Largest yaw rate at both fixes, and largest turn between them, of a car that drives straight. The
 offset of a gyroscope is up to 0.01 rad/s."""
 LATE_PARTS = 4
 """Parts of a tick in which the course delay is counted, 2.5 ms: the yaw rate hardly changes in half
 of that."""
-MOST_LATE, MOST_EARLY = 50, -10
+MAX_COURSE_DELAY, MIN_COURSE_DELAY = 50, -10
 """Largest delays in ticks. A course is early if accelerometer and gyroscope are delayed more."""
 COURSE_LATE = "course_late"
 """Column of `grams`: the corrected course delay in parts of a tick."""
@@ -79,7 +79,7 @@ def course_units(signals: SignalCatalog) -> CourseUnits:
     return CourseUnits(
         turn,
         divisor,
-        int(2 * HALF_TURN * LARGEST_RAD / grain),
+        int(2 * HALF_TURN * MAX_CHANGE_RAD / grain),
         int(STRAIGHT_RAD_S / signals[YAW_RATE].exact_scale),
         int(STRAIGHT_RAD / grain),
     )
@@ -93,4 +93,4 @@ def split_late(late: int) -> tuple[int, int]:
 
 def turned_scale(signals: SignalCatalog) -> float:
     """Return the physical value of a count of `TURNED`, in rad."""
-    return float(signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * COARSER
+    return float(signals[YAW_RATE].exact_scale * SAMPLE_TIME_S / 2) * TURNED_DIVISOR

@@ -30,7 +30,7 @@ Over = Literal["mean", "sum", "lag", "change", "running_mean"]
 """Function of a window: mean or sum over the last ticks, value N ticks ago, change since then, mean
 since the start of the drive."""
 
-LONGEST_TICKS = 2**16
+MAX_CHANGE_TICKS = 2**16
 """Longest window: eleven minutes."""
 
 LARGEST_RATIO = 2**14
@@ -331,7 +331,7 @@ class Definition(Config):
     made: Annotated[Made | None, _LEFT_OUT] = None
     of_bits: Bits = COUNT_BITS
     over: Over | None = None
-    ticks: int = Field(default=0, ge=0, le=LONGEST_TICKS)
+    ticks: int = Field(default=0, ge=0, le=MAX_CHANGE_TICKS)
     ratio: Ratio = Fraction(1)
     bits: Bits = 20
     fact: AttributeFactor | None = None

@@ -14,7 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from fleet_slip.catalog.course import BESIDE, LONGEST_TICKS
+from fleet_slip.catalog.course import AUXILIARY, MAX_CHANGE_TICKS
 from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, Identifier, SignalCatalog
 from fleet_slip.catalog.time_columns import (
     Calibrated,
@@ -70,8 +70,8 @@ class FeatureSetEntry(Config):
         )
         ticks = self.change_ticks
         names = (*self.signals, *self.features, *self.windows)
-        out_of_range = any(not 0 < n <= LONGEST_TICKS for n in ticks)
-        longest = f"{LONGEST_TICKS * float(SAMPLE_TIME_S):g}"
+        out_of_range = any(not 0 < n <= MAX_CHANGE_TICKS for n in ticks)
+        longest = f"{MAX_CHANGE_TICKS * float(SAMPLE_TIME_S):g}"
         for wrong, message in (
             (self.of is None and not self.signals, "a set has signals, or is of another set"),
             (self.of is not None and not self.change_s, "a set of another has change_s"),
@@ -125,7 +125,7 @@ class FeatureFile(Config):
         taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
         over_time = self._time_columns = _make_time_columns(self, signals)
         columns: dict[str, Feature | TimeColumn] = {**self.features, **over_time}
-        taken |= {"day", "tick", "clipped", *BESIDE}
+        taken |= {"day", "tick", "clipped", *AUXILIARY}
         names = [*columns, *(column.column for column in columns.values())]
         twice = sorted(name for name in names if name in taken or names.count(name) > 1)
         if twice:

@@ -24,7 +24,7 @@ from fleet_slip.catalog.calibration_parameters import (
 from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     LARGEST_BITS,
-    LONGEST_TICKS,
+    MAX_CHANGE_TICKS,
     AttributeFactor,
     AttributeText,
     Bits,
@@ -202,8 +202,8 @@ class Window(ColumnFamily):
             raise ValueError("ticks is for mean, sum, lag and change, which must have it")
         if len(set(self.ticks)) < len(self.ticks):
             raise ValueError("a number of ticks appears twice")
-        if any(not 1 <= n <= LONGEST_TICKS for n in self.ticks):
-            raise ValueError(f"ticks must lie in 1..{LONGEST_TICKS}")
+        if any(not 1 <= n <= MAX_CHANGE_TICKS for n in self.ticks):
+            raise ValueError(f"ticks must lie in 1..{MAX_CHANGE_TICKS}")
         if bool(self.ticks) != (TICKS in self.column):
             raise ValueError(f"column must have {TICKS} in it if there are ticks, and only then")
         return self

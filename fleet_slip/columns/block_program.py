@@ -58,8 +58,8 @@ INTEGERS = 30
 OPERATION, OUT, A, B, C, D = 0, 1, 2, 3, 4, 5
 """Columns of a step: the operation, and the places of what it writes and reads."""
 
-MOVES = 5
-"""So many columns behind a place: whether it moves on with the rows of a drive."""
+ADVANCE = 5
+"""Offset from the column of a place to its flag: whether it advances with the rows of a drive."""
 
 SLOT, KIND, TICKS, NUMBER = 11, 12, 13, 14
 """Further columns of a step: what is summed up, a kind of window, its ticks, and a constant, or how
@@ -96,10 +96,10 @@ Place = tuple[Region, int]
 Value = int | Place
 """What an operation reads: the result of an earlier one, by its number, or a part of the memory."""
 
-MOST_READ = 4
+MAX_READS = 4
 """So many values an operation reads at most."""
 
-NOWHERE: Place = (Region.CLIPPED, 0)
+UNUSED_PLACE: Place = (Region.CLIPPED, 0)
 
 STRIDE = BLOCK_ROWS + 2 * 8
 """Registers are so many numbers apart: if it were a power of two, the cache would have one place
@@ -175,12 +175,12 @@ class Code:
             ended = {r for r in operation.reads if isinstance(r, int) and last[r] == number}
             free += [registers[read] for read in ended.difference(columns)]
         places = [
-            [(Region.REGISTER, registers[number]) if number in registers else NOWHERE]
+            [(Region.REGISTER, registers[number]) if number in registers else UNUSED_PLACE]
             + [
                 (Region.REGISTER, registers[r]) if isinstance(r, int) else r
                 for r in operation.reads
             ]
-            + [NOWHERE] * (MOST_READ - len(operation.reads))
+            + [UNUSED_PLACE] * (MAX_READS - len(operation.reads))
             for number, operation in enumerate(self.operations)
         ]
         return BlockProgram(self, np.array(places, dtype=np.int64), count)
@@ -486,7 +486,7 @@ class _Writer:
         slot, kind = _number(self.code.stored, value), _number(self.code.kinds, ticks + 1)
         history, begins = (Region.VALUE, slot), (Region.BEGIN, kind)
         self._do(KEEP, value, history)
-        return self._do(AGO, history, NOWHERE, begins, kind=kind, ticks=ticks)
+        return self._do(AGO, history, UNUSED_PLACE, begins, kind=kind, ticks=ticks)
 
     def _do(self, operation: int, *operands: Value, **more: Any) -> int:
         return self.code.add(VectorOperation(operation, operands, **more))

@@ -303,9 +303,15 @@ def _do(
     step: Any, ratio: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int, size: int
 ) -> None:
     operation, slot, kind = step[op.OPERATION], step[op.SLOT], step[op.KIND]
-    out = step[op.OUT] + step[op.MOVES + op.OUT] * first
-    a, b = step[op.A] + step[op.MOVES + op.A] * first, step[op.B] + step[op.MOVES + op.B] * first
-    c, d = step[op.C] + step[op.MOVES + op.C] * first, step[op.D] + step[op.MOVES + op.D] * first
+    out = step[op.OUT] + step[op.ADVANCE + op.OUT] * first
+    a, b = (
+        step[op.A] + step[op.ADVANCE + op.A] * first,
+        step[op.B] + step[op.ADVANCE + op.B] * first,
+    )
+    c, d = (
+        step[op.C] + step[op.ADVANCE + op.C] * first,
+        step[op.D] + step[op.ADVANCE + op.D] * first,
+    )
     if operation >= op.INTEGERS:
         compute_integers(operation - op.INTEGERS, memory, (out, a, b), size, step[op.NUMBER])
     elif operation < op.ADD_UP:

@@ -33,12 +33,12 @@ from fleet_slip.calibration.receiver_delay import delay_columns
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
-    BESIDE,
-    COARSER,
+    AUXILIARY,
     COURSE,
     LATE_PARTS,
-    MOST_EARLY,
-    MOST_LATE,
+    MAX_COURSE_DELAY,
+    MIN_COURSE_DELAY,
+    TURNED_DIVISOR,
     YAW_RATE,
     course_units,
 )
@@ -83,13 +83,13 @@ class OnBoard:
     @property
     def computed(self) -> tuple[str, ...]:
         """Columns that are computed at each tick; others of a change come from fixes."""
-        from_fixes = (*BESIDE, self.label) if self.counted.times else ()
+        from_fixes = (*AUXILIARY, self.label) if self.counted.times else ()
         return tuple(name for name in self.columns if name not in from_fixes)
 
     @property
     def history_ticks(self) -> int:
         """Ticks of stored columns: those of a change, and of the delay of a fix."""
-        return max(self.counted.times) + 1 + (MOST_LATE if self.counted.in_time else 0)
+        return max(self.counted.times) + 1 + (MAX_COURSE_DELAY if self.counted.in_time else 0)
 
     @property
     def ranges(self) -> list[Range]:
@@ -126,7 +126,7 @@ def sets_on_board(catalog: Catalog, manifest: Manifest) -> tuple[OnBoard, ...]:
         )
     calibrated = catalog.calibrated
     used = {calibrated[name].of if name in calibrated else name for name in manifest.signals}
-    used |= {*COLUMNS, *BESIDE, label}
+    used |= {*COLUMNS, *AUXILIARY, label}
     columns = tuple(column for column in counted.columns if column in used)
     over_time = [name for name in columns if name in catalog.time_columns]
     with_attribute = [
@@ -243,14 +243,14 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
             "start": start_lines(steps, writer),
             "units": course_units(catalog.signals),
             "half_turn": HALF_TURN,
-            "coarser": COARSER,
+            "coarser": TURNED_DIVISOR,
             "delay_parts": LATE_PARTS,
-            "min_delay": MOST_EARLY,
-            "max_delay": MOST_LATE,
+            "min_delay": MIN_COURSE_DELAY,
+            "max_delay": MAX_COURSE_DELAY,
             "delay_ms": f"{1000 * float(SAMPLE_TIME_S) / LATE_PARTS:g}",
             "history": max(on_board.history_ticks for _, on_board in changed),
             "max_times": max(len(on_board.counted.times) for _, on_board in changed),
-            "max_columns": max(len(s.computed) for _, s in changed) + len(BESIDE) + 1,
+            "max_columns": max(len(s.computed) for _, s in changed) + len(AUXILIARY) + 1,
             "columns_bytes": MAX_COLUMNS // 8,
             "places": [place for on_board in sets for place in on_board.places],
             "firsts": [0, *accumulate(widths[:-1])],

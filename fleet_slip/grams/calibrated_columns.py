@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import BoolArray
 from fleet_slip.calibration.car_calibration import calibration_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION
-from fleet_slip.catalog.course import BESIDE, TURNED
+from fleet_slip.catalog.course import AUXILIARY, TURNED
 from fleet_slip.catalog.definitions import ParameterFactor
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
@@ -31,8 +31,8 @@ from fleet_slip.warehouse.predicate import parse_predicate
 
 
 def without_constant_columns(table: GramTable) -> GramTable:
-    """Project the constant and `TURNED` out of the products of each drive; drop `BESIDE`."""
-    signals = tuple(name for name in table.signals if name not in BESIDE)
+    """Project the constant and `TURNED` out of the products of each drive; drop `AUXILIARY`."""
+    signals = tuple(name for name in table.signals if name not in AUXILIARY)
     indices = [table.signals.index(name) for name in signals]
     z, n, sums = table.signals.index(TURNED), table.n.astype(object), table.sums.astype(object)
     with_z = table.products[:, [packed_position(max(i, z), min(i, z)) for i in [*indices, z]]]

@@ -14,9 +14,9 @@ from threadpoolctl import threadpool_limits
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.catalog import FeatureSet
 from fleet_slip.catalog.course import (
-    COARSER,
     COURSE,
     COURSE_LATE,
+    TURNED_DIVISOR,
     CourseUnits,
     course_units,
     split_late,
@@ -353,7 +353,7 @@ class Fixes:
         """Return the changes between fixes that are `duration` ticks apart.
 
         Returns the rows of the later fixes, the columns, shape (columns, changes), which end with
-        `BESIDE` and the label and are NaN where missing, and the number of clipped values of each.
+        `AUXILIARY` and the label and are NaN where missing, and the number of clipped values of each.
         """
         rows, yaw_rate, units = self.rows, self.yaw_rate, self.units
         before, now = _pair_fixes(self.ticks[rows], duration)
@@ -366,7 +366,11 @@ class Fixes:
         # Straight driving by the yaw rate at both fixes and in between.
         fastest = np.maximum(np.abs(yaw_rate[rows[before]]), np.abs(yaw_rate[rows[now]]))
         straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
-        auxiliary = [_divide_rounded(turned, COARSER), straight, straight * change]  # `BESIDE`
+        auxiliary = [
+            _divide_rounded(turned, TURNED_DIVISOR),
+            straight,
+            straight * change,
+        ]  # `AUXILIARY`
         # The first row has no change: it records a drive without a course.
         is_start = self.ticks[:1] == 0
         offset, size = int(is_start.sum()), len(self.counts)

@@ -28,15 +28,15 @@ from fleet_slip.base import (
 )
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
-    BESIDE,
-    COARSER,
+    AUXILIARY,
     COURSE,
     COURSE_LATE,
     LATE_PARTS,
-    MOST_EARLY,
-    MOST_LATE,
+    MAX_COURSE_DELAY,
+    MIN_COURSE_DELAY,
     STRAIGHT,
     TURNED,
+    TURNED_DIVISOR,
     YAW_RATE,
     course_units,
 )
@@ -163,13 +163,13 @@ def _onboard_feature_set(catalog: Catalog, name: str, identity: str) -> OnboardF
 def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
     """Return the smallest and largest count of a column, or of its changes over `times`."""
     signals, label = catalog.signals, catalog.signals.label
-    if times and column in (*BESIDE, label):
+    if times and column in (*AUXILIARY, label):
         if column == STRAIGHT:
             return 0, 1
         units = course_units(signals)
         limit = units.largest // units.divisor + 1
         if column == TURNED:
-            limit = 2 * max(times) * COUNT_MAX // COARSER + 1
+            limit = 2 * max(times) * COUNT_MAX // TURNED_DIVISOR + 1
         return -limit, limit
     source = signals[column] if column == label else catalog.input(column)
     if isinstance(source, Signal):
@@ -522,7 +522,7 @@ def _require_possible(sets: Mapping[str, OnboardFeatureSet], file: Path, table: 
         | {"key": key, "in_time": feature_set.in_time}
         for key, feature_set in by_key.items()
     ]
-    delays = {"earliest": LATE_PARTS * MOST_EARLY, "latest": LATE_PARTS * MOST_LATE}
+    delays = {"earliest": LATE_PARTS * MIN_COURSE_DELAY, "latest": LATE_PARTS * MAX_COURSE_DELAY}
     with open_database() as database, database_errors("checking Gram rows"):
         database.register("counted", _numbered(table))
         database.register("known", pa.Table.from_pylist(described))

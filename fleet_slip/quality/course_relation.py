@@ -6,7 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.course import COURSE, LARGEST_RAD, SATELLITE_SPEED, TURNED, YAW_RATE
+from fleet_slip.catalog.course import (
+    COURSE,
+    MAX_CHANGE_RAD,
+    SATELLITE_SPEED,
+    TURNED,
+    YAW_RATE,
+)
 from fleet_slip.catalog.signals import SAMPLE_TIME_S
 from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.drive_signals import (
@@ -31,8 +37,8 @@ COLUMNS = ("curvature", "ay", YAW_RATE, TURNED)
 """Of a Gram row of changes, before the label."""
 USUAL_LEVER_M, USUAL_COMPLIANCE = 1.35, 0.006
 """Of a passenger car: l in m and K in rad per m/s²."""
-FEWEST_CHANGES = 100
-LEAST_TURNED_RAD = 0.05
+MIN_CHANGES = 100
+MIN_TURNED_RAD = 0.05
 LEVERS_M = (CHECKS["place of the antenna"].low, CHECKS["place of the antenna"].high)
 MIN_EXPLAINED, MAX_EXPLAINED_NOISE_MPS = 0.15, 0.8
 """A relation that explains less may have no more noise than "noise of the course" allows."""
@@ -100,14 +106,14 @@ def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
     `delay_s` late is corrected by that times the change of the yaw rate.
     """
     changes = float(moments[0, 0])
-    if changes < FEWEST_CHANGES:
+    if changes < MIN_CHANGES:
         return None
     on_time = np.eye(6)
     on_time[5, 3] = delay_s
     about = on_time @ moments @ on_time.T / changes
     about = about - np.outer(about[0], about[0])
     variances = np.diag(about)
-    if variances[4] < LEAST_TURNED_RAD**2 or not (variances[1:4] > 0).all():
+    if variances[4] < MIN_TURNED_RAD**2 or not (variances[1:4] > 0).all():
         return None
     used = np.array([1, 2, 4])
     unit = np.sqrt(variances[used])
@@ -174,6 +180,6 @@ def _relation(signals: Signals, turned: FloatArray) -> CourseRelation | None:
     series = np.array([yaw_rate / fast, signals["ay"], yaw_rate, turned, signals["course"]])
     changes = series[:, COURSE_CHANGE_TICKS:] - series[:, :-COURSE_CHANGE_TICKS]
     changes[4] = wrap_angle(changes[4] - changes[3])
-    sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(LARGEST_RAD))
+    sound = np.isfinite(changes).all(axis=0) & (np.abs(changes[4]) <= float(MAX_CHANGE_RAD))
     rows = np.vstack([np.ones(int(sound.sum())), changes[:, sound]])
     return relate(rows @ rows.T)

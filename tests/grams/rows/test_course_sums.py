@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 
-from fleet_slip.catalog.course import LARGEST_RAD, TURNED, course_units
+from fleet_slip.catalog.course import MAX_CHANGE_RAD, TURNED, course_units
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.grams.compute import aggregate
@@ -42,7 +42,7 @@ def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[in
         angle = Fraction(now - before, 65536) * units.turn - turned
         angle += 2 * rest * (between[-1] - between[0])
         angle -= units.turn * nearest(angle / units.turn)
-        if abs(angle) * Fraction(1, 2_000_000) <= LARGEST_RAD:
+        if abs(angle) * Fraction(1, 2_000_000) <= MAX_CHANGE_RAD:
             change = nearest(angle / 200)
             slow = max(abs(between[0]), abs(between[-1])) <= 200 and abs(turned) <= 100_000
             found[tick] = (nearest(Fraction(turned, 256)), slow, slow * change, change)
