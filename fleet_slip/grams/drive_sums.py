@@ -352,8 +352,9 @@ class Fixes:
     def changes(self, duration: int) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the changes between fixes that are `duration` ticks apart.
 
-        Returns the rows of the later fixes, the columns, shape (columns, changes), which end with
-        `AUXILIARY` and the label and are NaN where missing, and the number of clipped values of each.
+        Returns the rows of the later fixes, the columns, and the number of clipped values of each.
+        Columns have shape (columns, changes), end with `AUXILIARY` and the label, and are NaN where
+        missing.
         """
         rows, yaw_rate, units = self.rows, self.yaw_rate, self.units
         before, now = _pair_fixes(self.ticks[rows], duration)
