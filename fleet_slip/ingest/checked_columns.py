@@ -27,7 +27,7 @@ from fleet_slip.ingest.columns import (
     describe,
     parse_numbers,
 )
-from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS
+from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS, FEWER
 from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
@@ -40,6 +40,7 @@ REASONS = (
     "out_of_range",
     "extra_fields",
     "cut_line",
+    "fewer_fields",
     "no_value",
     "time_backwards",
     "time_duplicate",
@@ -236,8 +237,8 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
     fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
         extra = pl.col(RAW + EXTRA_FIELDS)
-        cut, more = (extra == CUT, "cut_line"), (extra.is_not_null(), "extra_fields")
-        fields.append(_condition(cut, more, raw=extra))
+        short = ((extra == CUT, "cut_line"), (extra == FEWER, "fewer_fields"))
+        fields.append(_condition(*short, (extra.is_not_null(), "extra_fields"), raw=extra))
     return fields
 
 

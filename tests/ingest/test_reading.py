@@ -18,6 +18,8 @@ from fleet_slip.ingest import checked_columns as checking
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats import source, tables
 from fleet_slip.ingest.formats.csv import BLOCK_BYTES
+from fleet_slip.ingest.formats.file_formats import FileFormats
+from fleet_slip.ingest.formats.reading import open_source
 from fleet_slip.ingest.formats.source import Budget, Spool
 from fleet_slip.ingest.formats.tables import open_parquet
 from tests.support.logs import without_names
@@ -102,14 +104,42 @@ def test_a_last_line_that_is_cut_is_quarantined(
 
 
 def test_a_last_line_that_is_as_short_as_others_is_whole(tmp_path: Path) -> None:
-    lines = GOOD.splitlines()
-    log = read_text(tmp_path, "\n".join([lines[0] + ",note", *lines[1:]]))
+    head, first, *lines = GOOD.splitlines()
+    log = read_text(tmp_path, "\n".join([head + ",note", first + ",on", *lines]))
     assert log.counts.quarantined == {}
     assert len(ticks(log)) == 20
 
 
-def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
-    assert read_text(tmp_path, GOOD.replace("beta", "beta,x,x")).counts.rows_kept == 20
+@pytest.mark.parametrize("header", ["t,new,ax,beta", "t,ax,beta,note"])
+def test_rows_with_fewer_fields_than_names_are_refused(tmp_path: Path, header: str) -> None:
+    text = GOOD.replace("t,ax,beta", header)
+    with pytest.raises(InputError, match="its header has 4 names, and its rows have 3 fields"):
+        read_text(tmp_path, text)
+    assert read_text(tmp_path, GOOD.replace("t,ax,beta", "t,ax,beta,,")).counts.rows_kept == 20
+
+
+def test_columns_of_one_name_have_numbers(tmp_path: Path) -> None:
+    rows = [f"{i / 100},{i},8,9,0.5" for i in range(20)]
+    text = "\n".join(["t,ax,x,x,beta", *rows])
+    assert read_text(tmp_path, text).counts.rows_kept == 20
+    second = {"ax": {"column": "x@4", "unit": "m/s^2"}}
+    assert set(read_text(tmp_path, text, a_mapping(signals=second)).drives["ax"].to_pylist()) == {
+        9000
+    }
+
+
+def test_the_header_of_racecapture_has_names_and_units(tmp_path: Path) -> None:
+    header = '"Interval"|"ms"|0|0|1,"Utc"|"ms"|0|0|1,"AccelX"|"G"|-3.0|3.0|25,"Yaw"|"Deg/s"|-9|9|2'
+    rows = [f"{10 * i},{1717156800000 + 10 * i},0.1,{i % 30}" for i in range(50)]
+    signals = {
+        "ax": {"column": "AccelX", "unit": "g"},
+        "yaw_rate": {"column": "Yaw", "unit": "deg/s"},
+    }
+    mapping = a_mapping(time={"column": "Interval", "unit": "ms"}, signals=signals)
+    log = read_text(tmp_path, "\n".join([header, *rows]), mapping)
+    assert set(log.drives["ax"].to_pylist()) == {981}
+    with open_source(tmp_path / "log.csv", FileFormats()) as opened:
+        assert [channel.unit for channel in opened.channels()] == ["ms", "ms", "G", "Deg/s"]
 
 
 @pytest.mark.parametrize(
@@ -118,7 +148,7 @@ def test_other_columns_may_have_one_name(tmp_path: Path) -> None:
         (b"", "it is empty"),
         (b"\n\n", "its first line is empty"),
         (b"t,ax,beta\n", "a header without rows"),
-        (b"t,ax,ax,beta\n0,1,2,3\n", "2 columns are called 'ax' (number 2, 3)"),
+        (b"t,ax,ax,beta\n0,1,2,3\n", "2 columns are called 'ax'. Choose one: 'ax@2', 'ax@3'"),
         (b"t,AX,beta_deg\n0,1,2\n", "no column 'ax'. Did the mapping mean 'AX'? Its columns are"),
         (b"t,ax,beta\n0,1\xe92,3\n", "not UTF-8, near"),
         ("t,ax,beta\n0,1,2\n".encode("utf-16"), "binary or UTF-16"),

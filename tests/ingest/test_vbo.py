@@ -110,9 +110,13 @@ def test_a_drive_goes_on_over_midnight(
         (lambda text: text.replace("\n", "\r\n"), []),
         (lambda text: text.replace("[data]\n", "[DATA] \n"), []),
         (lambda text: text.partition("[data]")[0] + "[data]" + _comma(text), []),
-        (lambda text: text.replace("091430.10", " 091430.10"), [(11, "missing", "time")]),
+        (lambda text: text.replace("091430.10", " 091430.10"), []),
         (lambda text: text.replace("091430.10", "0914_0.10"), [(11, "missing", "time")]),
         (lambda text: text.replace("091430.10", "091470.10"), [(11, "missing", "time")]),
+        (lambda text: text.replace(" 091430.10", ""), [(11, "missing", "time")]),
+        (lambda text: text.replace("093.5 +0152.6 +0.10", "+0.10"), [(11, "fewer_fields", None)]),
+        (lambda text: text.replace(" 040.0", "\t  040.0").replace("\n137", " \n  137"), []),
+        (lambda text: text.replace("Latacc Yaw", " Latacc  Yaw "), []),
         (lambda text: text.replace("+0.10", "+0_10"), [(11, "not_a_number", "ay")]),
         (lambda text: text[:-20], [(100, "cut_line", None)]),
         (lambda text: text[:-90], [(99, "cut_line", None)]),
@@ -203,3 +207,18 @@ def test_a_draft_takes_speed_and_heading_for_the_receivers(tmp_path: Path) -> No
     ):
         assert line in draft
     assert "day = " not in draft
+
+
+def test_names_with_blanks_and_rows_with_fewer_fields_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.vbo"
+    text = write(file, head=HEAD.replace("heading height Latacc", "heading height Lateral Acc"))
+    assert "10 names in [column names], and 9 fields in the first row" in failure(file, mapping())
+    file.write_text(text.replace("Lateral Acc", "Latacc").replace(" +0152.6", ""))
+    assert "9 names in [column names], and 8 fields in the first row" in failure(file, mapping())
+
+
+def test_blanks_after_the_names_move_no_unit(tmp_path: Path) -> None:
+    write(tmp_path / "a.vbo", head=HEAD.replace("Latacc Yaw", "Latacc Yaw  "))
+    with open_source(tmp_path / "a.vbo", FileFormats()) as source:
+        units = {channel.name: channel.unit for channel in source.channels()}
+    assert (units["Yaw"], units["Latacc"]) == ("deg/s", "g")

@@ -2,7 +2,8 @@
 
 import csv
 import re
-from collections.abc import Iterator, Set
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence, Set
 from functools import cached_property
 from io import BufferedReader, BytesIO
 from itertools import islice
@@ -67,6 +68,11 @@ EXTRA_FIELDS = "\0extra fields"
 CUT = "the file ends within this line"
 """Its value for a last line that is cut: without a line break, with fewer fields than others."""
 
+FEWER = "fewer fields than names"
+"""Its value for a line of a format in which no field can be empty."""
+_FIRST_ROWS = 100
+"""Rows of which one must have as many fields as there are names."""
+
 
 class CsvSource(FormatSource):
     """A CSV file, or one that is compressed."""
@@ -79,17 +85,26 @@ class CsvSource(FormatSource):
         self.csv_format, self._numbers = csv_format, numbers
 
     @cached_property
-    def _names(self) -> list[str]:
+    def _header(self) -> list[Channel]:
         with self._file.open("rb") as stream:
-            return _csv_header(text_of(stream, self.csv_format), self._file, self.csv_format)
+            return self._read_header(text_of(stream, self.csv_format))
+
+    def _read_header(self, stream: BinaryIO) -> list[Channel]:
+        """Return all columns, and leave the stream where the data begin. Raises `InputError`."""
+        names = _csv_header(stream, self._file, self.csv_format)
+        return described(names)
 
     def channels(self) -> list[Channel]:
         """Return the columns of the header."""
-        return [Channel(name) for name in self._names if self._names.count(name) == 1]
+        return [channel for channel in self._header if channel.name]
 
     def find(self, column: str) -> tuple[str, int]:
         """Return the position of a column. Raises `InputError`."""
-        return "", find_column(self._file, self._names, column)
+        return "", find_column(self._file, [channel.name for channel in self._header], column)
+
+    def _cleaned(self, block: bytes, _start: int) -> bytes:
+        """Return a block whose lines from a position on have separators as a CSV file has."""
+        return block
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`.
@@ -98,10 +113,12 @@ class CsvSource(FormatSource):
         """
         with self._file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
-            names = _csv_header(plain, self._file, self.csv_format)
+            names = [channel.name for channel in self._read_header(plain)]
             numbers = set(self._numbers.columns & set(places))
             padding, unfolded = self._padding(names), 0
-            for block in _whole_lines(plain, self._file, padding):
+            for block in _whole_lines(plain, self._file, padding, self._cleaned):
+                if not unfolded:
+                    self._require_fields(block[len(padding) :], names)
                 unfolded += len(block) - len(padding)
                 self._budget.require_unfolded(unfolded)
                 for lines, header in self._split_at_headers(block, padding, names):
@@ -109,6 +126,22 @@ class CsvSource(FormatSource):
                     if header:
                         places = {name: find_column(self._file, header, name) for name in places}
                         names = header
+
+    def _require_fields(self, lines: bytes, names: list[str]) -> None:
+        """Raise `InputError` if all first rows have fewer fields than there are names.
+
+        Nothing shows then which of the columns is not there.
+        """
+        rows = [row for row in lines.split(b"\n", _FIRST_ROWS)[:_FIRST_ROWS] if row.strip()]
+        separator = self.csv_format.separator.encode()
+        fields = 1 + max((row.count(separator) for row in rows), default=0)
+        width = max((number for number, name in enumerate(names, 1) if name), default=0)
+        if len(rows) > 1 and fields < width:
+            raise InputError(
+                f"{quote_name(self._file)}: its header has {width} names, and its rows have "
+                f"{fields} fields, so that values may belong to other columns. Correct the header, "
+                "or set header_line and separator under [csv] in the mapping."
+            )
 
     def _padding(self, names: list[str]) -> bytes:
         """Return a line of separators before a block.
@@ -133,7 +166,7 @@ class CsvSource(FormatSource):
             begin = block.rfind(b"\n", 0, place) + 1
             end = block.find(b"\n", place) + 1 or len(block)
             fields = _fields(block[begin:end].decode().rstrip("\r\n"), self.csv_format)
-            header = [field.strip() for field in fields or ()]
+            header = [channel.name for channel in described(fields or [])]
             if len(set(header) & set(names)) >= max(2, len(set(names)) / 2):
                 yield padding + block[start:end], header
                 start, padding = end, self._padding(header)
@@ -197,7 +230,20 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
         raise InputError(f"{quote_name(file)}: its header is not CSV: a quote is not closed.")
     for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
         stream.readline(MAX_LINE_BYTES)
-    return [name.strip() for name in names]
+    return names
+
+
+_WITH_KEYS = re.compile(r'"?([^"|]+)"?\|"?([^"|]*)"?(\|[-+.\d]*){1,3}')
+"""A name in the header of RaceCapture: "AccelX"|"G"|-3.0|3.0|25."""
+
+
+def described(fields: Sequence[str]) -> list[Channel]:
+    """Return the columns of a header; those of one name have their number behind an @."""
+    keys = [_WITH_KEYS.fullmatch(field.strip()) for field in fields]
+    names = [key[1] if key else name.strip() for key, name in zip(keys, fields, strict=True)]
+    several = {name for name, count in Counter(names).items() if name and count > 1}
+    unique = (f"{name}@{n}" if name in several else name for n, name in enumerate(names, 1))
+    return [Channel(name, key[2] if key else "") for key, name in zip(keys, unique, strict=True)]
 
 
 _NUMBER = re.compile(r"[-+\d.,eE ]*")
@@ -206,13 +252,19 @@ _NUMBER = re.compile(r"[-+\d.,eE ]*")
 
 def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
     """Return the fields of a line, None if it is not CSV."""
+    if "|" in line and csv_format.separator == ",":  # quotes within a name of RaceCapture
+        fields = line.split(",")
+        if all(_WITH_KEYS.fullmatch(field.strip()) for field in fields):
+            return fields
     try:
         return next(csv.reader([line], delimiter=csv_format.separator, strict=True), [])
     except csv.Error:
         return None
 
 
-def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes]:
+def _whole_lines(
+    stream: BinaryIO, file: Path, padding: bytes, clean: Callable[[bytes, int], bytes]
+) -> Iterator[bytes]:
     """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one.
 
     Each begins with the padding, a line of its own: put here, the block is not copied for it.
@@ -222,7 +274,7 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
         block = remainder + more
         end = _end_of_lines(block)
         if end > len(padding):
-            lines, remainder = block[:end], padding + block[end:]
+            lines, remainder = clean(block[:end], len(padding)), padding + block[end:]
             _require_text(lines, file)
             before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
             yield lines
@@ -235,7 +287,7 @@ def _whole_lines(stream: BinaryIO, file: Path, padding: bytes) -> Iterator[bytes
         remainder = block
     if len(remainder) > len(padding):
         _require_text(remainder, file)
-        yield _with_cut_marked(remainder, before, padding)
+        yield _with_cut_marked(clean(remainder, len(padding)), before, padding)
 
 
 def _with_cut_marked(line: bytes, before: bytes, padding: bytes) -> bytes:

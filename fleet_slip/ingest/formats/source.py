@@ -201,6 +201,12 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
             "Rename all but one."
         )
     if not matches:
+        several = [name for name in names if name.rpartition("@")[0] == column]
+        if len(several) > 1 and all(name.rpartition("@")[2].isdigit() for name in several):
+            raise InputError(
+                f"{quote_name(file)}: {len(several)} columns are called {column!r}. Choose one: "
+                f"{', '.join(map(repr, several[:5]))}."
+            )
         raise missing_column(file, column, names)
     return matches[0]
 

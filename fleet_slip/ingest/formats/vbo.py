@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import takewhile
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import polars as pl
@@ -17,7 +17,7 @@ import polars as pl
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.csv import CsvSource, first_lines
+from fleet_slip.ingest.formats.csv import EXTRA_FIELDS, FEWER, CsvSource, described, first_lines
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget, Channel
 from fleet_slip.ingest.vocabulary import unit_called
@@ -35,6 +35,9 @@ _STANDARD_CHANNELS = {
 """The meaning of columns by name, and their units unless the file states others."""
 _DEGREES = {"lat": 1 / 60, "long": -1 / 60}
 """Degrees, positive to the east, of minutes, positive to the west."""
+_LAST = "\0last"
+"""The last column, which a row with fewer fields does not have."""
+_BLANKS, _AROUND = re.compile(rb"[ \t]{2,}|\t"), re.compile(rb"(?m)^[ \t]+|[ \t]+(\r?)$")
 _FLAGS = 64
 """To the number of satellites 64 is added while the brake is pressed, and 128 by a correction."""
 
@@ -61,6 +64,23 @@ class VboSource(CsvSource):
         )
         super().__init__(budget, layout, replace(numbers, columns=numbers.columns - {_TIME}))
         self._lines, self._created = lines, _CREATED.search(lines[0])
+        called, first = lines[names - 1].split(), " ".join(lines[data - 1 : data]).split()
+        if first and len(first) != len(called):
+            raise InputError(
+                f"{quote_name(budget.file)}: {len(called)} names in [column names], and "
+                f"{len(first)} fields in the first row of [data], so that values may belong to "
+                "other columns. Correct the names: they cannot contain blanks."
+            )
+
+    def _read_header(self, stream: BinaryIO) -> list[Channel]:
+        """Return the columns, whose names are between blanks, and pass over all before the data."""
+        super()._read_header(stream)
+        return described(self._lines[self.csv_format.header_line - 1].split())
+
+    def _cleaned(self, block: bytes, start: int) -> bytes:
+        """Return a block with one blank between fields, and none around them."""
+        lines = _BLANKS.sub(b" ", block[start:]) if _BLANKS.search(block, start) else block[start:]
+        return block[:start] + _AROUND.sub(rb"\1", lines)
 
     def _section(self, name: str) -> list[str]:
         """Return the lines of a section up to an empty one, none where there is no such section."""
@@ -70,11 +90,12 @@ class VboSource(CsvSource):
     def channels(self) -> list[Channel]:
         """Return the columns but the time, with the units behind titles and those of modules."""
         titles, of_modules = self._section("[header]"), self._section("[channel units]")
+        names = [channel.name for channel in self._header]
         units = {name: unit for name, (_, unit) in _STANDARD_CHANNELS.items()}
-        if len(titles) == len(self._names):
+        if len(titles) == len(self._header):
             called = (unit_called(title.rpartition(" ")[2]) for title in titles)
-            units |= {n: unit for n, unit in zip(self._names, called, strict=True) if unit}
-        units |= zip(self._names[::-1], of_modules[::-1], strict=False)  # the last columns
+            units |= {n: unit for n, unit in zip(names, called, strict=True) if unit}
+        units |= zip(names[::-1], of_modules[::-1], strict=False)  # the last columns
         return [
             Channel(
                 channel.name,
@@ -89,7 +110,11 @@ class VboSource(CsvSource):
         """Yield the columns as CSV does, with their times. Raises `InputError`."""
         _, place = self.find(_TIME)
         start_s, last_s = None, np.nan
-        for rows in super().read(base, places | {_TIME: place}):
+        last = {_LAST: len(self._header) - 1}
+        for parsed in super().read(base, places | {_TIME: place} | last):
+            fewer = pl.when(pl.col(_LAST).is_null()).then(pl.lit(FEWER))
+            fault = pl.coalesce(EXTRA_FIELDS, fewer).alias(EXTRA_FIELDS)
+            rows = parsed.with_columns(fault).drop(_LAST)
             times_s = _seconds(rows[_TIME])
             is_finite = np.isfinite(times_s)
             if is_finite.any():
