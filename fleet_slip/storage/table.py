@@ -620,7 +620,12 @@ class Table:
                 self.folder.delete(action.path)
 
     def encode(self, rows: pa.Table) -> Encoded:
-        """Return the content of a file with these rows."""
+        """Return the content of a file with these rows, and the scales of its fields."""
+        import pyarrow as pa
+
+        metadata = {field.name: field.metadata for field in self.schema}
+        fields = [field.with_metadata(metadata.get(field.name)) for field in rows.schema]
+        rows = pa.Table.from_arrays(rows.columns, schema=pa.schema(fields))
         return self.encoding.encode(rows, self.partition_by)
 
     def require_readable(self, delta: DeltaTable) -> Evolution:

@@ -301,12 +301,14 @@ def quarantine_schema() -> "pa.Schema":
 
 
 def stored_schema(signals: SignalCatalog) -> "pa.Schema":
-    """Return the schema of the table `logs`, with each signal's scale in its field's metadata."""
+    """Return the schema of the table `logs`, with scale and unit of each signal's field."""
     import pyarrow as pa
 
     return pa.schema(
         [
-            field.with_metadata({SCALE: str(signals[field.name].scale)})
+            field.with_metadata(
+                {SCALE: str(signals[field.name].scale), "unit": signals[field.name].unit}
+            )
             if field.name in signals.signals
             else field
             for field in signals.log_schema

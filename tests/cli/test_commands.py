@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
+from deltalake import DeltaTable
 
 import fleet_slip
 from fleet_slip.catalog.features import PLAIN
@@ -126,6 +128,14 @@ def test_sql_answers_as_table_json_and_csv(run_command: RunCommand, smoke_root: 
 def test_every_column_is_documented(run_command: RunCommand, smoke_root: Path) -> None:
     query = "FROM dictionary WHERE description = ''"
     assert run_command("sql", query, "--json", root=smoke_root).json == []
+
+
+def test_other_readers_find_scales_and_units_in_table_and_files(smoke_root: Path) -> None:
+    delta = DeltaTable(smoke_root / "logs")
+    (field,) = (field for field in delta.schema().fields if field.name == "ay")
+    assert field.metadata == {"scale": "0.001", "unit": "m/s^2"}
+    stored = pq.read_schema(delta.file_uris()[0]).field("ay")
+    assert stored.metadata == {b"scale": b"0.001", b"unit": b"m/s^2"}
 
 
 def test_python_sees_the_same_views_in_si_units(smoke_root: Path) -> None:
