@@ -4,17 +4,19 @@ A batch's columns carry the prefix `RAW`, so that no name in a file can meet one
 for a pattern, or be anything but a name.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
+import numpy as np
 import polars as pl
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
+from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches
 from fleet_slip.ingest.columns import (
@@ -32,39 +34,23 @@ from fleet_slip.ingest.formats.source import BASE
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
 RAW = "raw "
-REASONS = (
-    "missing",
-    "not_a_number",
-    "not_a_time",
-    "not_finite",
-    "out_of_range",
-    "extra_fields",
-    "cut_line",
-    "fewer_fields",
-    "no_value",
-    "time_backwards",
-    "time_duplicate",
-    "isolated",
-)
-"""Reasons to reject a row by itself; a problem is an index into this.
-
-The last three apply to logs with several time bases; else `DriveCutter` detects them.
-"""
+Faults: TypeAlias = dict[str, pl.Expr]
+"""Whether a row has a fault, by reason. Of several faults the first one is reported."""
 
 
 @dataclass(frozen=True)
 class RowField:
     """A value to take from a row, or a condition on it.
 
-    `value` is made of raw columns; `problem`, null where all is well, may also use the value under
-    the field's name, so that a text is parsed once.
+    `value` is made of raw columns; `faults` may also use the value under the field's name, so that
+    a text is parsed once.
     """
 
     name: str
     kind: Literal["key", "time", "signal", "condition"]
     raw: pl.Expr
     value: pl.Expr
-    problem: pl.Expr
+    faults: Faults
 
 
 def find_held(column: str, schema: pl.Schema) -> str:
@@ -72,27 +58,17 @@ def find_held(column: str, schema: pl.Schema) -> str:
     return HELD + column if RAW + HELD + column in schema else column
 
 
-def find_problems(*cases: tuple[pl.Expr, str]) -> pl.Expr:
-    """Return the index of the first reason whose condition holds, else null."""
-    return pl.coalesce(
-        [
-            pl.when(condition).then(pl.lit(REASONS.index(reason), pl.Int16))
-            for condition, reason in cases
-        ]
-    )
-
-
-def _number_problems(name: str, present: pl.Expr, more: tuple[pl.Expr, str]) -> pl.Expr:
-    """Return the problems of a field's number; `present` is true where there is a text."""
+def _number_faults(name: str, is_present: pl.Expr, reason: str, is_faulty: pl.Expr) -> Faults:
+    """Return the faults of a field's number; `is_present` is true where there is a text."""
     value = pl.col(name)
-    unread, infinite = value.is_null() & present, ~value.is_finite()
-    return find_problems((unread, "not_a_number"), (infinite, "not_finite"), more)
+    unread = value.is_null() & is_present
+    return {"not_a_number": unread, "not_finite": ~value.is_finite(), reason: is_faulty}
 
 
-def _time_problems(name: str, text: pl.Expr, *more: tuple[pl.Expr, str]) -> pl.Expr:
-    """Return the problems of a field's day or time."""
-    unread = pl.col(name).is_null()
-    return find_problems((text.is_null(), "missing"), (unread, "not_a_time"), *more)
+def _time_faults(name: str, text: pl.Expr, is_outside: pl.Expr | None = None) -> Faults:
+    """Return the faults of a field's day or time."""
+    faults = {"missing": text.is_null(), "not_a_time": pl.col(name).is_null()}
+    return faults if is_outside is None else faults | {"out_of_range": is_outside}
 
 
 MAX_WHOLE = 2.0**53
@@ -158,8 +134,7 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
         case other:
             raise unfit_column(column, other, "a date such as 2024-05-31")
     outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
-    problem = _time_problems(name, text, (outside, "out_of_range"))
-    return RowField(name, "key", raw, day, problem)
+    return RowField(name, "key", raw, day, _time_faults(name, text, outside))
 
 
 def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
@@ -168,9 +143,9 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     if unit is None:
         return _timestamp(column, schema, mapping)
     number, present = as_number(column, schema, mapping)
-    problem = _number_problems("time", present, (pl.col("time").is_null(), "missing"))
+    faults = _number_faults("time", present, "missing", pl.col("time").is_null())
     time_s = number * conversion_factor(unit, "s")
-    return RowField("time", "time", pl.col(RAW + column), time_s, problem)
+    return RowField("time", "time", pl.col(RAW + column), time_s, faults)
 
 
 def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
@@ -182,7 +157,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
             text = _dates(mapping.time.date, schema, mapping) + " " + text
         if not mapping.time.is_dated:  # the time of day
             clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
-            return RowField("time", "time", raw, clock_s, _time_problems("time", text))
+            return RowField("time", "time", raw, clock_s, _time_faults("time", text))
         moment = as_moments(text, str(mapping.time.moment_format))
     elif isinstance(kind, pl.Datetime):
         text = moment = raw
@@ -195,8 +170,8 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
         )
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
-    problem = _time_problems("time", text, (outside, "out_of_range"))
-    return RowField("time", "time", raw, moment.dt.epoch("us") / 1e6, problem)
+    faults = _time_faults("time", text, outside)
+    return RowField("time", "time", raw, moment.dt.epoch("us") / 1e6, faults)
 
 
 def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
@@ -229,16 +204,17 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
         if RAW + DISORDER in schema:
             # The faults of times within their base, found by `merge_bases`.
             reasons = ("time_backwards", "time_duplicate", "isolated")
-            cases = ((pl.col(RAW + DISORDER) == reason, reason) for reason in reasons)
-            fields.append(_condition(*cases, raw=pl.col(RAW + mapping.time.key), name="time"))
+            faults = {reason: pl.col(RAW + DISORDER) == reason for reason in reasons}
+            fields.append(_condition(faults, raw=pl.col(RAW + mapping.time.key), name="time"))
     names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
-    fields += [*signals, _condition((nothing, "no_value"), raw=pl.lit(None, pl.String))]
+    fields += [*signals, _condition({"no_value": nothing}, raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
         extra = pl.col(RAW + EXTRA_FIELDS)
-        short = ((extra == CUT, "cut_line"), (extra == FEWER, "fewer_fields"))
-        fields.append(_condition(*short, (extra.is_not_null(), "extra_fields"), raw=extra))
+        short = {"cut_line": extra == CUT, "fewer_fields": extra == FEWER}
+        faults = short | {"extra_fields": extra.is_not_null()}
+        fields.append(_condition(faults, raw=extra))
     return fields
 
 
@@ -261,8 +237,8 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     return pl.all_horizontal(predicates)
 
 
-def _condition(*cases: tuple[pl.Expr, str], raw: pl.Expr, name: str = "") -> RowField:
-    return RowField(name, "condition", raw, raw, find_problems(*cases))
+def _condition(faults: Faults, raw: pl.Expr, name: str = "") -> RowField:
+    return RowField(name, "condition", raw, raw, faults)
 
 
 def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
@@ -270,11 +246,20 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
     number, present = _signed(source, source.column, schema, mapping)
-    (signal, low, high), value = count_range(mapping.signal_catalog, name, source), pl.col(name)
-    count = value / float(signal.scale)
-    outside = (count <= low - 0.5) | (count >= high + 0.5)
-    problem = _number_problems(name, present, (outside, "out_of_range"))
-    return RowField(name, "signal", raw, _si_value(mapping, name, source, number), problem)
+    least, largest = _value_range(*count_range(mapping.signal_catalog, name, source))
+    faults = _number_faults(name, present, "out_of_range", ~pl.col(name).is_between(least, largest))
+    return RowField(name, "signal", raw, _si_value(mapping, name, source, number), faults)
+
+
+def _value_range(signal: Signal, low: int, high: int) -> tuple[float, float]:
+    """Return the least and the largest value in SI units whose count rounds into a range."""
+    scale, margin = float(signal.scale), 4 * np.spacing(max(abs(low), abs(high)) + 0.5)
+    least, largest = (low - 0.5 - margin) * scale, (high + 0.5 + margin) * scale
+    while least / scale <= low - 0.5:
+        least = np.nextafter(least, np.inf)
+    while largest / scale >= high + 0.5:
+        largest = np.nextafter(largest, -np.inf)
+    return float(least), float(largest)
 
 
 def _signed(
@@ -298,8 +283,8 @@ def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     number, present = as_number(column, schema, mapping)
-    problem = _number_problems(name, present, (pl.col(name) <= 0, "out_of_range"))
-    return RowField(name, "key", pl.col(RAW + column), number, problem)
+    faults = _number_faults(name, present, "out_of_range", pl.col(name) <= 0)
+    return RowField(name, "key", pl.col(RAW + column), number, faults)
 
 
 def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
@@ -308,8 +293,8 @@ def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowFie
     faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
     if schema[RAW + column] == pl.Float64:  # which has lost digits of longer numbers
         faulty |= pl.col(RAW + column).abs() >= MAX_WHOLE
-    problem = find_problems((pl.col(name).is_null(), "missing"), (faulty, "out_of_range"))
-    return RowField(name, "key", pl.col(RAW + column), value, problem)
+    faults = {"missing": pl.col(name).is_null(), "out_of_range": faulty}
+    return RowField(name, "key", pl.col(RAW + column), value, faults)
 
 
 def _is_faulty(name: str) -> bool:
@@ -341,7 +326,6 @@ _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {
 
 MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""
-_PROBLEM = "problem"
 
 
 class CheckedBlock(NamedTuple):
@@ -380,28 +364,25 @@ class RowChecker:
         if self.left_out == self.rows:
             raise InputError(
                 f"{quote_name(self._file)}: none of {self.rows:,} rows meets the condition of "
-                "mapping "
-                f"{self._mapping.name!r}: {describe(self._mapping.where)}."
+                f"mapping {self._mapping.name!r}: {describe(self._mapping.where)}."
             )
 
     def _check(self, batch: pl.DataFrame) -> CheckedBlock:
-        raw = batch.select(pl.all().name.prefix(RAW))
+        raw = batch.rename({name: RAW + name for name in batch.columns})
         try:
             fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
         except InputError as error:
             raise InputError(f"{quote_name(self._file)}: {error}") from None
         if RAW + ROW in raw.columns:
-            raw = raw.rename({RAW + ROW: "row"})
+            raw = raw.rename({RAW + ROW: "row", RAW + BASE: "base"})
         else:
             row = pl.int_range(self.rows + 1, self.rows + batch.height + 1, dtype=pl.Int64)
             raw = raw.with_columns(row.alias("row"))
         if meeting is not None:
             raw = raw.filter(meeting)
-        raw = raw.rename({RAW + BASE: "base"}, strict=False)
         self.rows += batch.height
         self.left_out += batch.height - raw.height
-        valued = raw.with_columns(f.value.alias(f.name) for f in fields if f.kind != "condition")
-        rows, refused = _split(self.keys.number(valued, fields), fields)
+        rows, refused = _split(raw, self.keys.number(raw, fields), fields)
         if len(self.keys.metadata) > MAX_KEYS:
             raise InputError(
                 f"{quote_name(self._file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
@@ -431,39 +412,76 @@ class DriveKeys:
         self.metadata: list[dict[str, Any]] = []
         """The metadata of each number."""
 
-    def number(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
-        """Add `group` to a batch with values: the row's number, null where its key is faulty.
+    def number(self, batch: pl.DataFrame, fields: list[RowField]) -> pl.Expr | pl.Series:
+        """Return `group` for raw columns: the row's number, null where its key is faulty.
 
-        A key are the fields of the kind `key`; without any, the whole file is number 0.
+        A key are the fields of the kind `key`; without any, the whole file is number 0. A run of
+        rows with the same raw values is looked at once.
         """
-        of_key = [field for field in fields if field.kind == "key"]
-        if not of_key:
+        keys = [field for field in fields if field.kind == "key"]
+        if not keys:
             self.metadata = self.metadata or [{}]
-            return batch.with_columns(pl.lit(0, pl.Int32).alias("group"))
-        names = [field.name for field in of_key]
-        sound = pl.all_horizontal([field.problem.is_null() for field in of_key])
-        keys = batch.filter(sound).select(names).unique(maintain_order=True)
-        fresh = [key for key in keys.rows() if key not in self._numbers]
+            return pl.lit(0, pl.Int32).alias("group")
+        sources = {name for field in keys for name in field.value.meta.root_names()}
+        changes = [pl.col(name).ne_missing(pl.col(name).shift()) for name in sources]
+        is_head = pl.any_horizontal(*changes, pl.int_range(pl.len()) == 0)
+        run = batch.select(is_head.alias("head"))["head"]
+        heads = batch.select(sources).filter(run).with_columns(_values(keys))
+        numbers = self._number_keys(heads, keys)
+        return numbers.gather(run.cum_sum() - 1)
+
+    def _number_keys(self, rows: pl.DataFrame, keys: list[RowField]) -> pl.Series:
+        """Return the number of each row's key, null where it is faulty."""
+        names = [field.name for field in keys]
+        faulty = pl.any_horizontal(fault for field in keys for fault in field.faults.values())
+        sound = rows.with_columns(faulty.fill_null(value=False).alias("\0faulty"))
+        combinations = sound.filter(~pl.col("\0faulty")).select(names).unique(maintain_order=True)
+        fresh = [key for key in combinations.rows() if key not in self._numbers]
         self._numbers |= {key: number for number, key in enumerate(fresh, len(self._numbers))}
         self.metadata += [dict(zip(names, key, strict=True)) for key in fresh]
-        numbers = [self._numbers[key] for key in keys.rows()]
-        keys = keys.with_columns(pl.Series("group", numbers, pl.Int32))
-        joined = batch.join(keys, on=names, how="left", nulls_equal=True, maintain_order="left")
-        return joined.with_columns(pl.when(sound).then("group").alias("group"))
+        numbers = [self._numbers[key] for key in combinations.rows()]
+        numbered = combinations.with_columns(pl.Series("group", numbers, pl.Int32))
+        joined = sound.join(numbered, on=names, how="left", nulls_equal=True, maintain_order="left")
+        return joined.select(pl.when(~pl.col("\0faulty")).then("group"))["group"]
 
 
-def _split(batch: pl.DataFrame, fields: list[RowField]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Split a batch into good rows, in SI units, and bad ones, by the first problem of each."""
-    values = [field.name for field in fields if field.kind in {"time", "signal"}]
-    columns = ["row", "group", *({"base"} & set(batch.columns)), *values]
-    codes = pl.coalesce(field.problem + len(REASONS) * i for i, field in enumerate(fields))
-    checked = batch.with_columns(codes.alias(_PROBLEM))
-    if checked[_PROBLEM].null_count() == checked.height:
-        return batch.select(columns), no_rows()
-    good = checked.filter(pl.col(_PROBLEM).is_null()).select(columns)
-    bad = checked.filter(pl.col(_PROBLEM).is_not_null())
-    explained = [_explain(rows, fields) for rows in bad.partition_by(_PROBLEM)]
-    return good, pl.concat([no_rows(), *explained])
+def _values(fields: Iterable[RowField]) -> list[pl.Expr]:
+    return [field.value.alias(field.name) for field in fields]
+
+
+def _split(
+    raw: pl.DataFrame, group: pl.Expr | pl.Series, fields: list[RowField]
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Split a batch into good rows, in SI units, and bad ones with the first fault of each.
+
+    Most batches are good: then each fault is only looked for. A value that is not finite is out of
+    its range, too.
+    """
+    measured = [field for field in fields if field.kind in {"time", "signal"}]
+    columns = ["row", "group", *({"base"} & set(raw.columns)), *(f.name for f in measured)]
+    valued = raw.with_columns(group, *_values(measured))
+    faults = [(field, *fault) for field in fields for fault in field.faults.items()]
+    possible = [
+        fault
+        for field, reason, fault in faults
+        if field.kind != "key" and not (field.kind == "signal" and reason == "not_finite")
+    ]
+    seen = valued.select(
+        fault.any().alias(str(i)) for i, fault in enumerate([pl.col("group").is_null(), *possible])
+    )
+    if not any(seen.row(0)):
+        return valued.select(columns), no_rows()
+    valued = valued.with_columns(_values(field for field in fields if field.kind == "key"))
+    masks = valued.select(
+        fault.fill_null(value=False).alias(str(i)) for i, (_, _, fault) in enumerate(faults)
+    )
+    is_refused, pieces = pl.repeat(value=False, n=valued.height, eager=True), [no_rows()]
+    for (field, reason, _), mask in zip(faults, masks, strict=True):
+        if mask.any():
+            bad = valued.filter(mask & ~is_refused)
+            pieces.append(_refused(bad, reason, field.name or None, field.raw))
+            is_refused |= mask
+    return valued.filter(~is_refused).select(columns), pl.concat(pieces)
 
 
 def describe_refused(rows: pl.DataFrame, mask: BoolArray | None, reason: str) -> pl.DataFrame:
@@ -471,12 +489,16 @@ def describe_refused(rows: pl.DataFrame, mask: BoolArray | None, reason: str) ->
     if mask is not None and not mask.any():
         return no_rows()
     bad = rows if mask is None else rows.filter(pl.Series(mask))
-    return bad.select(
-        pl.col("row"),
-        pl.col("group"),
+    return _refused(bad, reason, "time", pl.col("time"))
+
+
+def _refused(rows: pl.DataFrame, reason: str, signal: str | None, value: pl.Expr) -> pl.DataFrame:
+    return rows.select(
+        "row",
+        "group",
         pl.lit(reason).alias("reason"),
-        pl.lit("time").alias("signal"),
-        pl.col("time").cast(pl.String).alias("value"),
+        pl.lit(signal, pl.String).alias("signal"),
+        value.cast(pl.String).str.slice(0, MAX_VALUE_CHARACTERS).alias("value"),
     )
 
 
@@ -485,16 +507,3 @@ def no_rows() -> pl.DataFrame:
     """Return an empty frame of bad rows."""
     names = {"row": pl.Int64, "group": pl.Int32, "reason": pl.String}
     return pl.DataFrame(schema={**names, "signal": pl.String, "value": pl.String})
-
-
-def _explain(bad: pl.DataFrame, fields: list[RowField]) -> pl.DataFrame:
-    """Describe rows that all have the same problem."""
-    index, reason = divmod(bad[_PROBLEM][0], len(REASONS))
-    field = fields[index]
-    return bad.select(
-        "row",
-        "group",
-        pl.lit(REASONS[reason]).alias("reason"),
-        pl.lit(field.name or None, pl.String).alias("signal"),
-        field.raw.cast(pl.String).str.slice(0, MAX_VALUE_CHARACTERS).alias("value"),
-    )

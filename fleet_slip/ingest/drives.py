@@ -94,7 +94,8 @@ class DriveCutter:
             ]
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
-        return CutRows(rows, pl.concat(refused), ended + (self._open_segments() if last else []))
+        misplaced = pl.concat(refused) if any(bad.height for bad in refused) else no_rows()
+        return CutRows(rows, misplaced, ended + (self._open_segments() if last else []))
 
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool

@@ -584,7 +584,7 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
-    drive_of_row = as_arrow(np.repeat(np.arange(len(drives)), [d.ticks.size for d in drives]))
+    sizes = [drive.ticks.size for drive in drives]
     columns, signal_catalog = {}, mapping.signal_catalog
     for column in signal_catalog.log_schema:
         if column.name == "tick":
@@ -595,21 +595,32 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
         elif column.name in signal_catalog.extras:
             continue
         elif column.name in signal_catalog.signals:
-            columns[column.name] = pa.nulls(len(drive_of_row), column.type)
+            columns[column.name] = pa.nulls(sum(sizes), column.type)
         else:
             values = [drive.metadata.get(column.name) for drive in drives]
-            columns[column.name] = _column(values, column.type).take(drive_of_row)
+            columns[column.name] = _repeat(values, sizes, column.type)
     return pa.table(columns)
 
 
-def _column(values: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return values as a column. Not by `pa.array`, which imports pandas if installed."""
+def _repeat(values: Sequence[Any], sizes: Sequence[int], kind: pa.DataType) -> pa.Array:
+    """Return a column with each value so many times; strings are dictionary-encoded.
+
+    Not by `pa.array`, which imports pandas if installed.
+    """
     if pa.types.is_string(kind):
         texts = list(dict.fromkeys(text for text in values if text is not None))
         codes = [None if text is None else texts.index(text) for text in values]
         named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
-        return pa.DictionaryArray.from_arrays(_column(codes, pa.int32()), named, safe=False)
-    return pl.Series(values, strict=False).to_arrow().cast(kind)
+        return pa.DictionaryArray.from_arrays(_repeat(codes, sizes, pa.int32()), named, safe=False)
+    column = pl.Series(values, strict=False)
+    if column.null_count() == len(column):
+        return pa.nulls(sum(sizes), kind)
+    numbers = column.to_physical().fill_null(0).to_numpy()
+    absent = column.is_null().to_numpy() if column.null_count() else None
+    repeated = as_arrow(
+        np.repeat(numbers, sizes), None if absent is None else np.repeat(absent, sizes)
+    )
+    return repeated.view(column.to_arrow().type).cast(kind)
 
 
 # Commits: rejected rows first, then drives.

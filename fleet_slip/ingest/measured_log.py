@@ -156,7 +156,8 @@ class MeasuredStream:
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced, segments = cutter.cut(block.rows, last=last)
         self._open.add(rows)
-        self._refuse(pl.concat([block.refused, misplaced]))
+        self._refuse(block.refused)
+        self._refuse(misplaced)
         for ended in self._open.take(segments, last=last):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
                 self._refuse(describe_refused(ended.frame, None, "too_short"))

@@ -195,6 +195,8 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     if not pa.types.is_dictionary(column.type):
         return column
     array = column.combine_chunks()
+    if len(array.dictionary) == 1 and array.null_count < len(array):
+        return column
     used = array.indices.unique().drop_null()
     if used.to_pylist() == list(range(len(array.dictionary))):
         return column
