@@ -51,11 +51,11 @@ from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
-mapping = load_mapping({mapping!r}, load_catalog())
-warehouse = Warehouse(LocalFolder(Path({root!r})))
-list(ingest_files(warehouse, [Path({small!r})], mapping))
+mapping = load_mapping("{mapping}", load_catalog())
+warehouse = Warehouse(LocalFolder(Path("{root}")))
+list(ingest_files(warehouse, [Path("{small}")], mapping))
 start = clocks()
-(report,) = ingest_files(warehouse, [Path({file!r})], mapping)
+(report,) = ingest_files(warehouse, [Path("{file}")], mapping)
 assert report.new and report.counts.ticks == {rows}
 """
 _REFERENCE = """
@@ -231,15 +231,17 @@ def measure_log(
     write_log(file, rows, drives, shuffled=shuffled)
     write_log(small, 1000, min(drives, 1))
     write_mapping(mapping, kind, drives)
-    places = {"file": str(file), "small": str(small), "root": str(folder / "data"), "rows": rows}
-    seconds, cpu_s, peak_mib = measure(_INGEST.format(**places, mapping=str(mapping)))
+    root = str(folder / "data")
+    work = _INGEST.format(file=file, small=small, root=root, rows=rows, mapping=mapping)
+    seconds, cpu_s, peak_mib = measure(work)
     if kind == "mf4":
-        places |= {
-            name: str(Path(places[name]).with_suffix(".parquet")) for name in ("file", "small")
-        }
-        write_log(Path(places["file"]), rows, drives, shuffled=shuffled)
-        write_log(Path(places["small"]), 1000, min(drives, 1))
-    _, reference_s, _ = measure(_REFERENCE.format(**places, signals=[*SIGNALS]))
+        file, small = file.with_suffix(".parquet"), small.with_suffix(".parquet")
+        write_log(file, rows, drives, shuffled=shuffled)
+        write_log(small, 1000, min(drives, 1))
+    work = _REFERENCE.format(
+        file=str(file), small=str(small), root=root, rows=rows, signals=[*SIGNALS]
+    )
+    _, reference_s, _ = measure(work)
     fast = "met" if rows / seconds >= GOAL_ROWS_PER_S[kind] else "missed"
     little = "met" if peak_mib <= GOAL_MIB else "missed"
     shown = f"{rows / seconds / 1e6:14.2f} {rows / cpu_s / 1e6:10.2f} {cpu_s / reference_s:10.2f}"

@@ -53,6 +53,12 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
             yield from rows.iter_slices(BATCH_ROWS)
 
 
+def read_columns(log: Path, mapping: Mapping, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
+    """Yield columns of a log with one time base, in bounded batches. Raises `InputError`."""
+    with file_errors(log), open_source(log, mapping.formats) as source:
+        yield from Budget.for_file(log).metered(source.batches(columns))
+
+
 def _with_times(
     batches: Iterator[pl.DataFrame], log: Path, time_column: str, time: str
 ) -> Iterator[pl.DataFrame]:

@@ -5,6 +5,7 @@ for a pattern, or be anything but a name.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cache, lru_cache, partial
@@ -18,7 +19,7 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches
+from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches, read_columns
 from fleet_slip.ingest.columns import (
     NO_NUMBER,
     DateColumn,
@@ -31,6 +32,7 @@ from fleet_slip.ingest.columns import (
 )
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS, FEWER
 from fleet_slip.ingest.formats.source import BASE
+from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
 RAW = "raw "
@@ -192,13 +194,10 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
 
     Raises `InputError` if a column's type does not fit the mapping.
     """
-    fields: list[RowField] = []
-    if mapping.drive.column is not None:
-        fields.append(_text("drive", find_held(mapping.drive.column, schema), schema, mapping))
-    for name, make in _METADATA.items():
-        source = getattr(mapping.drive, name)
-        if isinstance(source, FromColumn):
-            fields.append(make(name, find_held(source.column, schema), schema, mapping))
+    fields = [
+        _METADATA[name](name, find_held(column, schema), schema, mapping)
+        for name, column in _key_columns(mapping).items()
+    ]
     if mapping.time.key is not None:
         fields.append(time_field(mapping.time.key, schema, mapping))
         if RAW + DISORDER in schema:
@@ -216,6 +215,13 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
         faults = short | {"extra_fields": extra.is_not_null()}
         fields.append(_condition(faults, raw=extra))
     return fields
+
+
+def _key_columns(mapping: Mapping) -> dict[str, str]:
+    """Return the columns with metadata of drives, by the names of their fields."""
+    sources = {name: getattr(mapping.drive, name) for name in _METADATA if name != "drive"}
+    columns = {n: source.column for n, source in sources.items() if isinstance(source, FromColumn)}
+    return columns if mapping.drive.column is None else {"drive": mapping.drive.column, **columns}
 
 
 def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
@@ -311,6 +317,7 @@ def _map_texts(
 
 
 _METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {
+    "drive": _text,
     "vehicle_id": _text,
     "vehicle_model": _text,
     "track": _text,
@@ -443,6 +450,38 @@ class DriveKeys:
         numbered = combinations.with_columns(pl.Series("group", numbers, pl.Int32))
         joined = sound.join(numbered, on=names, how="left", nulls_equal=True, maintain_order="left")
         return joined.select(pl.when(~pl.col("\0faulty")).then("group"))["group"]
+
+
+LARGE_FILE_BYTES = 2**22
+"""Size of a file from which `is_grouped` reads it: the rows of a smaller one fit into memory."""
+
+
+def is_grouped(file: Path, mapping: Mapping) -> bool:
+    """Return True if the rows of each drive of a large file are together. Reads these columns only.
+
+    Then a drive ends with its last row, and need not wait in a temporary file for the end of the
+    log. False for several time bases, and for a file whose faults `RowChecker` reports.
+    """
+    columns = _key_columns(mapping)
+    several_bases = mapping.time.own_clock or len(mapping.time_bases()) > 1
+    if not columns or several_bases or size_of(file) < LARGE_FILE_BYTES:
+        return False
+    keys, latest = DriveKeys(), -1
+    with suppress(InputError):
+        for batch in read_columns(file, mapping, [*dict.fromkeys(columns.values())]):
+            raw = batch.rename({name: RAW + name for name in batch.columns})
+            fields = [
+                _METADATA[name](name, column, raw.schema, mapping)
+                for name, column in columns.items()
+            ]
+            groups = raw.select(keys.number(raw, fields))["group"].drop_nulls()
+            if not groups.is_sorted() or (len(groups) and groups[0] < latest):
+                return False
+            latest = groups[-1] if len(groups) else latest
+            if len(keys.metadata) > MAX_KEYS:
+                return False
+        return True
+    return False
 
 
 def _values(fields: Iterable[RowField]) -> list[pl.Expr]:

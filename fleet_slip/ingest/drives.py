@@ -54,10 +54,15 @@ class DriveCutter:
     The result does not depend on the blocks: a row that needs the next one waits for it.
     """
 
-    def __init__(self, base: TimeBase, longest_s: float = MAX_DRIVE_S) -> None:
-        """Set the gap that ends a drive, and the maximum duration of a segment."""
+    def __init__(
+        self, base: TimeBase, longest_s: float = MAX_DRIVE_S, *, is_grouped: bool = False
+    ) -> None:
+        """Set the gap that ends a drive, and the maximum duration of a segment.
+
+        If the file `is_grouped`, the rows of each group are together: the next group ends it.
+        """
         self._gap_s = base.split_gap_s + TIME_EPSILON_S
-        self._longest_s = longest_s
+        self._longest_s, self._is_grouped = longest_s, is_grouped
         self._waiting: pl.DataFrame | None = None
         self._segments = 0
         self._state = np.empty(0, dtype=_GROUP)
@@ -65,17 +70,21 @@ class DriveCutter:
 
     def cut(self, rows: pl.DataFrame, *, last: bool) -> CutRows:
         """Return the rows of a block, those of a segment together; `last` ends all segments."""
+        if not last and self._waiting is None and self._continues(rows):
+            segment = int(self._state["segment"][rows["group"][0]])
+            return CutRows(rows.with_columns(pl.lit(segment, pl.Int64).alias("segment")), no_rows(), [])
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
         if rows.is_empty():
             nothing = rows.with_columns(pl.lit(0, pl.Int64).alias("segment"))
-            return CutRows(nothing, no_rows(), self._open_segments() if last else [])
+            return CutRows(nothing, no_rows(), self._end_before(self._state.size) if last else [])
         if several:
             rows = rows.sort("group", "time", maintain_order=True)
         elif not rows["group"].is_sorted():
             rows = rows.sort("group", maintain_order=True)
-        new_groups = int(rows["group"][-1]) + 1 - self._state.size
+        group = rows["group"]
+        new_groups = int(group[-1]) + 1 - self._state.size
         if new_groups > 0:
             self._state = np.concatenate([self._state, np.full(new_groups, _UNSEEN, dtype=_GROUP)])
         alone, waiting, decided_at = self._isolated(rows, last=last)
@@ -94,8 +103,33 @@ class DriveCutter:
             ]
             if (disordered := twice | backwards).any():
                 rows = rows.filter(pl.Series(~disordered))
+        if last:
+            ended += self._end_before(self._state.size)
+        elif self._is_grouped:
+            ended = sorted(ended + self._end_before(int(group[-1])))
         misplaced = pl.concat(refused) if any(bad.height for bad in refused) else no_rows()
-        return CutRows(rows, misplaced, ended + (self._open_segments() if last else []))
+        return CutRows(rows, misplaced, ended)
+
+    def _continues(self, rows: pl.DataFrame) -> bool:
+        """Return True if all rows continue the open segment of one group, in the order of time.
+
+        Most blocks do; then the state is updated.
+        """
+        if not rows.height or "base" in rows.columns:
+            return False
+        group, time = rows["group"], rows["time"].to_numpy()
+        if group[0] >= self._state.size or group.min() != group.max():
+            return False
+        state = self._state[group[0]]
+        step_s = np.diff(time, prepend=state["latest"])
+        is_steady = step_s.min() > 0 and step_s.max() <= self._gap_s  # False for NaN
+        piece = (time[-1] - state["start"]) // self._longest_s
+        is_ordered = state["last"] == state["time"] == state["latest"]
+        if not is_steady or not is_ordered or piece != state["piece"]:
+            return False
+        for name in ("last", "time", "latest"):
+            self._state[name][group[0]] = time[-1]
+        return True
 
     def _isolated(
         self, rows: pl.DataFrame, *, last: bool
@@ -110,8 +144,9 @@ class DriveCutter:
         alone = is_far & far_next
         waiting = np.zeros(alone.size, dtype=np.bool_)
         if not last:
-            waiting[end] = alone[end]
-            alone[end] = False
+            may_wait = end[-1:] if self._is_grouped else end
+            waiting[may_wait] = alone[may_wait]
+            alone[may_wait] = False
         self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
         # Rows of several time bases can be ordered by their times only.
         number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
@@ -174,9 +209,13 @@ class DriveCutter:
         before[first] = self._state[name][group[first]]
         return before
 
-    def _open_segments(self) -> list[int]:
-        """Return the segments that no block has ended, by group."""
-        return [int(segment) for segment in self._state["segment"] if segment >= 0]
+    def _end_before(self, group: int) -> list[int]:
+        """End the open segments of all groups before a group; return them by group."""
+        open_segment = self._state["segment"][:group]
+        is_open = open_segment >= 0
+        ended: list[int] = open_segment[is_open].tolist()
+        open_segment[is_open] = -1
+        return ended
 
 
 def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from glob import glob
 from pathlib import Path, PosixPath
@@ -98,3 +99,16 @@ def _logs_below(folder: Path) -> Iterator[Path]:
         for name in names:
             if name.lower().endswith(SUFFIXES) and not name.startswith("."):
                 yield Path(parent, name)
+
+
+def state_of(log: Path) -> tuple[int, int] | None:
+    """Return size and time of change, None if the file cannot be examined."""
+    with suppress(OSError):  # the reader of the file reports the problem
+        status = log.stat()
+        return status.st_size, status.st_mtime_ns
+    return None
+
+
+def size_of(log: Path) -> int:
+    """Return the bytes of a log, 0 if it cannot be examined."""
+    return (state_of(log) or (0, 0))[0]

@@ -25,6 +25,7 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
+from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import IngestCounts, MeasuredStream, open_measured
 from fleet_slip.ingest.recordings import (
@@ -43,7 +44,6 @@ from fleet_slip.ingest.recordings import (
     fingerprints_of,
     is_fully_erased,
     readmit_file,
-    size_of,
     tables_of,
 )
 from fleet_slip.ingest.ticks import MeasuredDrive, drive_id

@@ -21,7 +21,13 @@ from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.checked_columns import CheckedBlock, RowChecker, describe_refused, no_rows
+from fleet_slip.ingest.checked_columns import (
+    CheckedBlock,
+    RowChecker,
+    describe_refused,
+    is_grouped,
+    no_rows,
+)
 from fleet_slip.ingest.drives import (
     MAX_DRIVE_S,
     DriveCutter,
@@ -113,10 +119,11 @@ class MeasuredStream:
 
         Their order depends on the file and the mapping only.
         """
+        grouped = is_grouped(self.file, self.mapping)
         with closing(read_ahead(self.checker.blocks())) as blocks:
             early, intervals_s = self._usual_intervals(blocks)
             longest_s = MAX_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
-            cutter = DriveCutter(self.mapping.time, longest_s)
+            cutter = DriveCutter(self.mapping.time, longest_s, is_grouped=grouped)
             for block in chain(early, blocks):
                 yield from self._ended(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)

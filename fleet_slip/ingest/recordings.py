@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 
 from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import RepeatedError
+from fleet_slip.ingest.log_files import state_of
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.resources import cache_folder, keep_json
@@ -220,7 +221,7 @@ class IngestCache:
 
         def is_landed(file: Path) -> bool:
             entry = self.digests.get(_name_of(file))
-            return entry is not None and _state_of(file) == entry[:2] and landed(FILES + entry[2])
+            return entry is not None and state_of(file) == entry[:2] and landed(FILES + entry[2])
 
         return [file for file in files if not is_landed(file)]
 
@@ -231,7 +232,7 @@ class IngestCache:
 
     def remember(self, file: Path, digest: str) -> None:
         """Record that a file is in the logs."""
-        if state := _state_of(file):
+        if state := state_of(file):
             self.digests[_name_of(file)] = (*state, digest)
 
     def save(self) -> None:
@@ -241,19 +242,6 @@ class IngestCache:
 
 def _name_of(log: Path) -> str:
     return os.path.abspath(log)  # noqa: PTH100 - the faster
-
-
-def _state_of(log: Path) -> tuple[int, int] | None:
-    """Return size and time of change, None if the file cannot be examined."""
-    with suppress(OSError):  # the reader of the file reports the problem
-        status = log.stat()
-        return status.st_size, status.st_mtime_ns
-    return None
-
-
-def size_of(log: Path) -> int:
-    """Return the bytes of a log, 0 if it cannot be examined."""
-    return (_state_of(log) or (0, 0))[0]
 
 
 # Files whose recording is stored already.

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import drives, logs, measured_log
+from fleet_slip.ingest import checked_columns, drives, logs, measured_log
 from fleet_slip.ingest.drives import DriveCutter
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvSource
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.logs import log_table
+from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -210,6 +211,34 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     assert spilled.drives.equals(whole.drives)
     assert spilled.counts == whole.counts
     assert whole.counts.drives == 5
+
+
+@pytest.mark.parametrize("returns", [False, True])
+@pytest.mark.parametrize("block_bytes", [200, 2**22])
+def test_drives_whose_rows_are_together_end_with_their_last_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int, *, returns: bool
+) -> None:
+    """Of three drives the second has a gap, and the third an isolated last row."""
+    columns: dict[str, list[Any]] = {**good_columns(60)}
+    columns["run"] = [f"run {i // 20}" for i in range(60)]
+    columns["t"] = [f"{i / 100 + 5 * (28 < i < 40) + 9 * (i == 59):.2f}" for i in range(60)]
+    columns["ax"][7] = columns["run"][9] = ""
+    if returns:
+        columns["run"][58] = " run 0"
+    mapping = a_mapping(drive={"column": "run"})
+    expected = read_columns(tmp_path, columns, mapping)
+    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr(checked_columns, "LARGE_FILE_BYTES", 0)
+    together = read_columns(tmp_path, columns, mapping)
+    assert checked_columns.is_grouped(tmp_path / "log.csv", mapping) != returns
+    assert together.drives.equals(expected.drives)
+    assert together.quarantine.equals(expected.quarantine)
+    assert together.counts == expected.counts
+    assert expected.counts.drives == 4
+    assert expected.counts.quarantined["isolated"] == 1
+    with open_measured(tmp_path / "log.csv", mapping) as stream:
+        names = [drive.drive_id for drive in stream.drives()]
+    assert names == sorted(names)
 
 
 numbers = st.one_of(
