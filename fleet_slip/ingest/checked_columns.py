@@ -101,7 +101,7 @@ def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr
             is_present = text.is_not_null() & ~is_absent.fill_null(value=False)
             return pl.when(is_present).then(number), is_present
         case pl.Float64 | pl.Int64 | pl.UInt64:
-            number = raw.cast(pl.Float64).fill_nan(None)
+            number = raw.cast(pl.Float64)
             number = pl.when(~number.is_in(absent)).then(number) if absent else number
             return number, pl.lit(value=False)
         case other:
@@ -375,7 +375,7 @@ class RowChecker:
             )
 
     def _check(self, batch: pl.DataFrame) -> CheckedBlock:
-        raw = batch.rename({name: RAW + name for name in batch.columns})
+        raw = _without_nan(batch.rename({name: RAW + name for name in batch.columns}))
         try:
             fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
         except InputError as error:
@@ -398,6 +398,17 @@ class RowChecker:
         if self._mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / self._mapping.time.rate_hz).alias("time"))
         return CheckedBlock(rows, refused, self.rows)
+
+
+def _without_nan(batch: pl.DataFrame) -> pl.DataFrame:
+    """Return a batch with null for NaN, which is no value either."""
+    names = [name for name, kind in batch.schema.items() if kind == pl.Float64]
+    if not names:
+        return batch
+    has_nan = batch.select(pl.col(names).is_nan().any()).row(0)
+    return batch.with_columns(
+        pl.col(name).fill_nan(None) for name, nan in zip(names, has_nan, strict=True) if nan
+    )
 
 
 @lru_cache(maxsize=64)

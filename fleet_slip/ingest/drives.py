@@ -71,8 +71,9 @@ class DriveCutter:
     def cut(self, rows: pl.DataFrame, *, last: bool) -> CutRows:
         """Return the rows of a block, those of a segment together; `last` ends all segments."""
         if not last and self._waiting is None and self._continues(rows):
-            segment = int(self._state["segment"][rows["group"][0]])
-            return CutRows(rows.with_columns(pl.lit(segment, pl.Int64).alias("segment")), no_rows(), [])
+            number = int(self._state["segment"][rows["group"][0]])
+            segment = pl.lit(number, pl.Int64).alias("segment")
+            return CutRows(rows.with_columns(segment), no_rows(), [])
         several = "base" in rows.columns
         if self._waiting is not None:
             rows = pl.concat([self._waiting, rows])
