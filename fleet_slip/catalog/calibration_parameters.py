@@ -4,13 +4,13 @@ Each has a physical value. Models and cars use it as an integer count of its gra
 16 bits is unknown.
 """
 
+from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from typing import Literal
 
 from fleet_slip.catalog.arithmetic import nearest
 from fleet_slip.catalog.signals import COUNT_MAX, SIUnit
-from fleet_slip.config import Config
 
 CALIBRATION = "calibration"
 """Feature set whose Gram rows determine the parameters."""
@@ -39,7 +39,8 @@ ColumnUnit = SIUnit | Literal["1"]
 """An SI unit, or "1"."""
 
 
-class CalibrationParameter(Config):
+@dataclass(frozen=True)
+class CalibrationParameter:
     """One calibration parameter: its unit, grain and meaning."""
 
     unit: ColumnUnit
@@ -78,7 +79,7 @@ _PARAMETERS: tuple[tuple[CalibrationParameterName, ColumnUnit, str, str], ...] =
 )  # fmt: skip
 
 CALIBRATION_PARAMETERS: dict[CalibrationParameterName, CalibrationParameter] = {
-    name: CalibrationParameter(unit=unit, grain=Decimal(grain), description=description)
+    name: CalibrationParameter(unit, Decimal(grain), description)
     for name, unit, grain, description in _PARAMETERS
 }
 """All parameters, in the order of display."""

@@ -1,5 +1,6 @@
 """The file `configs/features.toml` as types: features, columns over time, feature sets."""
 
+from collections import Counter
 from collections.abc import Mapping
 from decimal import Decimal
 from fractions import Fraction
@@ -127,7 +128,7 @@ class FeatureFile(Config):
         columns: dict[str, Feature | TimeColumn] = {**self.features, **over_time}
         taken |= {"day", "tick", "clipped", *AUXILIARY}
         names = [*columns, *(column.column for column in columns.values())]
-        twice = sorted(name for name in names if name in taken or names.count(name) > 1)
+        twice = sorted(n for n, number in Counter(names).items() if n in taken or number > 1)
         if twice:
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
         for name, purpose in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):

@@ -1,5 +1,6 @@
 """The signal catalog `configs/signals.toml` as types: scales, ranges, roles, Arrow schema."""
 
+from collections import Counter
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
@@ -166,7 +167,7 @@ class SignalCatalog(Config):
             )
         names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
         names += ["day", "tick", "time_s"]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        twice = sorted(name for name, number in Counter(names).items() if number > 1)
         if twice:
             raise ValueError(f"names must differ: {', '.join(twice)}")
         return self
