@@ -5,40 +5,40 @@ WITH named AS (
     FROM counted
 ),
 
-judged AS (
+checked AS (
     SELECT
         number,
         drive_id,
         CASE
-            WHEN source IS DISTINCT FROM 'received' THEN 'has another source than ''received'''
-            WHEN coalesce(trim(vehicle_id), '') = '' THEN 'has no name of a car'
-            WHEN coalesce(trim(drive_id), '') = '' THEN 'has no name of a drive'
-            WHEN known.columns IS NULL THEN 'is of a feature set, or of signals, that mean something else here'
+            WHEN source IS DISTINCT FROM 'received' THEN 'does not have the source ''received'''
+            WHEN coalesce(trim(vehicle_id), '') = '' THEN 'has no vehicle_id'
+            WHEN coalesce(trim(drive_id), '') = '' THEN 'has no drive_id'
+            WHEN known.columns IS NULL THEN 'has a feature set or signals that are defined differently here'
             WHEN signals IS NULL OR names <> list_filter(known.columns, lambda name: list_contains(names, name))
-                THEN 'has signals that its set has not, or in another order'
+                THEN 'has signals that its feature set lacks, or another order of signals'
             WHEN (len(sums), len(products)) IS DISTINCT FROM (len(names), len(names) * (len(names) + 1) // 2)
-                THEN 'has not the sums and products of its signals'
+                THEN 'does not have one sum a signal and one product a pair of signals'
             WHEN list_aggregate(sums, 'count') < len(sums) OR list_aggregate(products, 'count') < len(products)
-                THEN 'has a sum or a product that is null'
+                THEN 'has a sum or product that is null'
             WHEN coalesce(n, 0) < 1 THEN 'has no rows'
-            WHEN NOT list_contains(known.parts, coalesce(part, '')) THEN 'has a part that its set has not'
+            WHEN NOT list_contains(known.parts, coalesce(part, '')) THEN 'has a block that its feature set lacks'
             WHEN in_time <> (course_late IS NOT NULL) OR NOT coalesce(course_late, 0) BETWEEN $earliest AND $latest
-                THEN 'is corrected by a delay that no course has'
+                THEN 'has a course delay that is missing, unexpected or out of range'
             WHEN day IS NULL OR NOT day BETWEEN DATE '2000-01-01' AND current_date + 1
-                THEN 'is of a day before 2000 or in the future'
+                THEN 'has a day before 2000 or in the future'
             WHEN (vehicle_id, day) <> first_value((vehicle_id, day)) OVER (PARTITION BY drive_id ORDER BY number)
-                THEN 'is of another car or day than a row of its drive before'
+                THEN 'has another car or day than an earlier row of its drive'
             WHEN row_number() OVER (PARTITION BY drive_id, feature_set, part, signals ORDER BY number) > 1
-                THEN 'is there twice'
+                THEN 'appears twice'
             WHEN sum(n) OVER (PARTITION BY vehicle_id, day, feature_set, part ORDER BY number) > $longest
-                THEN 'makes its car drive more than 24 hours on a day'
+                THEN 'exceeds 24 hours of driving of its car on a day'
         END AS reason
     FROM named
     LEFT JOIN known ON feature_set = key
 )
 
 SELECT number, drive_id, reason
-FROM judged
+FROM checked
 WHERE reason IS NOT NULL
 ORDER BY number
 LIMIT 1

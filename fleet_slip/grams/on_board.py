@@ -511,7 +511,7 @@ def _require_different(file: Path, rows: pa.Table) -> None:
     drives, digests = rows["drive_id"].to_pylist(), rows["digest"].to_pylist()
     for row, (drive, digest) in enumerate(zip(drives, digests, strict=True), 1):
         if (other := first_drives.setdefault(digest, drive)) != drive:
-            _refuse(file, row, drive, f"is there twice, first as {quote_name(other)}")
+            _refuse(file, row, drive, f"appears twice, first as {quote_name(other)}")
 
 
 def _require_possible(sets: Mapping[str, OnboardFeatureSet], file: Path, table: pa.Table) -> None:
@@ -567,8 +567,8 @@ def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
                 excess = database.execute(statement, [MAX_ROWS_OF_A_DAY]).fetchone()
     if repeated:
         row, drive, stored = repeated
-        _refuse(file, row, drive, f"is there already, as {quote_name(stored)}", RepeatedError)
+        _refuse(file, row, drive, f"is stored already, as {quote_name(stored)}", RepeatedError)
     if excess:
         row, drive = excess
-        reason = "makes its car drive more than 24 hours on a day, with what is stored"
+        reason = "exceeds 24 hours of driving of its car on a day, with the stored rows"
         _refuse(file, row, drive, reason)

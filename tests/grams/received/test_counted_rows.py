@@ -94,16 +94,16 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
-        ({"source": "smoke"}, "another source"),
-        ({"vehicle_id": " "}, "no name of a car"),
-        ({"drive_id": None}, "no name of a drive"),
+        ({"source": "smoke"}, "not have the source"),
+        ({"vehicle_id": " "}, "no vehicle_id"),
+        ({"drive_id": None}, "no drive_id"),
         ({"day": date(1999, 12, 31)}, "a day before 2000"),
         ({"day": date.today() + timedelta(days=3)}, "in the future"),
-        ({"feature_set": "signals:0000000000000000"}, "mean something else here"),
-        ({"part": "4 s"}, "a part that its set has not"),
-        ({"course_late": 3}, "a delay that no course has"),
-        ({"signals": ",".join(reversed(GRAM.signals))}, "in another order"),
-        ({"signals": "ax"}, "not the sums and products of its signals"),
+        ({"feature_set": "signals:0000000000000000"}, "defined differently here"),
+        ({"part": "4 s"}, "a block that its feature set lacks"),
+        ({"course_late": 3}, "a course delay that is missing, unexpected or out of range"),
+        ({"signals": ",".join(reversed(GRAM.signals))}, "another order of signals"),
+        ({"signals": "ax"}, "not have one sum a signal"),
         ({"n": 0}, "has no rows"),
         ({"sums": [None, *GRAM.sums[1:]]}, "null"),
         (
@@ -112,12 +112,12 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
                 "sums": LONG_SUMS.tolist(),
                 "products": LONG_PRODUCTS.tolist(),
             },
-            "makes its car drive more than 24 hours on a day",
+            "exceeds 24 hours of driving of its car on a day",
         ),
         ({"sums": [10**9, *GRAM.sums[1:]]}, "sums outside the ranges"),
         ({"products": [2**50, *GRAM.products[1:]]}, "products outside the ranges"),
         ({"products": NEGATIVE.tolist()}, "not positive semidefinite"),
-        ({"drive_id": "VIN1-20240501T100000Z"}, "of another car or day"),
+        ({"drive_id": "VIN1-20240501T100000Z"}, "another car or day"),
         ({"vehicle_id": "V" * 2_000_000}, "a vehicle_id that has more than 200 characters"),
         ({"drive_id": "V" * 201}, "a drive_id that has more than 200 characters"),
         ({"vehicle_id": "V\x1b[2J"}, "a vehicle_id that has characters that cannot be printed"),
@@ -142,9 +142,9 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
             [other(GRAM), row_of(gram_of(1), drive_id="renamed")],
         )
     ):
-        with pytest.raises(RepeatedError, match=r"row 2 .* is there already, as VIN1-2024"):
+        with pytest.raises(RepeatedError, match=r"row 2 .* is stored already, as VIN1-2024"):
             fleet.import_onboard_grams(write_counted(tmp_path / f"{number}", rows))
-    with pytest.raises(InputError, match=r"row 2 .* is there twice"):
+    with pytest.raises(InputError, match=r"row 2 .* appears twice"):
         fleet.import_onboard_grams(
             write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))])
         )
@@ -165,10 +165,10 @@ def test_a_replay_is_refused_on_any_day_of_any_car(
 ) -> None:
     replay = row_of(gram_of(1), drive_id="replay", **change)
     both = write_counted(tmp_path / "both", [row_of(gram_of(1)), replay])
-    with pytest.raises(InputError, match=r"row 2 \(drive replay\) is there twice, first as VIN1-"):
+    with pytest.raises(InputError, match=r"row 2 \(drive replay\) appears twice, first as VIN1-"):
         fleet.import_onboard_grams(both)
     fleet.import_onboard_grams(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
-    with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
+    with pytest.raises(RepeatedError, match="is stored already, as VIN1-2024"):
         fleet.import_onboard_grams(write_counted(tmp_path / "replay", [replay]))
     assert len(gram_rows(fleet)) == 1
 
@@ -181,7 +181,7 @@ def test_rows_of_a_standing_car_may_equal_those_of_another(
     fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
     fleet.import_onboard_grams(write_counted(tmp_path / "third", [row_of(standing, "VIN3")]))
     again = write_counted(tmp_path / "again", [row_of(standing, "VIN1", drive_id="again")])
-    with pytest.raises(RepeatedError, match="is there already, as VIN1-2024"):
+    with pytest.raises(RepeatedError, match="is stored already, as VIN1-2024"):
         fleet.import_onboard_grams(again)
 
 
@@ -195,14 +195,14 @@ def long_drive(seed: int, rows: int, name: str) -> dict[str, Any]:
 
 def test_a_car_drives_24_hours_a_day_at_most(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
     drives = [long_drive(seed, MAX_ROWS_OF_A_DAY // 2, f"drive-{seed}") for seed in range(4)]
-    reason = "makes its car drive more than 24 hours on a day"
+    reason = "exceeds 24 hours of driving of its car on a day"
     with pytest.raises(InputError, match=rf"row 3 \(drive drive-2\) {reason}"):
         fleet.import_onboard_grams(write_counted(tmp_path / "three", drives[:3]))
     fleet.import_onboard_grams(write_counted(tmp_path / "one", drives[:1]))
     fleet.import_onboard_grams(write_counted(tmp_path / "two", drives[1:2]))
     other = drives[2] | {"vehicle_id": "VIN2"}
     tomorrow = drives[3] | {"day": date(2024, 5, 2)}
-    with pytest.raises(InputError, match=rf"row 1 \(drive drive-2\) {reason}, with what is stored"):
+    with pytest.raises(InputError, match=rf"row 1 .*{reason}, with the stored rows"):
         fleet.import_onboard_grams(write_counted(tmp_path / "third", drives[2:3]))
     fleet.import_onboard_grams(write_counted(tmp_path / "others", [other, tomorrow]))
     assert len(gram_rows(fleet)) == 4
@@ -270,7 +270,7 @@ def test_a_drive_with_a_log_is_refused(smoke_copy: Path, tmp_path: Path) -> None
     fleet = fleet_slip.open(smoke_copy)
     same, _ = renamed(fleet, "other")
     path = write_counted(tmp_path / "rows", [same])
-    with pytest.raises(RepeatedError, match="is there already"):
+    with pytest.raises(RepeatedError, match="is stored already"):
         fleet.import_onboard_grams(path)
 
 
