@@ -425,7 +425,7 @@ class NightlyPipeline:
                 f"{self.inbox}: no such folder. Name the inbox folder for logs, or mount it."
             )
         try:
-            find_logs([self.inbox])
+            logs = find_logs([self.inbox])
         except InputError:  # a night without new logs is normal
             state: State = "done" if self.baseline.drives else "attention"
             return state, "No log is in the folder."
@@ -447,6 +447,7 @@ class NightlyPipeline:
         if replaced := sum(report.drives_replaced for report in reports):
             drives = pluralize(replaced, "drive")
             summary = f"{summary} The mapping was corrected: {drives} replaced."
+        summary = f"{summary} {logs.describe_passed_over()}".rstrip()
         if repeated:
             return "attention", f"{summary} Left out: {repeated}"
         for report in reports:

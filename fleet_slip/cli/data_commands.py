@@ -118,6 +118,7 @@ def ingest(
     from fleet_slip.ingest.log_files import names_several
 
     folders = any(map(names_several, files))
+    warn_of_passed_over(files)
     warned: set[tuple[str, tuple[str, ...]]] = set()
 
     def print_report(report: "IngestReport") -> None:
@@ -143,6 +144,14 @@ def ingest(
         new = sum(report.new for report in reports)
         say(_ingested(pluralize(new, "new file"), reports) if new else "nothing new")
     _require_no_alarm(reports)
+
+
+def warn_of_passed_over(files: Sequence[str]) -> None:
+    """Print how many files of folders are no logs by their suffix, and some names."""
+    from fleet_slip.ingest.log_files import find_logs
+
+    if passed_over := find_logs(files).describe_passed_over():
+        say(passed_over, logging.WARNING)
 
 
 def _require_no_alarm(reports: "list[IngestReport]") -> None:

@@ -13,6 +13,7 @@ import typer
 from fleet_slip.base import date_of, last_day, pluralize
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
+from fleet_slip.cli.data_commands import warn_of_passed_over
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
 from fleet_slip.errors import FleetSlipError, UsageError
@@ -144,6 +145,7 @@ def learn(
     Example: fleet-slip learn golf logs/ --mapping golf.toml
     """
     fleet = fleet_of(context)
+    warn_of_passed_over(logs)
     with progress_of_steps() as show:
         report = fleet.learn(name, logs, mapping, workers=cluster or threads, progress=show)
     if json:

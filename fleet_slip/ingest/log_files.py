@@ -5,40 +5,74 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache
 from glob import glob
-from pathlib import Path, PosixPath
+from pathlib import Path
 
-from fleet_slip.base import quote_name
+from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.formats.confined_reader import FORMATS
+from fleet_slip.ingest.formats.parquet_footer import MAGIC
+from fleet_slip.ingest.formats.reading import StrayLink
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
     ".blf", ".asc", ".log", ".trc", ".mcap", ".tdms", ".vbo",
 )  # fmt: skip
 
+_COMPANIONS = (
+    ".toml", ".dbc", ".kcd", ".sym", ".arxml", ".a2l", ".md", ".json", ".yaml", ".yml", ".pdf",
+    ".png", ".jpg", ".py", ".sh", ".tdms_index",
+)  # fmt: skip
+"""Suffixes of files that lie beside logs and are none."""
+_BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
+"""First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
+
 WILDCARDS = frozenset("*?[")
 
 
-class StrayLink(PosixPath):
-    """A file behind a link out of its folder, which is refused."""
+class LogFiles(list[Path]):
+    """Logs, and the other files of their folders whose suffix is not that of a log."""
+
+    def __init__(self, logs: Iterable[Path], passed_over: Iterable[Path]) -> None:
+        """Take both."""
+        super().__init__(logs)
+        self.passed_over = tuple(passed_over)
+
+    def describe_passed_over(self) -> str:
+        """Return a sentence on the files that were passed over, empty without any."""
+        if not self.passed_over:
+            return ""
+        names = ", ".join(quote_name(file) for file in self.passed_over[:3])
+        more = " …" if len(self.passed_over) > 3 else ""
+        files = pluralize(len(self.passed_over), "file")
+        return (
+            f"{files} passed over, whose suffix is not that of a log: {names}{more}. Rename what "
+            "is a log, or name it."
+        )
 
 
-def find_logs(paths: Iterable[Path | str]) -> list[Path]:
+def find_logs(paths: Iterable[Path | str]) -> LogFiles:
     """Return the given files, and the logs in the given folders, sorted.
 
     A path that does not exist may be a pattern such as `2024-*/*.mf4`. The suffix identifies logs
-    in folders; hidden files and folders are skipped. Raises `InputError` for no files.
+    in folders, or the first bytes; hidden files and folders are skipped. Raises
+    `InputError` for no files.
     """
-    for place in paths:
+    places, passed_over = list(paths), list[Path]()
+    for place in places:
         if "://" in str(place):
             raise InputError(
                 "logs are files of this machine. Copy those of an object store first, such as by: "
                 "aws s3 sync URL FOLDER"
             )
-    return [file for place in paths for file in _files_of(Path(place))]
+    files = [file for place in places for file in _files_of(Path(place), passed_over)]
+    return LogFiles(files, sorted(passed_over))
 
 
-def _files_of(path: Path) -> list[Path]:
-    """Return the files of a path: itself, those of a folder, or those that match a pattern."""
+def _files_of(path: Path, passed_over: list[Path]) -> list[Path]:
+    """Return the files of a path: itself, those of a folder, or those that match a pattern.
+
+    Adds other files of the folder to `passed_over`.
+    """
     if is_pattern(path):
         return _matching(path)
     if not path.is_dir():
@@ -51,11 +85,11 @@ def _files_of(path: Path) -> list[Path]:
             "folder "
             "of your logs."
         )
-    inside = sorted(_logs_below(path))
+    inside = sorted(_logs_below(path, passed_over))
     if not inside:
         raise InputError(
             f"{quote_name(path)}: no file in this folder has the suffix of a log: "
-            f"{', '.join(SUFFIXES)}."
+            f"{', '.join(SUFFIXES)}. {LogFiles([], passed_over).describe_passed_over()}".rstrip()
         )
     return _without_strays(inside, path)
 
@@ -90,15 +124,37 @@ def _without_strays(files: list[Path], folder: Path) -> list[Path]:
         place = os.path.realpath(file) if file.is_symlink() else f"{real(file.parent)}/"
         return os.path.commonpath([top, place]) == top
 
-    return [file if is_inside(file) else StrayLink(file) for file in files]
+    return [
+        file if isinstance(file, StrayLink) or is_inside(file) else StrayLink(file)
+        for file in files
+    ]
 
 
-def _logs_below(folder: Path) -> Iterator[Path]:
+def _logs_below(folder: Path, passed_over: list[Path]) -> Iterator[Path]:
+    top = os.path.realpath(folder)
     for parent, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in folders:
+            linked = Path(parent, name)
+            if linked.is_symlink() and os.path.commonpath([top, os.path.realpath(linked)]) != top:
+                yield StrayLink(linked)
         for name in names:
-            if name.lower().endswith(SUFFIXES) and not name.startswith("."):
-                yield Path(parent, name)
+            file = Path(parent, name)
+            if name.startswith(".") or name.lower().endswith(_COMPANIONS):
+                continue
+            if name.lower().endswith(SUFFIXES) or _begins_as_log(file):
+                yield file
+            else:
+                passed_over.append(file)
+
+
+def _begins_as_log(file: Path) -> bool:
+    """Return True if the first bytes of a file are those of a log."""
+    with suppress(OSError):
+        if file.is_file():  # a pipe would be waited for
+            with file.open("rb") as stream:
+                return stream.read(max(map(len, _BEGINNINGS))).startswith(_BEGINNINGS)
+    return False
 
 
 def state_of(log: Path) -> tuple[int, int] | None:

@@ -29,7 +29,7 @@ def give(*words: str) -> str:
 
 
 @dag(
-    schedule="30 2 * * *",
+    schedule="30 4 * * *",
     start_date=pendulum.datetime(2026, 1, 1, tz="UTC"),
     catchup=False,
     max_active_runs=1,

@@ -48,5 +48,5 @@ night = dagster.define_asset_job(
 definitions = dagster.Definitions(
     assets=[champion],
     jobs=[night],
-    schedules=[dagster.ScheduleDefinition(job=night, cron_schedule="30 2 * * *")],
+    schedules=[dagster.ScheduleDefinition(job=night, cron_schedule="30 4 * * *")],
 )

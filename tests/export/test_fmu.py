@@ -53,6 +53,15 @@ def unpack(content: bytes, folder: Path) -> tuple[Any, ElementTree.Element]:
     return ctypes.CDLL(str(library)), description.getroot()
 
 
+LOGGER = ctypes.CFUNCTYPE(None, c_void_p, c_char_p, c_int, c_char_p, c_char_p)
+
+
+class Functions(ctypes.Structure):
+    """The callbacks of FMI 2.0, of which the logger alone is set."""
+
+    _fields_ = (("logger", LOGGER), *((name, c_void_p) for name in ("a", "f", "s", "e")))
+
+
 class Fmu:
     """An instance of an FMU, called by the functions of FMI 2.0."""
 
@@ -67,7 +76,11 @@ class Fmu:
     def instantiate(self, token: bytes) -> Any:
         call = self.library.fmi2Instantiate
         call.restype = c_void_p
-        return call(b"car", c_int(1), c_char_p(token), None, None, c_int(0), c_int(0))
+        self.messages: list[tuple[bytes, bytes]] = []
+        self._logger = LOGGER(lambda _, name, *more: self.messages.append((name, more[2])))
+        self._functions = Functions(self._logger)
+        functions = byref(self._functions)
+        return call(b"car", c_int(1), c_char_p(token), None, functions, c_int(0), c_int(0))
 
     def call(self, function: str, *arguments: Any) -> int:
         return int(getattr(self.library, f"fmi2{function}")(self.component, *arguments))
@@ -124,7 +137,10 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
     assert [instance.step(s) for s in (0.01, 0.05, 0.0100000001)] == [0, 0, 0]
     error = 3
     assert [instance.step(s) for s in (0.015, 0.0, -0.01, float("nan"), 1e300)] == [error] * 5
+    message = b"the communication step of %g s is not a multiple of %g s"
+    assert instance.messages == [(b"car", message)] * 5
     assert not instance.instantiate(b"{another}")
+    assert instance.messages[0][0] == b"car"
     state = c_void_p()
     program = compile_program(CATALOG, MANIFEST)
     samples = hostile_drive(program, 60, 1)

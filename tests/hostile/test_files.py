@@ -17,7 +17,8 @@ from fleet_slip.errors import ConfigError, FleetSlipError, InputError, StorageEr
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.formats.can import parse_database
 from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
-from fleet_slip.ingest.log_files import StrayLink, find_logs
+from fleet_slip.ingest.formats.reading import StrayLink
+from fleet_slip.ingest.log_files import find_logs
 from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.models.acceptance import PublishThresholds
 from fleet_slip.models.registry import Registry
@@ -90,7 +91,7 @@ def test_a_link_out_of_a_folder_is_refused_and_holds_nothing_up(
     (folder / "below").symlink_to(other)
     reports = []
     with pytest.raises(
-        InputError, match=r"4 files cannot be used; all others .*b\.csv: a symbolic link"
+        InputError, match=r"5 files cannot be used; all others .*b\.csv: a symbolic link"
     ):
         reports += list(ingest_files(warehouse, find_logs([folder]), a_mapping()))
     assert warehouse.logs.snapshot().rows == 20

@@ -8,6 +8,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 import fleet_slip
@@ -19,6 +21,7 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.warehouse import Warehouse
+from tests.support.commands import run_on
 from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
 from tests.support.reported import call
 
@@ -72,6 +75,33 @@ def test_the_logs_of_a_folder_land_together_and_once(folder: Path) -> None:
     write_log(folder / "new.csv", rows=40)
     assert [Path(report["file"]).name for report in ingest(folder)] == ["new.csv"]
     assert len(drives(folder)) == 6
+
+
+def test_a_log_is_known_by_its_first_bytes_and_other_files_are_named(folder: Path) -> None:
+    parquet = folder / "INCA.dat"
+    pq.write_table(pa.table(good_columns(30)), parquet)
+    (folder / "car.dbc").write_text("beside the logs")
+    (folder / "export.txt").write_text("t,ax\n0,1\n")
+    found = find_logs([folder])
+    assert parquet in found
+    assert [file.name for file in found.passed_over] == ["export.txt", "notes.txt"]
+    root, mapping = folder.parent / "root", folder.parent / "car.toml"
+    printed = run_on(root, "ingest", folder, "--mapping", mapping)
+    assert printed.exit_code == 0
+    assert "6 new files" in printed.stderr
+    assert "2 files passed over, whose suffix is not that of a log: " in printed.stderr
+    assert "notes.txt" in printed.stderr
+
+
+@pytest.mark.parametrize("target", ["elsewhere", "landing/day 0"])
+def test_a_linked_folder_is_an_error_unless_it_is_read_anyway(folder: Path, target: str) -> None:
+    write_log(folder.parent / "elsewhere" / "7.csv", rows=27)
+    (folder / "disk").symlink_to(folder.parent / target, target_is_directory=True)
+    mapping = folder.parent / "car.toml"
+    printed = run_on(folder.parent / "root", "ingest", folder, "--mapping", mapping)
+    assert len(drives(folder)) == 5
+    assert printed.exit_code == (4 if target == "elsewhere" else 0)
+    assert ("disk: a symbolic link out of its folder" in printed.stderr) == (target == "elsewhere")
 
 
 def test_progress_is_in_files(folder: Path) -> None:

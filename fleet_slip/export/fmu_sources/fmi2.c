@@ -114,6 +114,13 @@ typedef struct {
     void *componentEnvironment;
 } fmi2CallbackFunctions;
 
+/* An instance, first, so that a pointer to it is one to this, and where its messages go. */
+typedef struct {
+    instance model;
+    fmi2CallbackFunctions functions;
+    char name[64];
+} component;
+
 #define REFERENCES fmi2Component c, const fmi2ValueReference references[], size_t count
 
 static fmi2Status status(bool is_valid)
@@ -143,10 +150,13 @@ EXPORTED fmi2Component fmi2Instantiate(fmi2String name, int kind, fmi2String tok
         }
         return NULL;
     }
-    instance *self = malloc(sizeof *self);
+    component *self = malloc(sizeof *self);
     if (self != NULL) {
-        clear(self);
-        start(self);
+        (void)memset(self, 0, sizeof *self);
+        clear(&self->model);
+        start(&self->model);
+        if (functions != NULL) { self->functions = *functions; }
+        if (name != NULL) { (void)strncpy(self->name, name, sizeof self->name - 1U); }
     }
     return self;
 }
@@ -304,7 +314,14 @@ EXPORTED fmi2Status fmi2GetRealOutputDerivatives(REFERENCES, const int orders[],
 EXPORTED fmi2Status fmi2DoStep(fmi2Component c, double time, double step, fmi2Boolean keeps)
 {
     (void)time; (void)keeps;
-    return status(advance(c, step));
+    const component *self = c;
+    if (advance(c, step)) { return fmi2OK; }
+    if (self->functions.logger != NULL) {
+        self->functions.logger(self->functions.componentEnvironment, self->name, fmi2Error, "error",
+                               "the communication step of %g s is not a multiple of %g s", step,
+                               (double)TICK_S);
+    }
+    return fmi2Error;
 }
 
 EXPORTED fmi2Status fmi2CancelStep(fmi2Component c) { (void)c; return fmi2Error; }

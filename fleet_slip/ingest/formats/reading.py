@@ -5,7 +5,7 @@ The first bytes identify the format; for text also the mapping and the file's su
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from pathlib import Path
+from pathlib import Path, PosixPath
 
 import polars as pl
 import pyarrow as pa
@@ -20,7 +20,6 @@ from fleet_slip.ingest.formats.parquet_footer import MAGIC
 from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 from fleet_slip.ingest.formats.tables import open_parquet
 from fleet_slip.ingest.formats.vbo import VBO_BEGINS, VboSource
-from fleet_slip.ingest.log_files import StrayLink
 
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
@@ -32,6 +31,10 @@ _BINARY = {
     (".mcap",): "an MCAP file",
     (".tdms", ".tdms_index"): "a TDMS file",
 }
+
+
+class StrayLink(PosixPath):
+    """A file or folder behind a link out of its folder, which is refused."""
 
 
 @contextmanager
