@@ -26,8 +26,7 @@ from fleet_slip.regression.gram import complete_cases
 from fleet_slip.regression.inference import (
     DriveMoments,
     Evidence,
-    infer_by_clusters,
-    infer_classically,
+    infer,
 )
 from fleet_slip.regression.least_squares import correlation_matrix
 from fleet_slip.regression.orders import RANKINGS, rank
@@ -72,8 +71,8 @@ def evidence(training: TrainingFolds, output: Path) -> None:
         sizes = [int(np.argmin(criterion_values(name, known))) for known in (rows, drives)]
         print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
     naive, robust = (
-        infer_classically(fits[-1], SCALES),
-        infer_by_clusters(fits[-1], training.drives, SCALES),
+        infer(fits[-1], SCALES),
+        infer(fits[-1], SCALES, training.drives),
     )
     for one, other in zip(naive.estimates, robust.estimates, strict=True):
         errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"

@@ -560,7 +560,7 @@ class Calibration(Answer):
             "logs_version": self.logs_version,
             "grams_version": self.grams_version,
             "numbers": {
-                name: definition.model_dump(mode="json")
+                name: vars(definition) | {"grain": str(definition.grain)}
                 for name, definition in CALIBRATION_PARAMETERS.items()
             },
             "cars": {

@@ -21,12 +21,7 @@ from fleet_slip.catalog.definitions import (
     parity,
     plain_column,
 )
-from fleet_slip.catalog.features import (
-    PLAIN,
-    FeatureFile,
-    FeatureSetEntry,
-    load_features,
-)
+from fleet_slip.catalog.features import PLAIN, FeatureFile, FeatureSetEntry, load_features
 from fleet_slip.catalog.signals import (
     SAMPLE_TIME_S,
     Identifier,
@@ -34,12 +29,7 @@ from fleet_slip.catalog.signals import (
     SignalCatalog,
     load_signals,
 )
-from fleet_slip.catalog.time_columns import (
-    Calibrated,
-    EstimateColumn,
-    Feature,
-    TimeColumn,
-)
+from fleet_slip.catalog.time_columns import Calibrated, EstimateColumn, Feature, TimeColumn
 from fleet_slip.config import Config, read_named_file
 from fleet_slip.errors import QuestionError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs

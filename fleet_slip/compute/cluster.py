@@ -113,11 +113,7 @@ def _connect(address: str) -> Client:
     """Connect; retry if Dask rejects two initial messages that arrive together."""
     usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
     connect: Callable[[], Client] = partial(
-        _Client,
-        address,
-        timeout=min(FIRST_S, usual_s),
-        set_as_default=False,
-        name="fleet-slip",
+        _Client, address, timeout=min(FIRST_S, usual_s), set_as_default=False, name="fleet-slip"
     )
     for _ in range(CONNECT_ATTEMPTS - 1):
         with contextlib.suppress(AssertionError):

@@ -9,7 +9,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, QuestionError, UsageError
-from fleet_slip.regression.folds import FoldAssignment, by_band, by_hash, by_value
+from fleet_slip.regression.folds import FoldAssignment, by_hash, by_value
 
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
 
@@ -88,7 +88,7 @@ def assign_folds(values: Sequence[Any], by: str, count: FoldCount) -> FoldAssign
             )
         return by_value(values)
     if by == BANDS:
-        return by_band(values, count)
+        return by_value(values, bands=count)
     if len(set(values)) > count:
         return by_hash([str(value) for value in values], count)
     return by_value(values)

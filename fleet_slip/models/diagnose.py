@@ -14,8 +14,7 @@ from fleet_slip.regression.inference import (
     ClusterUnit,
     Evidence,
     Inference,
-    infer_by_clusters,
-    infer_classically,
+    infer,
     variance_inflation,
 )
 from fleet_slip.regression.least_squares import Fit, condition_number
@@ -118,13 +117,13 @@ def diagnose(
     total = served.table.total()
     fits = nested_fits(total, inputs, label, intercept=intercept)
     fitted = fits[-1]
-    naive = infer_classically(fitted, scales)
+    naive = infer(fitted, scales)
     return Diagnosis(
         fitted=fitted,
         drives=len(served.table),
         cluster="row" if alone else moments.unit,
         naive=naive,
-        robust=naive if alone else infer_by_clusters(fitted, moments, scales),
+        robust=naive if alone else infer(fitted, scales, moments),
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
         evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),

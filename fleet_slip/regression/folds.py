@@ -62,12 +62,16 @@ def by_hash(keys: Sequence[str], count: int) -> FoldAssignment:
     return FoldAssignment(fold, tuple(str(number + 1) for number in used))
 
 
-def by_value(values: Sequence[Any]) -> FoldAssignment:
-    """Make one fold of each distinct value.
+def by_value(values: Sequence[Any], bands: int | None = None) -> FoldAssignment:
+    """Make one fold of each distinct value, or of each band of values.
+
+    Bands have about as many distinct values each. They depend on the cohort, unlike other folds.
 
     Parameters
     ----------
     values : sequence, shape (drives,)
+    bands : int, optional
+        Maximum number of bands. Default: each value is a fold.
 
     Returns
     -------
@@ -84,40 +88,13 @@ def by_value(values: Sequence[Any]) -> FoldAssignment:
             "out of the cohort."
         )
     distinct = sorted(set(values))
-    number = {value: i for i, value in enumerate(distinct)}
+    folds = np.array_split(np.arange(len(distinct)), min(bands or len(distinct), len(distinct)))
+    number = {distinct[place]: i for i, members in enumerate(folds) for place in members}
     fold = np.array([number[value] for value in values], dtype=np.int64)
-    return FoldAssignment(fold, tuple(str(value) for value in distinct))
-
-
-def by_band(values: Sequence[Any], count: int) -> FoldAssignment:
-    """Divide the range of a number into bands with about as many distinct values each.
-
-    The bands depend on the cohort, unlike other folds.
-
-    Parameters
-    ----------
-    values : sequence, shape (drives,)
-    count : int
-        Number of bands.
-
-    Returns
-    -------
-    FoldAssignment
-
-    Raises
-    ------
-    DataError
-        If a value is missing, or all are equal.
-    """
-    assignment = by_value(values)
-    if len(assignment.names) <= count:
-        return assignment
-    bands = np.array_split(np.arange(len(assignment.names)), count)
-    band = np.repeat(np.arange(count), [len(members) for members in bands])
-    names = tuple(
-        f"{assignment.names[members[0]]} to {assignment.names[members[-1]]}" for members in bands
-    )
-    return FoldAssignment(band[assignment.fold].astype(np.int64), names)
+    if len(folds) == len(distinct):
+        return FoldAssignment(fold, tuple(map(str, distinct)))
+    names = tuple(f"{distinct[members[0]]} to {distinct[members[-1]]}" for members in folds)
+    return FoldAssignment(fold, names)
 
 
 @dataclass(frozen=True)

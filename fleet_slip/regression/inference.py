@@ -247,44 +247,20 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     return [variance * (1 + Fraction(form, denominator)) / gram.n, *slopes]
 
 
-def infer_classically(fitted: Fit, scales: Scales) -> Inference:
-    """Return standard errors for independent rows, each rounded once.
+def infer(fitted: Fit, scales: Scales, drives: DriveMoments | None = None) -> Inference:
+    """Return standard errors of the coefficients: for independent rows, or by clusters (CR2).
+
+    By clusters, degrees of freedom are Satterthwaite's, so that intervals hold for few clusters and
+    for unequal ones.
 
     Parameters
     ----------
     fitted : Fit
     scales : mapping of str to Fraction
         Physical value of one count of each signal.
-
-    Returns
-    -------
-    Inference
-
-    Raises
-    ------
-    DataError
-        If there are too few rows.
-    """
-    sigma2 = noise_variance(fitted)
-    units = _units(fitted, scales)
-    errors = [
-        exact.sqrt(v * unit**2)
-        for v, unit in zip(classical_variances(fitted, sigma2), units, strict=True)
-    ]
-    return _inference(fitted, scales, sigma2, errors, fitted.degrees_of_freedom)
-
-
-def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Inference:
-    """Return cluster-robust standard errors (CR2), with a drive or a vehicle as cluster.
-
-    With Satterthwaite's degrees of freedom, intervals hold for few clusters and for unequal ones.
-
-    Parameters
-    ----------
-    fitted : Fit
-    drives : DriveMoments
-    scales : mapping of str to Fraction
-        Physical value of one count of each signal.
+    drives : DriveMoments, optional
+        Drives, with a drive or a vehicle as cluster. Default: rows are independent, and each error
+        is computed exactly and rounded once.
 
     Returns
     -------
@@ -295,11 +271,15 @@ def infer_by_clusters(fitted: Fit, drives: DriveMoments, scales: Scales) -> Infe
     DataError
         If there is one cluster, or too few rows.
     """
-    clusters = _require_clusters(drives.clusters, drives.unit)
-    variances, degrees = clustered_variances(fitted, drives)
-    units = [float(unit) for unit in _units(fitted, scales)]
-    errors = [math.sqrt(v) * u for v, u in zip(variances, units, strict=True)]
+    clusters = None if drives is None else _require_clusters(drives.clusters, drives.unit)
     sigma2 = noise_variance(fitted)
+    units = _units(fitted, scales)
+    if drives is None or clusters is None:
+        exact_variances = classical_variances(fitted, sigma2)
+        errors = [exact.sqrt(v * u**2) for v, u in zip(exact_variances, units, strict=True)]
+        return _inference(fitted, scales, sigma2, errors, fitted.degrees_of_freedom)
+    variances, degrees = clustered_variances(fitted, drives)
+    errors = [math.sqrt(v) * float(u) for v, u in zip(variances, units, strict=True)]
     return _inference(fitted, scales, sigma2, errors, clusters - 1, degrees.tolist())
 
 

@@ -60,14 +60,16 @@ CRITERIA: dict[str, Callable[[Problem], FloatArray]] = {
 }
 
 
-def criterion_values(name: str, evidence: Evidence) -> FloatArray:
-    """Return the values of a selection criterion for the k + 1 nested models.
+def criterion_values(name: str, evidence: Evidence, rss: FloatArray | None = None) -> FloatArray:
+    """Return the values of a selection criterion for k + 1 models of 0 to k signals.
 
     Parameters
     ----------
     name : str
         One of `CRITERIA`.
     evidence : Evidence
+    rss : float array, shape (k + 1,), optional
+        Residual sums of squares of the models, in counts^2. Default: the nested models.
 
     Returns
     -------
@@ -79,47 +81,16 @@ def criterion_values(name: str, evidence: Evidence) -> FloatArray:
     QuestionError
         For an unknown criterion.
     """
+    if name not in CRITERIA:
+        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {', '.join(CRITERIA)}.")
+    excess = evidence.excess() if rss is None else evidence.excess_of(rss)
     size = np.arange(evidence.inputs + 1, dtype=np.float64)
-    return _criterion(name)(Problem(evidence.excess(), size, evidence.rows, evidence.inputs))
-
-
-def subset_values(name: str, evidence: Evidence, rss: FloatArray, size: FloatArray) -> FloatArray:
-    """Return the values of a selection criterion for subset models.
-
-    Parameters
-    ----------
-    name : str
-        One of `CRITERIA`.
-    evidence : Evidence
-    rss : float array, shape (models,)
-        Residual sums of squares in counts^2.
-    size : float array, shape (models,)
-        Numbers of signals.
-
-    Returns
-    -------
-    float array, shape (models,)
-
-    Raises
-    ------
-    QuestionError
-        For an unknown criterion.
-    """
-    problem = Problem(evidence.excess_of(rss), size, evidence.rows, evidence.inputs)
-    return _criterion(name)(problem)
+    return CRITERIA[name](Problem(excess, size, evidence.rows, evidence.inputs))
 
 
 def best_size(name: str, evidence: Evidence) -> int:
     """Return j of the nested model that the criterion picks; the smaller one of equals."""
     return int(np.argmin(criterion_values(name, evidence)))
-
-
-def _criterion(name: str) -> Callable[[Problem], FloatArray]:
-    try:
-        return CRITERIA[name]
-    except KeyError:
-        names = ", ".join(CRITERIA)
-        raise QuestionError(f"unknown criterion {name!r}. Known criteria: {names}.") from None
 
 
 MAX_SUBSET_INPUTS = 22
@@ -191,8 +162,7 @@ def best_subsets(gram: Gram, inputs: Sequence[str], label: str, count: int = 2) 
 def pick_sizes(results: Sequence[SizeResult], evidence: Evidence) -> dict[str, int]:
     """Return the size that each criterion chooses; the evidence is that of the full model."""
     rss = np.array([float(result.best.rss) for result in results])
-    size = np.arange(len(results), dtype=np.float64)
-    return {name: int(np.argmin(subset_values(name, evidence, rss, size))) for name in CRITERIA}
+    return {name: int(np.argmin(criterion_values(name, evidence, rss))) for name in CRITERIA}
 
 
 def candidates(matrix: FloatArray, count: int) -> list[list[int]]:

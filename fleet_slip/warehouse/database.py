@@ -193,11 +193,7 @@ def database_errors(doing: str) -> Iterator[None]:
         if deleted := _DELETED.search(str(error)):
             raise missing_file_error(deleted[1]) from None
         raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
-    except (
-        duckdb.IOException,
-        duckdb.InvalidInputException,
-        duckdb.InternalException,
-    ) as error:
+    except (duckdb.IOException, duckdb.InvalidInputException, duckdb.InternalException) as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
         if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata

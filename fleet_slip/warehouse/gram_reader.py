@@ -314,9 +314,7 @@ MAX_REUSED_BYTES = 2**27
 
 @contextlib.contextmanager
 def open_grams(
-    source: Warehouse | GramReader,
-    feature_set: str,
-    predicate: Predicate,
+    source: Warehouse | GramReader, feature_set: str, predicate: Predicate
 ) -> Iterator[OpenedGrams]:
     """Open the Gram rows of a feature set by a reader, or by a new one; see `opened`."""
     if isinstance(source, GramReader):

@@ -7,12 +7,11 @@ from typing import Any
 
 import duckdb
 import pyarrow as pa
-from pydantic import Field, RootModel
 
 from fleet_slip.catalog.course import COURSE_LATE
 from fleet_slip.catalog.signals import ALL_DRIVES, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.column_sql import with_absent
-from fleet_slip.config import Config, load_toml
+from fleet_slip.config import load_toml
 from fleet_slip.errors import ConflictError
 from fleet_slip.resources import folder, read_sql
 from fleet_slip.storage.table import Snapshot, absent_columns
@@ -182,30 +181,19 @@ COMMON = "common"
 """Section of `warehouse/columns.toml` for columns of several views."""
 
 
-class ColumnDescription(Config):
-    """Description of a column."""
-
-    description: str = Field(min_length=1)
-    unit: str = ""
-
-
-class _Descriptions(RootModel[dict[str, dict[str, ColumnDescription]]]):
-    """By view and column."""
-
-
 @cache
-def column_descriptions() -> dict[str, dict[str, ColumnDescription]]:
-    """Return the descriptions that stand beside the SQL of the views, by view and column."""
-    return _Descriptions.model_validate(load_toml(folder("warehouse") / "columns.toml")).root
+def column_descriptions() -> dict[str, dict[str, dict[str, str]]]:
+    """Return description and unit of columns, by view and column, from `warehouse/columns.toml`."""
+    return load_toml(folder("warehouse") / "columns.toml")
 
 
 def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog) -> pa.Table:
     """Return the columns of all views with unit and description."""
     by_view = column_descriptions()
-    common = {n: ColumnDescription(description=c.description) for n, c in signals.drive.items()}
+    common = {name: {"description": column.description} for name, column in signals.drive.items()}
     for name, signal in signals.signals.items():
         for column, unit in ((name, f"{signal.scale} {signal.unit}"), (signal.column, signal.unit)):
-            common[column] = ColumnDescription(description=signal.description, unit=unit)
+            common[column] = {"description": signal.description, "unit": unit}
     common |= by_view[COMMON]
     columns = database.execute(
         "SELECT table_name, column_name, data_type FROM duckdb_columns() "
@@ -214,8 +202,7 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
     ).fetchall()
     rows = []
     for view, column, data_type in columns:
-        described = by_view.get(view, {}).get(column) or common.get(column)
-        unit, description = (described.unit, described.description) if described else ("", "")
+        described = by_view.get(view, {}).get(column) or common.get(column) or {}
         row = {"view": view, "column": column, "type": data_type}
-        rows.append(row | {"unit": unit, "description": description})
+        rows.append(row | {key: described.get(key, "") for key in ("unit", "description")})
     return pa.Table.from_pylist(rows)

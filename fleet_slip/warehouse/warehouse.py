@@ -198,8 +198,7 @@ class Warehouse:
             folder=self.root / "logs",
             schema=stored_schema(signals),
             encoding=Encoding(
-                dictionary=tuple(signals.drive),
-                delta_packed=("tick", *signals.signals),
+                dictionary=tuple(signals.drive), delta_packed=("tick", *signals.signals)
             ),
             partition_by=("day",),
             description="Logs of drives at 100 Hz as integer counts: physical = scale * count",

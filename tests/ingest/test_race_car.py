@@ -11,7 +11,7 @@ from fleet_slip.errors import QuestionError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.regression.inference import infer_classically
+from fleet_slip.regression.inference import infer
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
@@ -87,7 +87,7 @@ def test_a_log_without_wheel_speeds_gives_its_model_through_the_shipped_mapping(
     fitted = fit(table.total(), list(COEFFICIENTS), "sideslip")
     scales = {name: s.exact_scale for name, s in SIGNALS.signals.items()}
     for estimate, true in zip(
-        infer_classically(fitted, scales).estimates, [OFFSET, *COEFFICIENTS.values()], strict=True
+        infer(fitted, scales).estimates, [OFFSET, *COEFFICIENTS.values()], strict=True
     ):
         assert abs(estimate.value - true) < 4 * estimate.standard_error
         assert estimate.standard_error < 0.2 * abs(true)

@@ -94,12 +94,7 @@ def test_shares_by_acceleration_follow_the_better_estimate() -> None:
     assert shares[0] > 0.8 > 0.2 > shares[-1]
 
 
-@given(
-    st.integers(0, 2**32),
-    st.floats(0.01, 10),
-    st.floats(0.01, 10),
-    st.sampled_from(METHODS),
-)
+@given(st.integers(0, 2**32), st.floats(0.01, 10), st.floats(0.01, 10), st.sampled_from(METHODS))
 def test_combinations_stay_between_both_estimates(
     seed: int, line_std: float, filter_std: float, method: str
 ) -> None:

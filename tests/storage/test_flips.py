@@ -88,13 +88,7 @@ LOGS, GRAMS = "logs/day=*/*", "grams/*.parquet"
 
 @pytest.mark.parametrize(
     ("answer", "pattern"),
-    [
-        (sums, GRAMS),
-        (new_gram_rows, LOGS),
-        (all_rows, LOGS),
-        (all_rows, GRAMS),
-        (queried, LOGS),
-    ],
+    [(sums, GRAMS), (new_gram_rows, LOGS), (all_rows, LOGS), (all_rows, GRAMS), (queried, LOGS)],
 )
 def test_a_flipped_bit_is_told_or_makes_no_difference(
     filled: Warehouse, answer: Answer, pattern: str

@@ -96,9 +96,7 @@ def test_a_unit_lands_once_however_many_try(warehouse: Warehouse) -> None:
     assert len(warehouse.logs.snapshot().files) == 2
 
 
-def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(
-    warehouse: Warehouse,
-) -> None:
+def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(warehouse: Warehouse) -> None:
     action = warehouse.logs.write_file("one", rows("a"), DAY)
     change = Change(add=[action], transactions=[AppTransaction("u", 1)])
     before, also_before = (warehouse.logs.snapshot() for _ in range(2))

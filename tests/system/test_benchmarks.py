@@ -51,10 +51,7 @@ RUN_BY = {
 }
 """What a test of its own runs, with sizes that are not tiny."""
 
-ELSEWHERE = {
-    "fuzz.guided": "atheris",
-    "weka": "WEKA and a JVM",
-}
+ELSEWHERE = {"fuzz.guided": "atheris", "weka": "WEKA and a JVM"}
 """What is not run here, and what it needs."""
 
 PARTS = {"__main__", "peer_ways", "usage"}

@@ -18,7 +18,7 @@ from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import DriveMoments, Evidence
 from fleet_slip.regression.least_squares import correlation_matrix, fit
 from fleet_slip.regression.orders import METHODS, RANKINGS, rank, stepwise_order
-from fleet_slip.regression.subsets import all_rss, best_subsets, signals_of
+from fleet_slip.regression.subsets import CRITERIA, all_rss, best_subsets, signals_of
 from tests.support.counts import (
     dense_fit,
     evidence,
@@ -60,9 +60,8 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
     fits = nested_fits(gram, inputs, "y")
     evidence = Evidence.naive(fits)
     rss = np.array([float(result.best.rss) for result in results])
-    size = np.arange(11.0)
-    cp = subsets.subset_values("cp", evidence, rss, size)
-    bic = subsets.subset_values("bic-likelihood", evidence, rss, size)
+    cp = subsets.criterion_values("cp", evidence, rss)
+    bic = subsets.criterion_values("bic-likelihood", evidence, rss)
     for result, expected in zip(results, answers["best_subsets"], strict=True):
         assert list(result.best.model.signals) == expected["vars"]
         assert result.best.r_squared == pytest.approx(expected["r2"], rel=1e-12)
@@ -72,7 +71,7 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
         assert bic[expected["size"]] - shift == pytest.approx(expected["bic_leaps"], rel=1e-9)
         if expected["relative_gap_to_second_best"] is not None and 0 < expected["size"] < 10:
             assert result.gap == pytest.approx(expected["relative_gap_to_second_best"], rel=1e-9)
-    adjusted = subsets.subset_values("adjusted-r2", evidence, rss, size)
+    adjusted = subsets.criterion_values("adjusted-r2", evidence, rss)
     expected_adjusted = [row["adjr2"] for row in answers["best_subsets"]]
     assert np.argmin(adjusted) == np.argmax(expected_adjusted)
 
@@ -128,12 +127,10 @@ def test_ranking_mistakes_are_named() -> None:
 
 def test_criteria_are_prices_on_contributions() -> None:
     evidence = Evidence((50.0, 9.0, 3.0, 0.5), 1000.0, 1.0, 1.0, 995.0, "rows")
-    assert subsets.best_size("aic", evidence) == 3
-    assert subsets.best_size("cp", evidence) == 3
-    assert subsets.best_size("bic", evidence) == 2
-    assert subsets.best_size("ric", evidence) == 3
-    assert subsets.best_size("bic-likelihood", evidence) == 2
-    assert subsets.best_size("adjusted-r2", evidence) == 3
+    sizes = {
+        name: subsets.best_size(name, evidence) for name in CRITERIA if name != "aic-likelihood"
+    }
+    assert sizes == {"cp": 3, "aic": 3, "bic": 2, "bic-likelihood": 2, "ric": 3, "adjusted-r2": 3}
     np.testing.assert_allclose(evidence.excess(), [62.5, 12.5, 3.5, 0.5, 0])
     np.testing.assert_allclose(evidence.distances(), [58.5, 10.5, 3.5, 2.5, 4])
 

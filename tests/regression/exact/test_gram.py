@@ -13,9 +13,7 @@ from tests.support.counts import table_of
 SIGNALS = ("ax", "ay", "sideslip")
 
 counts_of_drive = hnp.arrays(
-    np.int16,
-    st.tuples(st.integers(0, 30), st.just(3)),
-    elements=st.integers(-(2**15), 2**15 - 1),
+    np.int16, st.tuples(st.integers(0, 30), st.just(3)), elements=st.integers(-(2**15), 2**15 - 1)
 )
 
 
@@ -43,10 +41,7 @@ def test_blas_is_exact_at_the_largest_counts_over_many_blocks() -> None:
     assert gram.sums == (-rows * 2**15,) * 2
 
 
-@given(
-    hnp.arrays(np.int64, (5, 2), elements=st.integers(-(2**62), 2**62)),
-    st.integers(1, 2**80),
-)
+@given(hnp.arrays(np.int64, (5, 2), elements=st.integers(-(2**62), 2**62)), st.integers(1, 2**80))
 def test_counts_of_any_size_are_exact(counts: np.ndarray, factor: int) -> None:
     large = counts.astype(object) * factor
     assert Gram.from_counts(("a", "b"), large) == python_gram(("a", "b"), large)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import infer_classically
+from fleet_slip.regression.inference import infer
 from fleet_slip.regression.least_squares import fit
 from tests.support.counts import columns_to_counts, evidence
 
@@ -45,12 +45,9 @@ def test_certified_digits(name: str) -> None:
         counts, scales = polynomial(counts, scales, degree)
     signals = ("y", *(f"x{i}" for i in range(1, len(scales))))
     fitted = fit(
-        Gram.from_counts(signals, counts),
-        signals[1:],
-        "y",
-        intercept=problem["model"]["intercept"],
+        Gram.from_counts(signals, counts), signals[1:], "y", intercept=problem["model"]["intercept"]
     )
-    result = infer_classically(fitted, dict(zip(signals, scales, strict=True)))
+    result = infer(fitted, dict(zip(signals, scales, strict=True)))
     certified = problem["certified"]
     assert len(result.estimates) == len(certified["coef"])
     for estimate, value, error in zip(

@@ -18,8 +18,7 @@ from fleet_slip.regression.gram import GramTable, complete_cases
 from fleet_slip.regression.inference import (
     DriveMoments,
     Evidence,
-    infer_by_clusters,
-    infer_classically,
+    infer,
     pool,
     student_t_two_sided,
     variance_inflation,
@@ -49,7 +48,7 @@ def test_cluster_errors_are_those_of_the_rows(seed: int, inputs: int) -> None:
     drives = random_drives(seed, drives=9, inputs=inputs)
     order = [*range(inputs)][::-1][:3]
     fitted = fit(gram_of(np.concatenate(drives)), [f"x{i + 1}" for i in order], "y")
-    result = infer_by_clusters(fitted, moments_of(drives), unit_scales(inputs))
+    result = infer(fitted, unit_scales(inputs), moments_of(drives))
     errors, degrees = by_rows([drive[:, [*order, -1]] for drive in drives])
     np.testing.assert_allclose([e.standard_error for e in result.estimates], errors, rtol=1e-7)
     np.testing.assert_allclose([e.degrees_of_freedom for e in result.estimates], degrees, rtol=1e-6)
@@ -66,7 +65,7 @@ def test_intervals_of_few_unequal_cars_hold(cars: int, rows: int) -> None:
     for _ in range(100):
         drives = drives_of(random, cars, 3, rows=rows)
         fitted = fit(gram_of(np.concatenate(drives)), names(3)[:-1], "y")
-        for one in infer_by_clusters(fitted, moments_of(drives), unit_scales(3)).estimates[1:]:
+        for one in infer(fitted, unit_scales(3), moments_of(drives)).estimates[1:]:
             reach = scipy.stats.t.ppf(0.975, one.degrees_of_freedom) * one.standard_error
             inside.append(abs(one.value - 1) <= reach)
     assert np.mean(inside) >= 0.92
@@ -86,10 +85,10 @@ def test_questions_without_an_answer_are_errors() -> None:
     drives = random_drives(1, drives=2)
     gram = gram_of(drives[0])
     with pytest.raises(DataError, match="two drives"):
-        infer_by_clusters(fit(gram, ["x1"], "y"), moments_of(drives[:1]), unit_scales(4))
+        infer(fit(gram, ["x1"], "y"), unit_scales(4), moments_of(drives[:1]))
     few = gram_of(drives[0][:2, [0, -1]])
     with pytest.raises(DataError, match="2 rows are too few"):
-        infer_classically(fit(few, ["x1"], "y"), unit_scales(1))
+        infer(fit(few, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
         complete_cases([moments_table()], ["x9"])
 
@@ -152,7 +151,7 @@ def test_coefficients_and_both_kinds_of_errors_agree(
     model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
     moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]))
-    mine, theirs = infer_classically(fitted, unit_scales(inputs)), model.fit()
+    mine, theirs = infer(fitted, unit_scales(inputs)), model.fit()
     largest = np.abs(theirs.params).max()
     values = [estimate.value for estimate in mine.estimates]
     np.testing.assert_allclose(values, theirs.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
@@ -189,8 +188,8 @@ def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: in
     model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
     moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
     classical, clustered = (
-        infer_classically(fitted, unit_scales(4)),
-        infer_by_clusters(fitted, moments, unit_scales(4)),
+        infer(fitted, unit_scales(4)),
+        infer(fitted, unit_scales(4), moments),
     )
     expected = model.fit()
     both = (classical, expected.bse), (clustered, by_rows(parts, intercept=False)[0])
@@ -245,9 +244,7 @@ NUMBERS = hnp.arrays(
     elements=st.floats(-1.0, 1.0, allow_subnormal=False),
 )
 VARIANCES = hnp.arrays(
-    np.float64,
-    st.shared(st.integers(4, 12), key="members"),
-    elements=st.floats(1e-4, 1.0),
+    np.float64, st.shared(st.integers(4, 12), key="members"), elements=st.floats(1e-4, 1.0)
 )
 
 

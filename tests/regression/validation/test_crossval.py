@@ -20,7 +20,6 @@ from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,
     assemble,
-    by_band,
     by_hash,
     by_value,
     cross_validate,
@@ -233,7 +232,7 @@ def test_a_constant_prediction_has_no_correlation() -> None:
 def test_bands_are_contiguous_and_whole(values: list[int], count: int) -> None:
     if len(set(values)) < 2:
         return
-    found = by_band(values, count)
+    found = by_value(values, count)
     assert len(found.names) == min(count, len(set(values)))
     by_fold = [
         {v for v, f in zip(values, found.fold, strict=True) if f == fold}
@@ -246,7 +245,7 @@ def test_bands_are_contiguous_and_whole(values: list[int], count: int) -> None:
 
 def test_a_drive_without_a_speed_is_in_no_band() -> None:
     with pytest.raises(DataError, match="no value of the column to fold by"):
-        by_band([0.5, None, 0.7], 2)
+        by_value([0.5, None, 0.7], 2)
 
 
 SIGNALS = ("x", "z", "y")
