@@ -427,10 +427,7 @@ def changes(rng: np.random.Generator) -> dict[str, Any]:
     label += 0.002 * rng.standard_normal(5000)
     scales = {name: float(scale) for name, scale in CATALOG.input_scales.items()}
     wanted = {"curvature": curvature, "ay": ay, TURNED: turned, SIGNALS.label: label}
-    scales |= {
-        TURNED: turned_scale(SIGNALS),
-        SIGNALS.label: float(SIGNALS[SIGNALS.label].scale),
-    }
+    scales |= {TURNED: turned_scale(SIGNALS), SIGNALS.label: float(SIGNALS[SIGNALS.label].scale)}
     return {name: np.rint(values / scales[name]) for name, values in wanted.items()}
 
 

@@ -35,10 +35,7 @@ def test_a_sine_at_one_speed_is_no_fault() -> None:
 
 @pytest.mark.parametrize(
     ("change", "kind"),
-    [
-        (lambda angle: -angle, "reversed"),
-        (lambda angle: np.degrees(angle) * 0.2, "scaled"),
-    ],
+    [(lambda angle: -angle, "reversed"), (lambda angle: np.degrees(angle) * 0.2, "scaled")],
 )
 def test_sign_and_unit_show_at_one_speed_too(
     change: Callable[[FloatArray], FloatArray], kind: str

@@ -60,8 +60,7 @@ def test_sums_equal_those_of_the_cohort(
 
 
 @pytest.mark.parametrize(
-    ("period", "compared", "drives"),
-    [(3, {"1", "2"}, {36}), (18, {"1", "2", "3", "4", "5"}, {34})],
+    ("period", "compared", "drives"), [(3, {"1", "2"}, {36}), (18, {"1", "2", "3", "4", "5"}, {34})]
 )
 def test_models_are_compared_on_the_same_drives_or_not_at_all(
     warehouse: Warehouse, period: int, compared: set[str], drives: set[int]

@@ -1,6 +1,7 @@
 """Tables of Gram rows from cars land whole and once; what no drive can have is refused."""
 
 import shutil
+from collections.abc import Callable
 from datetime import date, timedelta
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import fleet_slip
+from fleet_slip.api.fleet import Fleet
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.on_board import (
     COLUMNS,
@@ -21,6 +23,7 @@ from fleet_slip.grams.on_board import (
     NO_ROWS,
     PRODUCTS,
     SUMS,
+    OnboardImport,
     find_impossible,
 )
 from fleet_slip.regression.gram import Gram
@@ -32,21 +35,29 @@ DAY_S = 86_400
 
 
 @pytest.fixture
-def fleet(tmp_path: Path) -> fleet_slip.Fleet:
+def fleet(tmp_path: Path) -> Fleet:
     return fleet_slip.open(tmp_path / "data")
 
 
-def gram_rows(fleet: fleet_slip.Fleet) -> list[dict[str, Any]]:
+Send = Callable[[list[dict[str, Any]]], OnboardImport]
+
+
+@pytest.fixture
+def send(fleet: Fleet, tmp_path: Path) -> Send:
+    return lambda rows: fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+
+
+def gram_rows(fleet: Fleet) -> list[dict[str, Any]]:
     if not fleet.warehouse.grams.snapshot().rows:
         return []
     rows: list[dict[str, Any]] = fleet.sql("FROM grams ORDER BY ALL").to_arrow_table().to_pylist()
     return rows
 
 
-def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+def test_rows_land_as_they_are_and_are_fitted(fleet: Fleet, send: Send) -> None:
     grams = [gram_of(seed) for seed in range(6)]
     rows = [row_of(gram, f"VIN{i}") for i, gram in enumerate(grams)]
-    report = fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+    report = send(rows)
     assert (report.new, report.gram_rows, report.drives, report.rows) == (True, 6, 6, 3000)
     for row, gram in zip(gram_rows(fleet), grams, strict=True):
         assert (row["row_count"], tuple(row["sums"]), tuple(row["products"])) == (
@@ -61,9 +72,7 @@ def test_rows_land_as_they_are_and_are_fitted(fleet: fleet_slip.Fleet, tmp_path:
     assert not fleet.maintenance.verify(full=True).findings
 
 
-def test_the_same_file_counts_once_and_is_forgotten_for_good(
-    fleet: fleet_slip.Fleet, tmp_path: Path
-) -> None:
+def test_the_same_file_counts_once_and_is_forgotten_for_good(fleet: Fleet, tmp_path: Path) -> None:
     rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
     path = write_counted(tmp_path / "rows", rows)
     fleet.import_onboard_grams(path)
@@ -124,7 +133,7 @@ LONG_SUMS, LONG_PRODUCTS = TOO_LONG
     ],
 )
 def test_a_row_that_cannot_be_keeps_the_whole_file_out(
-    fleet: fleet_slip.Fleet, tmp_path: Path, changed: dict[str, Any], reason: str
+    fleet: Fleet, tmp_path: Path, changed: dict[str, Any], reason: str
 ) -> None:
     path = write_counted(tmp_path / "rows", [row_of(gram_of(1)), other(GRAM, **changed)])
     with pytest.raises(InputError, match=rf"rows: row [12] \(drive .*\) .*{reason}"):
@@ -132,22 +141,13 @@ def test_a_row_that_cannot_be_keeps_the_whole_file_out(
     assert gram_rows(fleet) == []
 
 
-def test_a_drive_that_is_there_is_refused_under_any_name(
-    fleet: fleet_slip.Fleet, tmp_path: Path
-) -> None:
-    fleet.import_onboard_grams(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
-    for number, rows in enumerate(
-        (
-            [other(GRAM), row_of(gram_of(3))],
-            [other(GRAM), row_of(gram_of(1), drive_id="renamed")],
-        )
-    ):
+def test_a_drive_that_is_there_is_refused_under_any_name(fleet: Fleet, send: Send) -> None:
+    send([row_of(gram_of(1))])
+    for same in (row_of(gram_of(3)), row_of(gram_of(1), drive_id="renamed")):
         with pytest.raises(RepeatedError, match=r"row 2 .* is stored already, as VIN1-2024"):
-            fleet.import_onboard_grams(write_counted(tmp_path / f"{number}", rows))
+            send([other(GRAM), same])
     with pytest.raises(InputError, match=r"row 2 .* appears twice"):
-        fleet.import_onboard_grams(
-            write_counted(tmp_path / "twice", [other(GRAM), other(gram_of(5))])
-        )
+        send([other(GRAM), other(gram_of(5))])
     assert len(gram_rows(fleet)) == 1
 
 
@@ -161,25 +161,25 @@ def test_a_drive_that_is_there_is_refused_under_any_name(
     ],
 )
 def test_a_replay_is_refused_on_any_day_of_any_car(
-    fleet: fleet_slip.Fleet, tmp_path: Path, change: dict[str, Any]
+    fleet: Fleet, send: Send, tmp_path: Path, change: dict[str, Any]
 ) -> None:
     replay = row_of(gram_of(1), drive_id="replay", **change)
     both = write_counted(tmp_path / "both", [row_of(gram_of(1)), replay])
     with pytest.raises(InputError, match=r"row 2 \(drive replay\) appears twice, first as VIN1-"):
         fleet.import_onboard_grams(both)
-    fleet.import_onboard_grams(write_counted(tmp_path / "first", [row_of(gram_of(1))]))
+    send([row_of(gram_of(1))])
     with pytest.raises(RepeatedError, match="is stored already, as VIN1-2024"):
-        fleet.import_onboard_grams(write_counted(tmp_path / "replay", [replay]))
+        send([replay])
     assert len(gram_rows(fleet)) == 1
 
 
 def test_rows_of_a_standing_car_may_equal_those_of_another(
-    fleet: fleet_slip.Fleet, tmp_path: Path
+    fleet: Fleet, send: Send, tmp_path: Path
 ) -> None:
     standing = Gram.from_counts(GRAM.signals, np.zeros((3000, K), np.int64))
     rows = [row_of(standing, car) for car in ("VIN1", "VIN2")]
-    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
-    fleet.import_onboard_grams(write_counted(tmp_path / "third", [row_of(standing, "VIN3")]))
+    send(rows)
+    send([row_of(standing, "VIN3")])
     again = write_counted(tmp_path / "again", [row_of(standing, "VIN1", drive_id="again")])
     with pytest.raises(RepeatedError, match="is stored already, as VIN1-2024"):
         fleet.import_onboard_grams(again)
@@ -193,49 +193,45 @@ def long_drive(seed: int, rows: int, name: str) -> dict[str, Any]:
     return row_of(gram, drive_id=name, n=500 * times, sums=sums, products=products)
 
 
-def test_a_car_drives_24_hours_a_day_at_most(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+def test_a_car_drives_24_hours_a_day_at_most(fleet: Fleet, send: Send) -> None:
     drives = [long_drive(seed, MAX_ROWS_OF_A_DAY // 2, f"drive-{seed}") for seed in range(4)]
     reason = "exceeds 24 hours of driving of its car on a day"
     with pytest.raises(InputError, match=rf"row 3 \(drive drive-2\) {reason}"):
-        fleet.import_onboard_grams(write_counted(tmp_path / "three", drives[:3]))
-    fleet.import_onboard_grams(write_counted(tmp_path / "one", drives[:1]))
-    fleet.import_onboard_grams(write_counted(tmp_path / "two", drives[1:2]))
+        send(drives[:3])
+    send(drives[:1])
+    send(drives[1:2])
     other = drives[2] | {"vehicle_id": "VIN2"}
     tomorrow = drives[3] | {"day": date(2024, 5, 2)}
-    with pytest.raises(InputError, match=rf"row 1 .*{reason}, with the stored rows"):
-        fleet.import_onboard_grams(write_counted(tmp_path / "third", drives[2:3]))
-    fleet.import_onboard_grams(write_counted(tmp_path / "others", [other, tomorrow]))
+    with pytest.raises(InputError, match=rf"row 1 \(drive drive-2\) {reason}, with the stored rows"):
+        send(drives[2:3])
+    send([other, tomorrow])
     assert len(gram_rows(fleet)) == 4
 
 
 @pytest.mark.parametrize("name", [" VIN1", "VIN1\t", "vin1"])
 def test_an_erased_car_does_not_come_back_under_a_similar_name(
-    fleet: fleet_slip.Fleet, tmp_path: Path, name: str
+    fleet: Fleet, send: Send, name: str
 ) -> None:
     rows = [row_of(gram_of(1), "VIN1"), row_of(gram_of(2), "VIN2")]
-    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+    send(rows)
     fleet.maintenance.forget(vehicle="VIN1")
     with pytest.raises(InputError, match="was forgotten"):
-        fleet.import_onboard_grams(
-            write_counted(tmp_path / "again", [row_of(gram_of(3), name, drive_id="a")])
-        )
+        send([row_of(gram_of(3), name, drive_id="a")])
 
 
-def test_names_are_stored_without_spaces_and_composed(
-    fleet: fleet_slip.Fleet, tmp_path: Path
-) -> None:
+def test_names_are_stored_without_spaces_and_composed(fleet: Fleet, send: Send) -> None:
     row = row_of(gram_of(1), " Zoe\u0308 ", drive_id="d1\n")
-    fleet.import_onboard_grams(write_counted(tmp_path / "rows", [row]))
+    send([row])
     ((stored),) = gram_rows(fleet)
     assert (stored["vehicle_id"], stored["drive_id"]) == ("Zo\u00eb", "d1")
 
 
 @pytest.mark.parametrize("subject", [{"drive": "VIN1-20240501T100000Z"}, {"vehicle": "VIN1"}])
 def test_an_erased_drive_is_refused_under_another_name_until_it_is_allowed(
-    fleet: fleet_slip.Fleet, tmp_path: Path, subject: dict[str, Any]
+    fleet: Fleet, send: Send, tmp_path: Path, subject: dict[str, Any]
 ) -> None:
     rows = [row_of(gram_of(1)), row_of(gram_of(2), "VIN2")]
-    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+    send(rows)
     assert fleet.maintenance.forget(**subject).drives == 1
     again = row_of(gram_of(1), "pseudonym", START_S + DAY_S)
     path = write_counted(tmp_path / "again", [again])
@@ -256,7 +252,7 @@ def test_an_erased_drive_with_a_log_does_not_come_back_as_gram_rows(
         fleet.import_onboard_grams(again)
 
 
-def renamed(fleet: fleet_slip.Fleet, name: str) -> tuple[dict[str, Any], str]:
+def renamed(fleet: Fleet, name: str) -> tuple[dict[str, Any], str]:
     """Return the row of a logged drive as if a car had counted it, and the drive's own name."""
     row = fleet.sql("FROM grams WHERE feature_set = 'signals' ORDER BY drive_id LIMIT 1")
     (stored,) = row.to_arrow_table().to_pylist()
@@ -274,9 +270,7 @@ def test_a_drive_with_a_log_is_refused(smoke_copy: Path, tmp_path: Path) -> None
         fleet.import_onboard_grams(path)
 
 
-def test_pages_need_checksums_and_a_flipped_bit_is_found(
-    fleet: fleet_slip.Fleet, tmp_path: Path
-) -> None:
+def test_pages_need_checksums_and_a_flipped_bit_is_found(fleet: Fleet, tmp_path: Path) -> None:
     table = rows_of_fleet(20, START_S, seed=1)
     path = tmp_path / "rows"
     for options in ({}, {"use_dictionary": False}, {"compression": "none"}):
@@ -293,9 +287,9 @@ def test_pages_need_checksums_and_a_flipped_bit_is_found(
     assert gram_rows(fleet) == []
 
 
-def test_what_is_no_table_is_not_taken(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
+def test_what_is_no_table_is_not_taken(fleet: Fleet, send: Send, tmp_path: Path) -> None:
     table = rows_of_fleet(3, START_S, seed=1).drop_columns(["part", "course_late"])
-    assert fleet.import_onboard_grams(write_counted(tmp_path / "rows", table)).gram_rows == 3
+    assert send(table).gram_rows == 3
     (tmp_path / "text").write_text("FSGR")
     with pytest.raises(InputError, match="table of Gram rows"):
         fleet.import_onboard_grams(tmp_path / "text")
@@ -316,12 +310,13 @@ def test_the_command_says_what_landed(run_command: RunCommand, tmp_path: Path) -
     assert "nothing to do" in done.stderr + done.stdout
 
 
-def test_rows_of_a_drive_go_when_its_log_comes(smoke_root: Path, tmp_path: Path) -> None:
+def test_rows_of_a_drive_go_when_its_log_comes(
+    fleet: Fleet, send: Send, smoke_root: Path, tmp_path: Path
+) -> None:
     same, drive = renamed(fleet_slip.open(smoke_root), "renamed")
-    fleet = fleet_slip.open(tmp_path / "data")
     other = row_of(gram_of(1), drive_id=drive)  # the same name, and other counts
     rows = [same, other, row_of(gram_of(2), "VIN2")]
-    fleet.import_onboard_grams(write_counted(tmp_path / "rows", rows))
+    send(rows)
     shutil.copytree(smoke_root / "logs", tmp_path / "data" / "logs")
     report = fleet.gram()
     assert report.received_dropped == 2
