@@ -25,8 +25,6 @@ from fleet_slip.vehicle.integration import STEP_S
 from fleet_slip.vehicle.parameters import (
     PERFECT,
     CarImperfections,
-    Controls,
-    State,
     VehicleParameters,
     constants,
     imperfection_constants,
@@ -98,26 +96,21 @@ def _surface_table(road: Road) -> FloatArray:
 def require_valid_road(road: Road) -> None:
     """Raise `ConfigError` if the tables of a road are not valid."""
     entries = len(road.curvature_1pm)
-    if len(road.speed_mps) != entries or entries < 2:
-        raise ConfigError(
-            f"the road has {entries} entries of curvature and {len(road.speed_mps)} of speed. Give "
-            "as many of both, at least two."
-        )
     intervals = entries if road.closed else entries - 1
+    columns = (road.curvature_1pm, road.speed_mps, *(road.surface or ()))
+    if entries < 2 or any(len(c) != entries or not np.isfinite(c).all() for c in columns):
+        raise ConfigError(
+            "the road has missing or infinite entries of curvature, speed or surface. Give as many "
+            "finite ones of each, at least two."
+        )
     if abs(intervals * road.spacing_m - road.length_m) > 1e-6 * road.length_m:
         raise ConfigError(
             f"the road has {intervals} intervals of {road.spacing_m} m, but a length of "
             f"{road.length_m} m. Give a length that agrees."
         )
-    if not (np.isfinite(road.curvature_1pm).all() and (road.speed_mps > LOST_SPEED_MPS).all()):
+    if not (road.speed_mps > LOST_SPEED_MPS).all():
         raise ConfigError(
-            "the road has an infinite or missing curvature, or a target speed that is too low. "
-            f"Give finite curvature, and target speeds above {LOST_SPEED_MPS} m/s."
-        )
-    if road.surface and any(len(c) != entries or not np.isfinite(c).all() for c in road.surface):
-        raise ConfigError(
-            f"the road's surface has missing or infinite entries. Give {entries} finite ones, as "
-            "many as the road has."
+            f"the road has a target speed that is too low. Give speeds above {LOST_SPEED_MPS} m/s."
         )
 
 
@@ -218,40 +211,6 @@ def simulate_blocks(
                 lane_table[FIRST, lane] = tick
             if last:
                 batch_kernel.vacate(memory, lane_table, lane)
-
-
-def simulate_samples(drive: LaneDrive, samples: int) -> Iterator[tuple[Controls, State]]:
-    """Simulate a drive sample by sample.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    samples
-        Number of samples.
-
-    Yields
-    ------
-    Controls
-        Demands of the kernel's driver at a sample.
-    State
-        State of the car after the sample.
-    """
-    routes, roads, surfaces = _routes([drive])
-    memory, lane_table = batch_kernel.empty_lanes()
-    truth, _ = batch_kernel.empty_blocks()
-    speed_mps = roads[0, batch_kernel.SPEED]
-    batch_kernel.start_drive(memory, lane_table, 0, 0, _car(drive), speed_mps)
-    column = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES)[:, 0]
-    for sample in range(samples):
-        routes["samples"], results = sample + 1, np.full((1, 2), ABSENT)
-        lane_table[FIRST, 0] = sample
-        batch_kernel.simulate_lanes(
-            routes, roads, surfaces, STEPS_PER_SAMPLE, memory, lane_table, truth, results
-        )
-        demands = column[batch_kernel.CONTROLS :][: len(Controls._fields)].tolist()
-        state = column[batch_kernel.STATE :][: len(State._fields)].tolist()
-        yield Controls(*demands), State(*state)
 
 
 def _car(drive: LaneDrive) -> FloatArray:

@@ -7,6 +7,7 @@ drive ends.
 
 import math
 from collections.abc import Callable
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -125,26 +126,18 @@ ABSENT = -1
 DRIVE, TICK, LAP, FIRST = range(4)
 """Rows of the lane table: drive, tick of the next sample, lap, and first tick of the block."""
 
-STATE = 0
-"""First row of the state in memory. The constants below are the first rows of other tuples."""
-SLOPES = STATE + len(State._fields)
-POSE = SLOPES + len(Slopes._fields)
-POSE_SLOPES = POSE + len(Pose._fields)
-CONTROLS = POSE_SLOPES + len(PoseSlopes._fields)
-PATH = CONTROLS + len(Controls._fields)
-FORCE = PATH + len(Path._fields)
-"""Specific force ax, ay at the sample."""
-ANGLES = FORCE + 2
-"""Angles of the front wheels, and side-slip angle, at the sample."""
-ORDER = ANGLES + 3
-"""Order of the integration: `FIRST_ORDER` in a drive's first step."""
-CAR = ORDER + 1
-HANDLING = CAR + len(Constants._fields)
-IMPERFECTION_CONSTANTS = HANDLING + len(Handling._fields)
-ENVIRONMENT = IMPERFECTION_CONSTANTS + len(ImperfectionConstants._fields)
-COMPLIANCE = ENVIRONMENT + len(Environment._fields)
-COMPLIANCE_RATES = COMPLIANCE + len(Compliance._fields)
-ROWS = COMPLIANCE_RATES + len(ComplianceRates._fields)
+_STATES = (State, Slopes, Pose, PoseSlopes, Controls, Path)
+_PARAMETERS = (Constants, Handling, ImperfectionConstants, Environment, Compliance, ComplianceRates)
+STATE, SLOPES, POSE, POSE_SLOPES, CONTROLS, PATH, FORCE = accumulate(
+    (len(fields._fields) for fields in _STATES), initial=0
+)
+"""First rows of tuples in memory. `FORCE` are specific force ax, ay at the sample."""
+ANGLES, ORDER = FORCE + 2, FORCE + 5
+"""Angles of the front wheels, and side-slip angle, at the sample. Order of the integration:
+`FIRST_ORDER` in a drive's first step."""
+CAR, HANDLING, IMPERFECTION_CONSTANTS, ENVIRONMENT, COMPLIANCE, COMPLIANCE_RATES, ROWS = accumulate(
+    (len(fields._fields) for fields in _PARAMETERS), initial=ORDER + 1
+)
 
 INVERSE_RADIUS = Constants._fields.index("inverse_radius")
 

@@ -6,6 +6,7 @@ so that a positive steering angle turns the car to the right of the picture.
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import highway_env
@@ -19,7 +20,8 @@ from fleet_slip.compiling import equation, kernel
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.batch import LaneDrive, simulate_samples
+from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
+from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
     CALM,
@@ -62,8 +64,8 @@ from fleet_slip.vehicle.parameters import (
 )
 from fleet_slip.vehicle.tyre import cornering_stiffness
 
-CHECKED_SAMPLES = 150
-"""Samples of a drive that are compared with highway-env: 1.5 s."""
+CHECKED_S = 1.5
+"""Time of a drive that is compared with highway-env."""
 MIN_SCALE = 1e-3
 """Lower bound of the scale of a quantity, in SI units: a yaw rate on a straight is rounding."""
 AXLES = ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR")
@@ -436,8 +438,8 @@ def highway_twin(car: FourWheelVehicle) -> BicycleVehicle:
 def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
     """Require that the first 1.5 s of a drive agree with highway-env.
 
-    The kernel's car is compared with `FourWheelVehicle`, and `LinearTyreVehicle` with highway-env's
-    `BicycleVehicle`, under the demands of the kernel's driver.
+    The kernel is compared with `HighwayLanes`, and `LinearTyreVehicle` with highway-env's
+    `BicycleVehicle`, under the steering and acceleration of the kernel's car.
 
     Parameters
     ----------
@@ -454,20 +456,28 @@ def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
         If a quantity differs by more than the tolerance.
     """
     speed = float(drive.road.speed_mps[0])
-    car, linear = (vehicle_of(drive, speed, kind) for kind in (FourWheelVehicle, LinearTyreVehicle))
+    short = replace(drive, laps=CHECKED_S * speed / drive.road.length_m)
+    by_kernel, by_vehicle = (
+        next(simulate_blocks([short], simulate_lanes=lanes)).channels
+        for lanes in (batch_kernel.simulate_lanes, HighwayLanes([short]))
+    )
+    linear = vehicle_of(drive, speed, LinearTyreVehicle)
     bicycle = highway_twin(linear)
-    kernel_states, car_states, linear_states, bicycle_states = [], [], [], []
-    for demands, state in simulate_samples(drive, CHECKED_SAMPLES):
-        wheel = math.atan(demands.steering_wheel / drive.vehicle.steering.ratio)
-        for vehicle in (car, linear, bicycle):
-            vehicle.act({"steering": wheel, "acceleration": demands.traction})
+    linear_states: list[FloatArray] = []
+    bicycle_states: list[FloatArray] = []
+    for angle, force in zip(by_kernel["steering_wheel_rad"], by_kernel["ax_mps2"], strict=True):
+        wheel = math.atan(angle / drive.vehicle.steering.ratio)
+        for vehicle, states in ((linear, linear_states), (bicycle, bicycle_states)):
+            vehicle.act({"steering": wheel, "acceleration": force})
             vehicle.step(SAMPLE_S)
-        kernel_states.append(state)
-        car_states.append(car.motion)
-        linear_states.append(linear.state[:, 0])
-        bicycle_states.append(bicycle.state[:, 0])
-    for quantities, values, expected, vehicle in (
-        (State._fields, kernel_states, car_states, FourWheelVehicle),
+            states.append(vehicle.state[:, 0])
+    length = min(len(channels["vx_mps"]) for channels in (by_kernel, by_vehicle))
+    kernel_states, car_states = (
+        np.stack([channels[name][:length] for name in CHANNELS], axis=1)
+        for channels in (by_kernel, by_vehicle)
+    )
+    for quantities, values, expected, kind in (
+        (CHANNELS, kernel_states, car_states, FourWheelVehicle),
         (BICYCLE_STATE, linear_states, bicycle_states, BicycleVehicle),
     ):
         difference = np.abs(np.subtract(values, expected))
@@ -477,9 +487,9 @@ def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
             continue
         tick, quantity = wrong[0]
         raise RefusedError(
-            f"the simulated car departs from highway-env: {(tick + 1) * SAMPLE_S:.2f} s after the "
+            f"the simulated car departs from highway-env: {tick * SAMPLE_S:.2f} s after the "
             f"start of {name}, {quantities[quantity]} is {values[tick][quantity]:.9g}, but "
-            f"{expected[tick][quantity]:.9g} in {vehicle.__name__}. The file was not written. The "
+            f"{expected[tick][quantity]:.9g} in {kind.__name__}. The file was not written. The "
             f"compiler or highway-env {highway_env.__version__} differs from the tested one: "
             "install the versions of constraints.txt and run the command again."
         )
