@@ -202,7 +202,9 @@ def test_a_car_drives_24_hours_a_day_at_most(fleet: Fleet, send: Send) -> None:
     send(drives[1:2])
     other = drives[2] | {"vehicle_id": "VIN2"}
     tomorrow = drives[3] | {"day": date(2024, 5, 2)}
-    with pytest.raises(InputError, match=rf"row 1 \(drive drive-2\) {reason}, with the stored rows"):
+    with pytest.raises(
+        InputError, match=rf"row 1 \(drive drive-2\) {reason}, with the stored rows"
+    ):
         send(drives[2:3])
     send([other, tomorrow])
     assert len(gram_rows(fleet)) == 4
