@@ -5,23 +5,23 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Context, Option
 
 from fleet_slip.api.calls import CarMeasures
 from fleet_slip.base import require_extra
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
-from fleet_slip.cli.output import print_answer, progress, say
+from fleet_slip.cli.output import print_answer, progress, say, write_text
 from fleet_slip.errors import UsageError
 
 
 def score(
-    context: typer.Context,
+    context: Context,
     model: opt.Model = None,
     cohort: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="SQL predicate on the view drives. Default: the drives that the model was not "
             "trained on, or all if there are no others."
         ),
@@ -38,14 +38,12 @@ def score(
 
 
 def predict(
-    context: typer.Context,
+    context: Context,
     model: opt.Version,
-    logs: Annotated[list[Path], typer.Argument(metavar="LOG...", help="Log files or folders.")],
+    logs: Annotated[list[Path], Argument(metavar="LOG...", help="Log files or folders.")],
     mapping: opt.Mapping,
-    output: Annotated[Path, typer.Option(help="File to write: .parquet, .csv or .mf4.")],
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace the file if it exists.")
-    ] = False,
+    output: Annotated[Path, Option(help="File to write: .parquet, .csv or .mf4.")],
+    replace: Annotated[bool, Option("--replace", help="Replace the file if it exists.")] = False,
     json: opt.Json = False,
 ) -> None:
     """Predict the side-slip angle of log files, beside the reference where they have one.
@@ -61,20 +59,20 @@ def predict(
 
 @recorded
 def evaluate(
-    context: typer.Context,
+    context: Context,
     model: opt.Model = None,
     compare: Annotated[
-        list[str] | None, typer.Option(help="Another model to evaluate beside it. May be repeated.")
+        list[str] | None, Option(help="Another model to evaluate beside it. May be repeated.")
     ] = None,
     scenario: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all."
         ),
     ] = None,
     blind: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--blind",
             help="Evaluate on random roads, cars, weather and drivers, drawn from the hash of the "
             "model's version: unknown before it was published.",
@@ -82,7 +80,7 @@ def evaluate(
     ] = False,
     cohort: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="SQL predicate on the view drives: evaluate on measured drives with a label "
             "instead. Models and filters are trained without the drives, or parts, that they are "
             "evaluated on."
@@ -91,7 +89,7 @@ def evaluate(
     include_faulty: opt.IncludeFaulty = False,
     vehicle: Annotated[
         str | None,
-        typer.Option(help="With --cohort: vehicle file for filters, instead of --mass and axles."),
+        Option(help="With --cohort: vehicle file for filters, instead of --mass and axles."),
     ] = None,
     mass: opt.Mass = None,
     front_axle: opt.FrontAxle = None,
@@ -102,7 +100,7 @@ def evaluate(
     front_drive: opt.FrontDrive = None,
     threads: opt.Threads = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Print the errors of all estimators on every drive.")
+        bool, Option("--all", help="Print the errors of all estimators on every drive.")
     ] = False,
     json: opt.Json = False,
 ) -> None:
@@ -154,8 +152,8 @@ def evaluate(
 
 
 def identify(
-    context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Name of the car.")],
+    context: Context,
+    name: Annotated[str, Argument(help="Name of the car.")],
     cohort: opt.Cohort = TRAINING_DRIVES,
     mass: opt.Mass = None,
     front_axle: opt.FrontAxle = None,
@@ -165,9 +163,9 @@ def identify(
     radius: opt.Radius = None,
     front_drive: opt.FrontDrive = None,
     threads: opt.Threads = None,
-    output: Annotated[Path | None, typer.Option(help="Vehicle file to write.")] = None,
+    output: Annotated[Path | None, Option(help="Vehicle file to write.")] = None,
     campaign: Annotated[
-        Path | None, typer.Option(help="Campaign file with the car to write, for publish --prior.")
+        Path | None, Option(help="Campaign file with the car to write, for publish --prior.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -179,8 +177,6 @@ def identify(
 
     Example: fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44
     """
-    from fleet_slip.storage.storage_errors import storage_errors
-
     car = fleet_of(context).evaluation.identify(
         name,
         cohort,
@@ -200,17 +196,14 @@ def identify(
         (campaign, car.as_campaign(), train),
     ):
         if file is not None:
-            with storage_errors(file):
-                file.write_text(text, encoding="utf-8")
-            if not json:
-                say(f"written to {file}{remark}")
+            write_text(file, text, "" if json else remark)
 
 
 def report(
-    context: typer.Context,
+    context: Context,
     model: opt.Model = None,
     output: Annotated[
-        Path | None, typer.Option(help="Folder to write into. Default: report/ in the data root.")
+        Path | None, Option(help="Folder to write into. Default: report/ in the data root.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -234,22 +227,22 @@ def report(
 
 @recorded
 def watch(
-    context: typer.Context,
+    context: Context,
     drive: Annotated[
         str,
-        typer.Argument(
+        Argument(
             metavar="SCENARIO|DRIVE",
             help="Scenario of configs/scenarios, a TOML file, or a logged drive: its drive_id, its "
             "name, or the name of its file.",
         ),
     ],
     model: opt.Model = None,
-    output: Annotated[
-        Path, typer.Option(help="Page to write, .html. It plays in a browser.")
-    ] = Path("watch.html"),
-    from_s: Annotated[float, typer.Option("--from", help="First second of the drive.")] = 0.0,
+    output: Annotated[Path, Option(help="Page to write, .html. It plays in a browser.")] = Path(
+        "watch.html"
+    ),
+    from_s: Annotated[float, Option("--from", help="First second of the drive.")] = 0.0,
     until_s: Annotated[
-        float | None, typer.Option("--until", help="Last second. Default: the end.")
+        float | None, Option("--until", help="Last second. Default: the end.")
     ] = None,
 ) -> None:
     """Show a drive: the car on its track, its angle and the estimate, wheels and gates.
@@ -263,13 +256,11 @@ def watch(
 
 
 def explore(
-    context: typer.Context,
-    edit: Annotated[bool, typer.Option("--edit", help="Show the code, for editing.")] = False,
-    port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Port on this machine.")
-    ] = None,
+    context: Context,
+    edit: Annotated[bool, Option("--edit", help="Show the code, for editing.")] = False,
+    port: Annotated[int | None, Option(min=1, max=65535, help="Port on this machine.")] = None,
     headless: Annotated[
-        bool, typer.Option("--headless", help="Print the address, and open no browser.")
+        bool, Option("--headless", help="Print the address, and open no browser.")
     ] = False,
 ) -> None:
     """Explore a data root in the browser: cohorts by mouse, error maps, coefficients, drift.

@@ -15,6 +15,7 @@ from types import CodeType, FunctionType, ModuleType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Context, Option
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
@@ -39,58 +40,26 @@ if TYPE_CHECKING:
 # and colours took longer than everything else.
 
 GROUPS = {
-    "Start here": {
-        "demo": "pipeline_commands",
-        "run": "pipeline_commands",
-        "mapping": "data_commands",
-        "ingest": "data_commands",
-        "learn": "pipeline_commands",
-        "sql": "sql_command",
-        "show": "model_commands",
-        "evaluate": "accuracy_commands",
-        "export": "model_commands",
-    },
-    "Data": {
-        "simulate": "data_commands",
-        "gram": "data_commands",
-        "features": "data_commands",
-    },
-    "Models": {
-        "select": "selection_commands",
-        "publish": "selection_commands",
-        "models": "model_commands",
-        "promote": "model_commands",
-        "rollback": "model_commands",
-        "pin": "model_commands",
-        "unpin": "model_commands",
-        "diff": "model_commands",
-    },
-    "Accuracy": {
-        "score": "accuracy_commands",
-        "predict": "accuracy_commands",
-        "identify": "accuracy_commands",
-        "report": "accuracy_commands",
-        "watch": "accuracy_commands",
-        "explore": "accuracy_commands",
-        "diagnose": "selection_commands",
-    },
-    "Operations": {
-        "nightly": "pipeline_commands",
-        "status": "operation_commands",
-        "contract": "operation_commands",
-        "quality": "operation_commands",
-        "calibrate": "operation_commands",
-        "monitor": "operation_commands",
-        "verify": "operation_commands",
-        "compact": "operation_commands",
-        "forget": "operation_commands",
-        "migrate": "operation_commands",
-    },
+    "Start here": "demo run mapping ingest learn sql show evaluate export",
+    "Data": "simulate gram features",
+    "Models": "select publish models promote rollback pin unpin diff",
+    "Accuracy": "score predict identify report watch explore diagnose",
+    "Operations": "nightly status contract quality calibrate monitor verify compact forget migrate",
 }
-"""The commands by group, in the order of `--help`, with the module of `fleet_slip.cli` that defines
-each as a function."""
+"""The commands by group, in the order of `--help`."""
 
-COMMANDS = {name: module for group in GROUPS.values() for name, module in group.items()}
+MODULES = {
+    "pipeline_commands": "demo run learn nightly",
+    "data_commands": "mapping ingest simulate gram features",
+    "sql_command": "sql",
+    "model_commands": "show export models promote rollback pin unpin diff",
+    "accuracy_commands": "evaluate score predict identify report watch explore",
+    "selection_commands": "select publish diagnose",
+    "operation_commands": "status contract quality calibrate monitor verify compact forget migrate",
+}
+"""The modules of `fleet_slip.cli` that define the commands, each as a function."""
+
+COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
 
 
 class CommandGroup(TyperGroup):
@@ -107,10 +76,11 @@ class CommandGroup(TyperGroup):
         width = max(map(len, COMMANDS))
         text_width = formatter.width - width - 6
         for group, names in GROUPS.items():
+            helps = {
+                name: self.commands[name].get_short_help_str(2 * text_width)
+                for name in names.split()
+            }
             with formatter.section(group):
-                helps = {
-                    name: self.commands[name].get_short_help_str(2 * text_width) for name in names
-                }
                 formatter.write_dl([(f"{name:<{width}}", text) for name, text in helps.items()])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -234,34 +204,31 @@ def _print_version(requested: bool) -> None:
 
 @app.callback()
 def options(
-    context: typer.Context,
+    context: Context,
     root: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Data root: a folder, or the URL of an object store, such as s3://BUCKET/PATH. "
-            "Default: $FLEET_SLIP_ROOT, else ./data.",
+            "Default: $FLEET_SLIP_ROOT, else ./data."
         ),
     ] = None,
     config: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Folder of configs that override the shipped ones (docs/configuration.md). "
-            "Default: $FLEET_SLIP_CONFIG.",
+            "Default: $FLEET_SLIP_CONFIG."
         ),
     ] = None,
     lineage: Annotated[  # noqa: ARG001 - read by `recorded`
         str | None,
-        typer.Option(
+        Option(
             envvar="FLEET_SLIP_LINEAGE",
             help="File or URL (http://HOST:PORT) for OpenLineage events of commands that change "
             "the data root.",
         ),
     ] = None,
     _version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Side-slip angle estimation from fleet logs.

@@ -8,12 +8,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Argument, Context, Option
 
 from fleet_slip.api.calls import open_workers
 from fleet_slip.base import last_day, pluralize
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
-from fleet_slip.cli.output import print_answer, print_json, print_parts, print_text, progress, say
+from fleet_slip.cli.output import (
+    print_answer,
+    print_json,
+    print_parts,
+    print_table,
+    print_text,
+    progress,
+    say,
+    write_text,
+)
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 
@@ -31,13 +41,13 @@ ALL_SETS = "all"
 
 @recorded
 def simulate(
-    context: typer.Context,
-    campaign: Annotated[str, typer.Argument(help="Campaign of configs/campaigns, or a TOML file.")],
+    context: Context,
+    campaign: Annotated[str, Argument(help="Campaign of configs/campaigns, or a TOML file.")],
     days: opt.CampaignDays = None,
     through: opt.Through = None,
     engine: Annotated[
         Literal["kernel", "highway-env"],
-        typer.Option(help="The compiled kernel, or highway-env's vehicle: slower, the same logs."),
+        Option(help="The compiled kernel, or highway-env's vehicle: slower, the same logs."),
     ] = "kernel",
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -61,30 +71,30 @@ def simulate(
 
 @recorded
 def ingest(
-    context: typer.Context,
+    context: Context,
     files: Annotated[
         list[str],
-        typer.Argument(
+        Argument(
             help="Log files (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO) or folders. "
             "Of folders, files that were ingested before are skipped."
         ),
     ],
     mapping: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Mapping of configs/mappings, or a TOML file. Without it, the files are tables of "
             "Gram rows."
         ),
     ] = None,
     dry_run: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--dry-run", help="Store nothing; show the result and what looks wrong (exit code 10)."
         ),
     ] = False,
     replace: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--replace",
             help="Replace the drives of the same recordings, such as after a correction of the "
             "mapping.",
@@ -105,11 +115,7 @@ def ingest(
     if mapping is None:
         if dry_run or replace:
             raise UsageError("give --mapping: only tables of Gram rows (docs/export.md) have none.")
-        imports = [fleet.import_onboard_grams(file) for file in files]
-        if json:
-            print_json(imports)
-        else:
-            print_parts(part for report in imports for part in report.parts())
+        print_answer([fleet.import_onboard_grams(file) for file in files], json)
         return
     if dry_run:
         _print_previews(fleet.preview(files, mapping), json)
@@ -189,11 +195,7 @@ def _ingested(subject: str, reports: "Sequence[IngestReport]") -> str:
 
 def _print_previews(previews: "list[Preview]", json: bool) -> None:
     """Print previews. Raises `AlarmError` if anything looks wrong."""
-    if json:
-        print_json(previews)
-    else:
-        for preview in previews:
-            print_parts(preview.parts())
+    print_answer(previews, json)
     if suspicions := sum(len(preview.alarms) for preview in previews):
         raise AlarmError(f"{pluralize(suspicions, 'suspicion')}, see above. Nothing was stored.")
 
@@ -213,14 +215,12 @@ def mapping() -> None:
 
 @mapping_app.command()
 def suggest(
-    context: typer.Context,
-    file: Annotated[str, typer.Argument(help="A measured log.")],
+    context: Context,
+    file: Annotated[str, Argument(help="A measured log.")],
     output: Annotated[
-        Path | None, typer.Option(help="File to write the draft to, instead of stdout.")
+        Path | None, Option(help="File to write the draft to, instead of stdout.")
     ] = None,
-    can: Annotated[
-        Path | None, typer.Option(help="Database of a CAN trace: DBC, KCD or SYM.")
-    ] = None,
+    can: Annotated[Path | None, Option(help="Database of a CAN trace: DBC, KCD or SYM.")] = None,
     json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
@@ -230,8 +230,6 @@ def suggest(
 
     Example: fleet-slip mapping suggest drive.mf4
     """
-    from fleet_slip.storage.storage_errors import storage_errors
-
     if output is not None and output.exists():
         raise UsageError(f"{output} exists. Choose another name, or remove it.")
     draft, text = _draft(fleet_of(context).warehouse.catalog.signals, file, can)
@@ -257,25 +255,20 @@ def suggest(
         title = f"{file}: {len(channels)} channels"
         print_parts([TextTable(title, header, channels, row, text_columns=3)])
     if output is not None:
-        with storage_errors(output):
-            output.write_text(text, encoding="utf-8")
-        say(f"draft written to {output}")
+        write_text(output, text, ": a draft of a mapping")
     elif not json:
         print_text("\n" + text)
 
 
 @mapping_app.command(name="list")
-def list_mappings(context: typer.Context, json: opt.Json = False) -> None:
+def list_mappings(context: Context, json: opt.Json = False) -> None:
     """List the mappings of configs/mappings.
 
     Example: fleet-slip mapping list
     """
     configs = fleet_of(context).warehouse.configs
     files = {name: str(configs.find("mappings", name)) for name in configs.names("mappings")}
-    if json:
-        print_json(files)
-    else:
-        print_parts([TextTable("", "mapping|file", files.items(), text_columns=2)])
+    print_table(files, json, TextTable("", "mapping|file", files.items(), text_columns=2))
 
 
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
@@ -298,16 +291,14 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draf
 
 @recorded
 def gram(
-    context: typer.Context,
+    context: Context,
     features: Annotated[
         str,
-        typer.Option(
-            help="Feature set of configs/features.toml, or all; signals is the logged signals."
-        ),
+        Option(help="Feature set of configs/features.toml, or all; signals is the logged signals."),
     ] = "signals",
     cohort: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="SQL predicate on the view drives: read only log files with such a drive. "
             "Default: all files."
         ),
@@ -315,7 +306,7 @@ def gram(
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     sql: Annotated[
-        bool, typer.Option("--sql", help="Print the SQL statement, and compute nothing.")
+        bool, Option("--sql", help="Print the SQL statement, and compute nothing.")
     ] = False,
     json: opt.Json = False,
 ) -> None:
@@ -345,12 +336,10 @@ def gram(
         for name in names:
             with progress(f"gram {name}") as show:
                 reports.append(fleet.gram(name, cohort=cohort, workers=executor, progress=show))
-    if json:
-        print_json(reports if features == ALL_SETS else reports[0])
-        return
-    for report in reports:
-        print_parts(report.parts())
-    if not (any(report.gram_rows for report in reports) or fleet.warehouse.logs.snapshot().files):
+    print_answer(reports if features == ALL_SETS else reports[0], json)
+    if not (
+        json or any(report.gram_rows for report in reports) or fleet.warehouse.logs.snapshot().files
+    ):
         say(
             f"{fleet.root}: no logs yet. Load some with fleet-slip ingest, or simulate with "
             "fleet-slip run"
@@ -361,18 +350,18 @@ def gram(
 
 
 def features(
-    context: typer.Context,
+    context: Context,
     sets: Annotated[
-        bool, typer.Option("--sets", help="List the feature sets instead of the features.")
+        bool, Option("--sets", help="List the feature sets instead of the features.")
     ] = False,
     sql: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Print the query over log_counts that computes this feature, window or factor."
         ),
     ] = None,
     files: Annotated[
-        bool, typer.Option("--files", help="List the config files in use, and their folders.")
+        bool, Option("--files", help="List the config files in use, and their folders.")
     ] = False,
     everything: opt.All = False,
     json: opt.Json = False,
@@ -465,10 +454,6 @@ def _print_files(configs: "Configs", json: bool) -> None:
         for name, file in configs.files().items()
         if read_named_file(file)
     }
-    if json:
-        print_json(files)
-    else:
-        heading = f"own configs: {overlay or 'none'}\nshipped ones: {folder('configs')}"
-        print_parts(
-            [TextTable(heading, "file|from", files.items(), "{0}|{1[from]}", text_columns=2)]
-        )
+    heading = f"own configs: {overlay or 'none'}\nshipped ones: {folder('configs')}"
+    table = TextTable(heading, "file|from", files.items(), "{0}|{1[from]}", text_columns=2)
+    print_table(files, json, table)

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Context, Option
 
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
@@ -12,10 +12,10 @@ from fleet_slip.rendering import TextTable
 
 
 def models(
-    context: typer.Context,
+    context: Context,
     name: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             help="Name of a model: list its versions and the history of its aliases.",
             autocompletion=opt.complete_name,
         ),
@@ -53,10 +53,7 @@ def models(
 
 
 def show(
-    context: typer.Context,
-    model: opt.Model = None,
-    everything: opt.All = False,
-    json: opt.Json = False,
+    context: Context, model: opt.Model = None, everything: opt.All = False, json: opt.Json = False
 ) -> None:
     """Show one model version: figures, training data and coefficients.
 
@@ -75,9 +72,9 @@ def show(
 
 @recorded
 def promote(
-    context: typer.Context,
+    context: Context,
     reference: Annotated[
-        str, typer.Argument(help="NAME@VERSION.", autocompletion=opt.complete_reference)
+        str, Argument(help="NAME@VERSION.", autocompletion=opt.complete_reference)
     ],
     alias: opt.Alias = "champion",
 ) -> None:
@@ -90,7 +87,7 @@ def promote(
 
 
 @recorded
-def rollback(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
+def rollback(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Point an alias back at its previous version, and pin it there.
 
     Example: fleet-slip rollback waterford
@@ -103,7 +100,7 @@ def rollback(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "c
 
 
 @recorded
-def pin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
+def pin(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Keep an alias at its version: publications become candidates, until promote or unpin.
 
     Example: fleet-slip pin waterford
@@ -113,7 +110,7 @@ def pin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champi
 
 
 @recorded
-def unpin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
+def unpin(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Let publications move an alias again.
 
     Example: fleet-slip unpin waterford
@@ -122,9 +119,7 @@ def unpin(context: typer.Context, model: opt.ModelName, alias: opt.Alias = "cham
     say(f"{model}@{alias} is version {version.version}; publications may move it")
 
 
-def diff(
-    context: typer.Context, first: opt.Version, second: opt.Version, json: opt.Json = False
-) -> None:
+def diff(context: Context, first: opt.Version, second: opt.Version, json: opt.Json = False) -> None:
     """Compare two versions of a model: data, prior, signals, coefficients, figures.
 
     Example: fleet-slip diff waterford@1 waterford@2
@@ -133,17 +128,16 @@ def diff(
 
 
 def export(
-    context: typer.Context,
+    context: Context,
     to: Annotated[
-        Literal["json", "c", "sql", "dbc", "onnx", "fmu"],
-        typer.Option(help="Target of the export."),
+        Literal["json", "c", "sql", "dbc", "onnx", "fmu"], Option(help="Target of the export.")
     ],
     model: opt.Model = None,
     output: Annotated[
-        Path, typer.Option(help="Folder to write into; files of the same names are replaced.")
+        Path, Option(help="Folder to write into; files of the same names are replaced.")
     ] = Path(),
     with_gram: Annotated[
-        bool, typer.Option("--with-gram", help="With C: also the code for Gram rows on board.")
+        bool, Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,
     json: opt.Json = False,
 ) -> None:

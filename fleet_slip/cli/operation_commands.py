@@ -1,10 +1,9 @@
 """Commands of operations, such as status, contract, quality, monitor, verify and forget."""
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Context, Option
 
 from fleet_slip.base import date_of
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
@@ -13,19 +12,19 @@ from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import (
     print_answer,
     print_json,
-    print_parts,
     print_text,
     progress,
     progress_of_steps,
     say,
+    write_text,
 )
 from fleet_slip.errors import UsageError
 
 
 def status(
-    context: typer.Context,
+    context: Context,
     max_age_hours: Annotated[
-        float | None, typer.Option(min=0, help="Maximum age of data or of a backlog, in hours.")
+        float | None, Option(min=0, help="Maximum age of data or of a backlog, in hours.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -35,21 +34,13 @@ def status(
 
     Example: fleet-slip status --max-age-hours 26
     """
-    report = fleet_of(context).maintenance.status(max_age_hours)
-    if json:
-        print_json(report)
-    else:
-        print_parts(report.parts())
-    for problem in report.problems:
-        say(f"- {problem}", logging.ERROR)
-    if report.problem:
-        raise report.problem
+    print_answer(fleet_of(context).maintenance.status(max_age_hours), json)
 
 
 def contract(
-    context: typer.Context,
+    context: Context,
     output: Annotated[
-        Path | None, typer.Option(help="File to write, such as fleet.odcs.yaml. Default: stdout.")
+        Path | None, Option(help="File to write, such as fleet.odcs.yaml. Default: stdout.")
     ] = None,
 ) -> None:
     """Write the data contract of the views in ODCS 3.1: columns, units, ranges and keys.
@@ -57,20 +48,16 @@ def contract(
     Example: fleet-slip contract --output fleet.odcs.yaml
     """
     from fleet_slip.operations.data_contract import data_contract
-    from fleet_slip.storage.storage_errors import storage_errors
 
     text = data_contract(fleet_of(context).warehouse)
     if output is None:
         print_text(text.removesuffix("\n"))
         return
-    with storage_errors(output):
-        output.write_text(text, encoding="utf-8")
+    write_text(output, text)
     say(f"{output}: {len(text):,} characters. Check it by: datacontract lint {output}")
 
 
-def quality(
-    context: typer.Context, cohort: opt.Cohort = TRAINING_DRIVES, json: opt.Json = False
-) -> None:
+def quality(context: Context, cohort: opt.Cohort = TRAINING_DRIVES, json: opt.Json = False) -> None:
     """Find stuck, saturated, biased, noisy, scaled, reversed and swapped sensors, drive by drive.
 
     Reads Gram rows only. Exit code 10 if a drive has faulty sensors.
@@ -81,13 +68,11 @@ def quality(
 
 
 def calibrate(
-    context: typer.Context,
+    context: Context,
     cohort: opt.Cohort = ALL_DRIVES,
     car: Annotated[
         str | None,
-        typer.Option(
-            help="vehicle_id: print the parameters of this car, also as on-board constants."
-        ),
+        Option(help="vehicle_id: print the parameters of this car, also as on-board constants."),
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -102,17 +87,15 @@ def calibrate(
 
 
 def monitor(
-    context: typer.Context,
+    context: Context,
     model: opt.Model = None,
     cohort: Annotated[
         str | None,
-        typer.Option(
-            help="SQL predicate on the view drives. Default: the predicate of the training."
-        ),
+        Option(help="SQL predicate on the view drives. Default: the predicate of the training."),
     ] = None,
     since: Annotated[
         str | None,
-        typer.Option(help="First new day, YYYY-MM-DD. Default: the day after the training data."),
+        Option(help="First new day, YYYY-MM-DD. Default: the day after the training data."),
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -127,22 +110,20 @@ def monitor(
 
 
 def verify(
-    context: typer.Context,
+    context: Context,
     full: Annotated[
-        bool, typer.Option("--full", help="Compute the Gram rows of all log files again.")
+        bool, Option("--full", help="Compute the Gram rows of all log files again.")
     ] = False,
     grams: Annotated[
         bool,
-        typer.Option(
-            "--grams", help="Also compute some Gram rows in several ways and compare the bits."
-        ),
+        Option("--grams", help="Also compute some Gram rows in several ways and compare the bits."),
     ] = False,
     repair: Annotated[
-        bool, typer.Option("--repair", help="Rebuild damaged Gram rows from the logs.")
+        bool, Option("--repair", help="Rebuild damaged Gram rows from the logs.")
     ] = False,
     accept_loss: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             help="Lost document without a backup to give up: FOLDER/NUMBER.json, or FOLDER for all "
             "its documents. May be repeated."
         ),
@@ -171,21 +152,20 @@ def verify(
 
 @recorded
 def compact(
-    context: typer.Context,
+    context: Context,
     target_rows: Annotated[
-        int | None,
-        typer.Option(min=1, help="Maximum number of rows of a file. Default: 2,000,000."),
+        int | None, Option(min=1, help="Maximum number of rows of a file. Default: 2,000,000.")
     ] = None,
     retention_hours: Annotated[
         float | None,
-        typer.Option(
+        Option(
             min=1,
             max=168,
             help="Hours for which files of replaced versions are kept. Default: 168, a week.",
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="List the files to be removed; change nothing.")
+        bool, Option("--dry-run", help="List the files to be removed; change nothing.")
     ] = False,
     json: opt.Json = False,
 ) -> None:
@@ -205,21 +185,21 @@ def compact(
 
 @recorded
 def forget(
-    context: typer.Context,
-    vehicle: Annotated[str | None, typer.Option(help="vehicle_id to erase.")] = None,
-    drive: Annotated[str | None, typer.Option(help="drive_id to erase.")] = None,
+    context: Context,
+    vehicle: Annotated[str | None, Option(help="vehicle_id to erase.")] = None,
+    drive: Annotated[str | None, Option(help="drive_id to erase.")] = None,
     now: Annotated[
-        bool, typer.Option("--now", help="Delete old files at once, instead of by compact.")
+        bool, Option("--now", help="Delete old files at once, instead of by compact.")
     ] = False,
     allow: Annotated[
-        bool, typer.Option("--allow", help="Accept new rows of the vehicle or drive again.")
+        bool, Option("--allow", help="Accept new rows of the vehicle or drive again.")
     ] = False,
     expired: Annotated[
-        bool, typer.Option("--expired", help="Erase drives older than the retention period.")
+        bool, Option("--expired", help="Erase drives older than the retention period.")
     ] = False,
     retention: Annotated[
         str | None,
-        typer.Option(help="Retention file of --expired. Default: retention.toml of the configs."),
+        Option(help="Retention file of --expired. Default: retention.toml of the configs."),
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -253,7 +233,7 @@ def forget(
 
 
 @recorded
-def migrate(context: typer.Context, json: opt.Json = False) -> None:
+def migrate(context: Context, json: opt.Json = False) -> None:
     """Bring the data root to this program and to the signal catalog: add columns.
 
     It can be repeated after any interruption.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, cast
 
-import typer
+from typer import Argument, Context, Option
 
 import fleet_slip
 from fleet_slip.errors import FleetSlipError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 P = ParamSpec("P")
 
 
-def fleet_of(context: typer.Context) -> "Fleet":
+def fleet_of(context: Context) -> "Fleet":
     """Return the fleet that --root and --config name."""
     fleet: Fleet = context.obj()
     return fleet
@@ -33,7 +33,7 @@ def recorded(command: Callable[P, None]) -> Callable[P, None]:
     def run(*arguments: P.args, **options: P.kwargs) -> None:
         if options.get("dry_run"):
             return command(*arguments, **options)
-        context = cast(typer.Context, options["context"])
+        context = cast(Context, options["context"])
         warehouse = fleet_of(context).warehouse
         with (
             recording(warehouse.root, command.__name__, sys.argv[1:]) as current_run,
@@ -45,7 +45,7 @@ def recorded(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def _lineage(
-    context: typer.Context, warehouse: "Warehouse", current_run: Run, options: dict[str, object]
+    context: Context, warehouse: "Warehouse", current_run: Run, options: dict[str, object]
 ) -> AbstractContextManager[None]:
     """Return what emits the events of a run, if --lineage names a file or a URL."""
     target = context.find_root().params.get("lineage")
@@ -56,7 +56,7 @@ def _lineage(
     return emit_lineage(target, warehouse, current_run, options)
 
 
-def complete_name(context: typer.Context, incomplete: str) -> list[str]:
+def complete_name(context: Context, incomplete: str) -> list[str]:
     """Return the names of models for the completion of a shell."""
     with suppress(FleetSlipError):
         names = _registry(context).names()
@@ -64,7 +64,7 @@ def complete_name(context: typer.Context, incomplete: str) -> list[str]:
     return []
 
 
-def complete_reference(context: typer.Context, incomplete: str) -> list[str]:
+def complete_reference(context: Context, incomplete: str) -> list[str]:
     """Return names of models, or versions and aliases once a name is complete."""
     name, at, _ = incomplete.partition("@")
     if not at:
@@ -77,21 +77,21 @@ def complete_reference(context: typer.Context, incomplete: str) -> list[str]:
     return []
 
 
-def _registry(context: typer.Context) -> "Registry":
+def _registry(context: Context) -> "Registry":
     """Return the registry of a command line that is not complete yet."""
     options = context.parent.params if context.parent else {}
     return fleet_slip.open(options.get("root"), options.get("config")).models.registry
 
 
-Json = Annotated[bool, typer.Option("--json", help="Print machine-readable JSON on stdout.")]
-All = Annotated[bool, typer.Option("--all", help="Print all rows and columns.")]
+Json = Annotated[bool, Option("--json", help="Print machine-readable JSON on stdout.")]
+All = Annotated[bool, Option("--all", help="Print all rows and columns.")]
 
 Threads = Annotated[
-    int | None, typer.Option(min=1, help="Threads on this machine. Default: one per core.")
+    int | None, Option(min=1, help="Threads on this machine. Default: one per core.")
 ]
 Cluster = Annotated[
     str | None,
-    typer.Option(
+    Option(
         envvar="DASK_SCHEDULER_ADDRESS",
         metavar="ADDRESS",
         help="Address of a Dask scheduler, such as tcp://10.0.0.1:8786, whose workers share the "
@@ -101,94 +101,82 @@ Cluster = Annotated[
 
 Model = Annotated[
     str | None,
-    typer.Argument(
+    Argument(
         metavar="MODEL",
         autocompletion=complete_reference,
-        help="NAME, NAME@VERSION or NAME@ALIAS of a published model; NAME alone is its champion. "
-        "Default: the only published model.",
+        help="NAME, NAME@VERSION or NAME@ALIAS. Default: the only published model.",
     ),
 ]
-ModelName = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=complete_name)]
-Alias = Annotated[str, typer.Option(help="Alias.")]
+ModelName = Annotated[str, Argument(help="Name of the model.", autocompletion=complete_name)]
+Alias = Annotated[str, Option(help="Alias.")]
 Version = Annotated[
     str,
-    typer.Argument(
+    Argument(
         help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.",
         autocompletion=complete_reference,
     ),
 ]
 
-Cohort = Annotated[str, typer.Option(help="SQL predicate on the view drives.")]
+Cohort = Annotated[str, Option(help="SQL predicate on the view drives.")]
 IncludeFaulty = Annotated[
-    bool, typer.Option("--include-faulty", help="Include drives with faulty sensors.")
+    bool, Option("--include-faulty", help="Include drives with faulty sensors.")
 ]
-Mapping = Annotated[str, typer.Option(help="Mapping of configs/mappings, or a TOML file.")]
+Mapping = Annotated[str, Option(help="Mapping of configs/mappings, or a TOML file.")]
 CampaignDays = Annotated[
-    int | None, typer.Option(min=1, help="Simulate only the first N days. Default: all.")
+    int | None, Option(min=1, help="Simulate only the first N days. Default: all.")
 ]
 Through = Annotated[
-    str | None, typer.Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
+    str | None, Option(help="Last day to simulate, YYYY-MM-DD or today. Default: all days.")
 ]
 
 # How models are selected.
 
 ModelList = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Model list of configs/models, or a TOML file. Default: estimator, or table1 with "
         "--features or without the Gram rows of estimator."
     ),
 ]
 OneModel = Annotated[
-    str | None,
-    typer.Option(
-        help='Inputs of one model, separated by commas, such as "ax, ay, yaw_rate", instead of a '
-        "list."
-    ),
+    str | None, Option(help='Inputs of one model instead of a list, such as "ax, ay, yaw_rate".')
 ]
 Order = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Inputs, separated by commas, whose first 1, 2, ... form nested models; 'catalogue' "
         "is all inputs, a family of windows or gates its columns."
     ),
 ]
 Features = Annotated[
     str | None,
-    typer.Option(
-        help="Feature set of configs/features.toml, computed by: fleet-slip gram --features NAME. "
-        "Default: the list's, else the logged signals."
-    ),
+    Option(help="Feature set of configs/features.toml. Default: the list's, or signals."),
 ]
 Label = Annotated[
     Literal["course"] | None,
-    typer.Option(
+    Option(
         help="Train without a reference sensor, on changes of the course over ground. Default "
         "feature set and model list are then those called course."
     ),
 ]
 FoldKey = Literal["drive", "vehicle", "track", "day", "mass", "adhesion", "speed", "part"]
 GroupBy = Annotated[
-    FoldKey | None,
-    typer.Option("--group-by", help="Groups that form the folds. Default: the list's."),
+    FoldKey | None, Option("--group-by", help="Groups that form the folds. Default: the list's.")
 ]
 Folds = Annotated[
     str | None,
-    typer.Option(
+    Option(
         metavar="NUMBER|each",
         help="Number of folds, or each for one fold per group. Default: the list's.",
     ),
 ]
 Ranking = Annotated[
     str | None,
-    typer.Option(
-        help="Ranking of the inputs of --order: declared, correlation, t, forward or backward. "
-        "Default: declared."
-    ),
+    Option(help="Ranking of inputs: declared (default), correlation, t, forward or backward."),
 ]
 Criterion = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Criterion for the number of ranked inputs: cv (the smallest model within --tolerance "
         "of the best), cp, aic, aic-likelihood, bic, bic-likelihood, ric or adjusted-r2. Default: "
         "cv."
@@ -196,7 +184,7 @@ Criterion = Annotated[
 ]
 Tolerance = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Smallest gain that justifies another signal: an angle such as 0.025deg (root of the "
         "difference of the mean squared errors), or a share of the RMSE such as 2%. Models within "
         "it, or within one standard error of the difference, count as equal. Default: 0.025deg, or "
@@ -204,51 +192,31 @@ Tolerance = Annotated[
     ),
 ]
 AllSubsets = Annotated[
-    bool, typer.Option("--all-subsets", help="Search all subsets of the inputs of --order.")
+    bool, Option("--all-subsets", help="Search all subsets of the inputs of --order.")
 ]
 Robust = Annotated[
-    bool,
-    typer.Option(
-        "--robust",
-        help="Down-weight outlier drives (error above three times the median). Lists them; see "
-        "diagnose.",
-    ),
+    bool, Option("--robust", help="Down-weight drives with an error above three times the median.")
 ]
 ClusterUnit = Annotated[
     Literal["drive", "vehicle"] | None,
-    typer.Option(
-        help="Unit of independent evidence. Default: vehicle if there are several, else drive."
-    ),
+    Option(help="Unit of independent evidence. Default: vehicle if there are several."),
 ]
 Intercept = Annotated[
-    bool,
-    typer.Option(
-        "--intercept/--no-intercept", help="Fit an intercept, or force models through the origin."
-    ),
+    bool, Option("--intercept/--no-intercept", help="Fit an intercept, or go through the origin.")
 ]
 Search = Annotated[
     str | None,
-    typer.Option(
-        help="Search method among the inputs of --order, or all: forward, backward or exchange. "
-        "The search is repeated in every fold."
-    ),
+    Option(help="Search among the inputs, repeated in every fold: forward, backward or exchange."),
 ]
 MaxFeatures = Annotated[
-    int | None,
-    typer.Option(
-        min=1, max=200, help="Maximum number of columns that --search may add. Default: 24."
-    ),
+    int | None, Option(min=1, max=200, help="Maximum number of columns of --search. Default: 24.")
 ]
 HalfLife = Annotated[
-    int | None,
-    typer.Option(
-        help="Days, counted back from the cohort's newest day, after which a drive counts half as "
-        "much."
-    ),
+    int | None, Option(help="Days, back from the newest, after which a drive counts half as much.")
 ]
 Prior = Annotated[
     str | None,
-    typer.Option(
+    Option(
         help="Campaign of configs/campaigns, or a TOML file, whose simulated drives join the "
         "training with an eighth of the weight of all real rows, unless held-out drives have a "
         "clearly larger error with them. See: fleet-slip identify --campaign."
@@ -257,20 +225,10 @@ Prior = Annotated[
 
 # Measured data of a car.
 
-Mass = Annotated[float | None, typer.Option(help="Mass of the car with its driver, kg.")]
-FrontAxle = Annotated[
-    float | None, typer.Option(help="Distance from centre of gravity to front axle, m.")
-]
-RearAxle = Annotated[
-    float | None, typer.Option(help="Distance from centre of gravity to rear axle, m.")
-]
-TrackWidth = Annotated[float | None, typer.Option(help="Track width, m. Default: 1.55.")]
-Height = Annotated[
-    float | None, typer.Option(help="Height of the centre of gravity, m. Default: 0.55.")
-]
-Radius = Annotated[
-    float | None, typer.Option(help="Rolling radius of the wheels, m. Default: 0.315.")
-]
-FrontDrive = Annotated[
-    float | None, typer.Option(help="Share of the drive torque on the front axle. Default: 1.")
-]
+Mass = Annotated[float | None, Option(help="Mass of the car with its driver, kg.")]
+FrontAxle = Annotated[float | None, Option(help="Centre of gravity to front axle, m.")]
+RearAxle = Annotated[float | None, Option(help="Centre of gravity to rear axle, m.")]
+TrackWidth = Annotated[float | None, Option(help="Track width, m. Default: 1.55.")]
+Height = Annotated[float | None, Option(help="Height of the centre of gravity, m. Default: 0.55.")]
+Radius = Annotated[float | None, Option(help="Rolling radius of the wheels, m. Default: 0.315.")]
+FrontDrive = Annotated[float | None, Option(help="Share of torque on the front axle. Default: 1.")]

@@ -10,15 +10,17 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from fleet_slip.base import document_of
 from fleet_slip.errors import hide_passwords, printable
 from fleet_slip.rendering import FILE_WIDTH, Answer, Part, Remark, TextTable, wrap_lines
 from fleet_slip.storage.runs import LOGGER
+from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,14 +66,32 @@ def printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
-def print_answer(answer: Answer, json: bool, **options: Any) -> None:
-    """Print the answer to a command, with options of its parts; then raise its problem."""
+def print_answer(answer: Answer | Sequence[Answer], json: bool, **options: Any) -> None:
+    """Print the answer to a command, with options of its parts; then raise its first problem."""
+    answers = answer if isinstance(answer, Sequence) else (answer,)
     if json:
         print_json(answer)
     else:
-        print_parts(answer.parts(**options))
-    if answer.problem:
-        raise answer.problem
+        print_parts(part for each in answers for part in each.parts(**options))
+    for problem in (each.problem for each in answers):
+        if problem:
+            raise problem
+
+
+def print_table(content: Any, json: bool, *tables: TextTable) -> None:
+    """Print tables, or a content as JSON."""
+    if json:
+        print_json(content)
+    else:
+        print_parts(tables)
+
+
+def write_text(file: Path, text: str, remark: str = "") -> None:
+    """Write a file, and print a remark on it. Raises `StorageError`."""
+    with storage_errors(file):
+        file.write_text(text, encoding="utf-8")
+    if remark:
+        say(f"written to {file}{remark}")
 
 
 def _print(text: str) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Context, Option
 
 from fleet_slip.base import date_of, last_day, pluralize
 from fleet_slip.catalog.signals import TRAINING_DRIVES
@@ -24,13 +25,11 @@ if TYPE_CHECKING:
 
 
 def demo(
-    context: typer.Context,
-    output: Annotated[
-        Path, typer.Option(help="Folder to write into: data, c and report.html.")
-    ] = Path("fleet-slip-demo"),
-    open_page: Annotated[
-        bool, typer.Option("--open", help="Open the report in the browser.")
-    ] = False,
+    context: Context,
+    output: Annotated[Path, Option(help="Folder to write into: data, c and report.html.")] = Path(
+        "fleet-slip-demo"
+    ),
+    open_page: Annotated[bool, Option("--open", help="Open the report in the browser.")] = False,
 ) -> None:
     """Simulate 12 drives, train a model, export it as C, and show it on another drive.
 
@@ -76,15 +75,13 @@ def demo(
 
 @recorded
 def run(
-    context: typer.Context,
+    context: Context,
     campaign: Annotated[
-        str, typer.Option(help="Campaign of configs/campaigns, or a TOML file.")
+        str, Option(help="Campaign of configs/campaigns, or a TOML file.")
     ] = "waterford",
     days: opt.CampaignDays = None,
     through: opt.Through = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the model. Default: the campaign's.")
-    ] = None,
+    name: Annotated[str | None, Option(help="Name of the model. Default: the campaign's.")] = None,
     models: opt.ModelList = None,
     tolerance: opt.Tolerance = None,
     threads: opt.Threads = None,
@@ -125,11 +122,11 @@ def run(
 
 @recorded
 def learn(
-    context: typer.Context,
+    context: Context,
     name: opt.ModelName,
     logs: Annotated[
         list[str],
-        typer.Argument(help="Log files or folders. Files that were ingested before are skipped."),
+        Argument(help="Log files or folders. Files that were ingested before are skipped."),
     ],
     mapping: opt.Mapping,
     threads: opt.Threads = None,
@@ -165,27 +162,27 @@ def learn(
 
 @recorded
 def nightly(
-    context: typer.Context,
-    inbox: Annotated[str, typer.Option(help="Folder of logs; new logs in it are ingested.")],
+    context: Context,
+    inbox: Annotated[str, Option(help="Folder of logs; new logs in it are ingested.")],
     mapping: opt.Mapping,
-    model: Annotated[str, typer.Option(help="Name of the model.")],
+    model: Annotated[str, Option(help="Name of the model.")],
     cohort: opt.Cohort = TRAINING_DRIVES,
     models: opt.ModelList = None,
     tolerance: opt.Tolerance = None,
     candidate: Annotated[
-        bool, typer.Option("--candidate", help="Publish as a candidate, even if it is not worse.")
+        bool, Option("--candidate", help="Publish as a candidate, even if it is not worse.")
     ] = False,
     retention: Annotated[
-        str | None, typer.Option(help="Retention file. Default: retention.toml of the configs.")
+        str | None, Option(help="Retention file. Default: retention.toml of the configs.")
     ] = None,
     night: Annotated[
-        str | None, typer.Option(help="Date of the night, YYYY-MM-DD. Default: today.")
+        str | None, Option(help="Date of the night, YYYY-MM-DD. Default: today.")
     ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     output: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Folder for the summary: NIGHT.txt and NIGHT.json. The files name drives; forget "
             "does not change them."
         ),

@@ -3,18 +3,17 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Context, Option
 
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
-from fleet_slip.cli.output import print_answer, print_json, print_parts, say
+from fleet_slip.cli.output import print_answer, print_json, print_parts, say, write_text
 from fleet_slip.storage.runs import step
-from fleet_slip.storage.storage_errors import storage_errors
 
 
 def select(
-    context: typer.Context,
+    context: Context,
     cohort: opt.Cohort = TRAINING_DRIVES,
     include_faulty: opt.IncludeFaulty = False,
     models: opt.ModelList = None,
@@ -37,7 +36,7 @@ def select(
     prior: opt.Prior = None,
     save: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             metavar="LIST.toml",
             help="Write what was compared as a model list, for publish --models.",
         ),
@@ -83,19 +82,17 @@ def select(
     selection = drives.run_request(request)
     print_answer(selection, json, everything=everything, hint="--all")
     if save is not None:
-        with storage_errors(save):
-            save.write_text(selection.as_model_list().as_toml(), encoding="utf-8")
-        if not json:
-            say(f"written to {save}. Publish it: fleet-slip publish NAME --models {save}")
+        remark = f". Publish it: fleet-slip publish NAME --models {save}"
+        write_text(save, selection.as_model_list().as_toml(), "" if json else remark)
 
 
 @recorded
 def publish(
-    context: typer.Context,
+    context: Context,
     name: opt.ModelName,
     cohort: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="SQL predicate on the view drives. Default: the cohort of the model's champion; "
             "all drives, for a new model."
         ),
@@ -107,16 +104,16 @@ def publish(
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
     force: Annotated[
-        bool, typer.Option("--force", help="Publish even a model that is worse than the champion.")
+        bool, Option("--force", help="Publish even a model that is worse than the champion.")
     ] = False,
     candidate: Annotated[
-        bool, typer.Option("--candidate", help="Publish as a candidate; promote makes it champion.")
+        bool, Option("--candidate", help="Publish as a candidate; promote makes it champion.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print what would be published; publish nothing.")
+        bool, Option("--dry-run", help="Print what would be published; publish nothing.")
     ] = False,
     mlflow: Annotated[
-        str | None, typer.Option(help="URI of an MLflow server to register the version in, too.")
+        str | None, Option(help="URI of an MLflow server to register the version in, too.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -163,18 +160,18 @@ def publish(
 
 
 def diagnose(
-    context: typer.Context,
+    context: Context,
     model: opt.Model = None,
     cohort: opt.Cohort = TRAINING_DRIVES,
     signals: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Signals to fit instead of a published model, separated by commas; 'catalogue' is "
             "all inputs."
         ),
     ] = None,
     features: Annotated[
-        str | None, typer.Option(help="Feature set of --signals. Default: the logged signals.")
+        str | None, Option(help="Feature set of --signals. Default: the logged signals.")
     ] = None,
     cluster: opt.ClusterUnit = None,
     json: opt.Json = False,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import duckdb
 import pyarrow as pa
-import typer
+from typer import Argument, Context, Option
 
 from fleet_slip.base import pluralize
 from fleet_slip.cli import options as opt
@@ -35,30 +35,26 @@ FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 
 
 def sql(
-    context: typer.Context,
+    context: Context,
     query: Annotated[
         str,
-        typer.Argument(
-            help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.'
-        ),
+        Argument(help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.'),
     ] = "-",
     json: opt.Json = False,
-    csv: Annotated[bool, typer.Option("--csv", help="Print CSV on stdout.")] = False,
+    csv: Annotated[bool, Option("--csv", help="Print CSV on stdout.")] = False,
     exact: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--exact",
             help="Print texts of CSV unchanged. By default, texts that a spreadsheet takes for "
             "formulas get an apostrophe.",
         ),
     ] = False,
-    output: Annotated[
-        Path | None, typer.Option(help="File to write: .parquet, .csv or .json.")
-    ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Print all rows and columns.")] = False,
+    output: Annotated[Path | None, Option(help="File to write: .parquet, .csv or .json.")] = None,
+    everything: Annotated[bool, Option("--all", help="Print all rows and columns.")] = False,
     unsafe: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--unsafe",
             help="Allow any statement, and any file that you may read or write. Use it only for "
             "SQL that you trust: it can overwrite the data root.",

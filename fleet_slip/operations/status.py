@@ -24,7 +24,7 @@ from fleet_slip.errors import (
 from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
 from fleet_slip.quality.peers import thresholds
-from fleet_slip.rendering import Answer, Part, TextTable
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.documents import find_lost
 from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
@@ -125,6 +125,7 @@ class WarehouseStatus(Answer):
                 "{logs_behind}|{grams_behind}"
             )
             yield TextTable("\nchampions", header, self.champions, row, text_columns=2)
+        yield from (Remark(f"- {problem}") for problem in self.problems)
 
     @property
     def problem(self) -> AlarmError | None:
