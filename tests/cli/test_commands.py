@@ -196,7 +196,7 @@ FORGED = (
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "message"),
     [
-        (["run", "--campaign", "nowhere"], 3, "Known: fleet, fleet_course, fleet_realistic"),
+        (["run", "--campaign", "nowhere"], 3, "Known: demo, fleet, fleet_course"),
         (["run", "--campaign", "missing.toml"], 3, "no such file"),
         (["run", "--campaign", "smoke", "--through", "yesterday"], 2, "write it as 2024-05-01"),
         (["select", "--cohort", "campaign = 'none'"], 5, "no drive matches"),
