@@ -263,7 +263,7 @@ UNFIT_CHARACTERS = "\\*?["
 """The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
 
 _ESCAPE = re.compile("%[0-9A-Fa-f]{2}")
-"""What stands for another character in a URL, as which the Delta library takes a path."""
+"""An escaped character of a URL, as which the Delta library reads a path."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _OBJECT_URL = re.compile(
@@ -301,7 +301,7 @@ def _local(path: Path) -> Folder:
             "character. Choose another."
         )
     for folder in (place := Path(os.path.realpath(path)), *place.parents):
-        # Whatever lies in a table and is not part of it, vacuum removes.
+        # Vacuum removes all files in a table that are not part of it.
         if os.access(folder / "_delta_log", os.F_OK):
             raise StorageError(
                 f"{path}: it is inside the table {folder}. Choose the folder that the table is in, "
@@ -312,7 +312,7 @@ def _local(path: Path) -> Folder:
 
 
 def _at_url(url: str) -> Folder:
-    # A URL that is refused is not shown: what is wrong with it may be that it has a password.
+    # A refused URL is not shown, as it may contain a password.
     if url.startswith("file://"):
         parts = urlsplit(url)
         if parts.netloc not in ("", "localhost") or parts.query or parts.fragment:

@@ -1,7 +1,7 @@
-"""Folders of an object store: S3 and what speaks like it, Google Cloud Storage, Azure.
+"""Folders of object stores: S3 and compatible ones, Google Cloud Storage, Azure.
 
-Puts are whole or nothing, and fail under `If-None-Match: *` where there is one: no temporary names
-or links, and several machines can write.
+Puts are atomic. `If-None-Match: *` makes a put fail if the object exists, so that several machines
+can write without temporary names or links.
 """
 
 import contextlib
@@ -32,27 +32,26 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 
-# The client for a bucket of an object store: its time limits and retries. Credentials are in the
-# environment, or are those of the machine, renewed in time.
+# Clients of buckets: time limits and retries. Credentials come from the environment or the machine.
 
 HTTP_VARIABLE = "AWS_ALLOW_HTTP"
-"""Environment variable, which the Delta library reads too: true lets an endpoint be http."""
+"""Environment variable, which the Delta library reads too: true permits http endpoints."""
 
 TIMEOUT_S = 60
-"""Longest that nothing may come of an answer, and that sending may take: of up to 40 MB."""
+"""Maximum pause of a response, and maximum time to send up to 40 MB."""
 
 LONGEST_S = 3600
-"""Longest that an answer may take to come, however slowly."""
+"""Maximum time of a whole response."""
 
 CONNECT_TIMEOUT_S = 5
 RETRIES = 5
 RETRY_S = 60
-"""No attempt begins later than so long after the first."""
+"""Maximum time between the first and the last attempt."""
 
 
 @functools.cache
 def client(bucket: str) -> "ObjectStore":
-    """Return the client for a bucket, which a process makes when it first needs it."""
+    """Return the client of a bucket, created on first use."""
     with object_errors(bucket):
         return from_url(
             bucket,
@@ -66,23 +65,21 @@ def client(bucket: str) -> "ObjectStore":
         )
 
 
-# Objects as files that can be read anywhere in them: for DuckDB and for pyarrow.
-#
-# They never change. One is fetched whole, compared with the checksum in its name, and read from
-# those bytes.
+# Objects as seekable files for DuckDB and pyarrow. Data files never change: each is fetched whole
+# and compared with the checksum in its name.
 
 PART_BYTES = 2**22
-"""Bytes of an object that are handed on at once."""
+"""Size of the blocks of a response."""
 
 KEPT_BYTES = 2**27
-"""Of the objects that were fetched last, so many bytes are kept."""
+"""Maximum size of the cache of fetched objects."""
 
 
 def _bytes_of(store: "ObjectStore", key: str, where: str) -> bytes:
-    """Return an object, which `where` names in errors.
+    """Return the content of an object; `where` names it in errors.
 
-    The library goes on where an answer breaks off, if the object is still the same. Raises
-    `StorageError`, as when nothing comes for `TIMEOUT_S`.
+    The library resumes a broken response if the object is unchanged. Raises `StorageError`, also
+    after a pause of `TIMEOUT_S`.
     """
     with object_errors(where):
         parts = obstore.get(store, key).stream(min_chunk_size=PART_BYTES)
@@ -90,7 +87,7 @@ def _bytes_of(store: "ObjectStore", key: str, where: str) -> bytes:
 
 
 def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
-    """Return a whole object, compared with its name. DuckDB opens a file twice: some are kept."""
+    """Return a checked object. The last ones are cached, as DuckDB opens a file twice."""
     with _fetching:
         if where in _fetched:
             return _fetched[where]
@@ -104,15 +101,12 @@ def _fetch(store: "ObjectStore", key: str, where: str) -> bytes:
 
 
 _fetched: dict[str, bytes] = {}
-"""By URL: a data file never changes."""
+"""Contents by URL."""
 _fetching = threading.Lock()
 
 
 class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
-    """The objects of one bucket, which never change, for DuckDB.
-
-    fsspec makes text of all that one is made with.
-    """
+    """The objects of one bucket for DuckDB. fsspec converts the arguments to text."""
 
     cachable = False
 
@@ -129,14 +123,14 @@ class ObjectFilesystem(fsspec.AbstractFileSystem):  # type: ignore[misc]
         return datetime.fromtimestamp(0, UTC)
 
     def glob(self, path: str, **_options: Any) -> list[str]:
-        return [path]  # names of data files are no patterns
+        return [path]  # names of data files contain no patterns
 
     def exists(self, path: str, **_options: Any) -> bool:
-        return bool(path)  # that it is not there shows when it is read
+        return bool(path)  # reading fails for a missing file
 
     def open(self, path: str, mode: str = "rb", **_options: Any) -> io.BytesIO:
         if mode != "rb":
-            raise PermissionError(f"{path}: a warehouse is only read through SQL")
+            raise PermissionError(f"{path}: SQL only reads a warehouse")
         return io.BytesIO(_fetch(self._store, *self._key(path)))
 
     def _key(self, path: str) -> tuple[str, str]:
@@ -202,29 +196,29 @@ class ObjectFolder(Folder):
         return _bytes_of(self._store, self._key(path), f"{self}/{path}")
 
     def read_many(self, paths: Sequence[str]) -> list[bytes | None]:
-        """Return the content of files, None for one that is gone. Many are asked for at once."""
+        """Return the contents of files, read concurrently; None for a missing file."""
         with ThreadPoolExecutor(READS_AT_ONCE) as executor:
             return list(executor.map(self._read_or_none, paths))
 
     def open(self, path: str) -> pa.NativeFile:
-        """Open a file; raises `StorageError` if the answer is not what the name says."""
+        """Open a file. Raises `StorageError` if it does not match its checksum."""
         return pa.BufferReader(_fetch(self._store, self._key(path), f"{self}/{path}"))
 
     def put(self, path: str, content: Content) -> None:
         self._put(path, content, "overwrite")
 
     def create(self, path: str, content: Content) -> bool:
-        """Write a file, unless there is one; after a lost answer that is the one it has made."""
+        """Write a new file. After a lost response, an earlier attempt counts as existing."""
         return self._put(path, content, "create")
 
     def append(self, path: str, content: bytes) -> None:
-        """Add to a history: an object of its own, whose name goes on with the time."""
+        """Append to a history: write an object whose name contains the time."""
         self.put(f"{path}/{time.time_ns():020d}-{uuid.uuid4().hex[:8]}.jsonl", content)
 
     def remove(self, file: StoredFile) -> bool:
-        """Delete the very file that a listing found; False if it is gone or was replaced.
+        """Delete exactly the listed file; return False if it is gone or was replaced.
 
-        What is written between look and deletion would go: no name is used twice (`Table.put`).
+        A write between check and deletion would be lost, but no name is used twice (`Table.put`).
         """
         with object_errors(str(file)):
             try:
@@ -265,8 +259,8 @@ class ObjectFolder(Folder):
         return True
 
     def stored_file(self, meta: Any) -> StoredFile:
-        # Of one object some stores list milliseconds, or a tag without quotes, and tell seconds
-        # and quotes when they are asked for it alone.
+        # Some stores list milliseconds, or tags without quotes, but return seconds and quotes for
+        # a single object.
         return StoredFile(
             self,
             meta["path"].removeprefix(f"{self.prefix}/") if self.prefix else meta["path"],

@@ -1,4 +1,4 @@
-"""The history of runs: which commands changed a data root, and what came of it.
+"""The history of runs: the commands that changed a data root, and their outcomes.
 
     runs/2026-11.jsonl                        one line when a command starts, one when it ends
     runs/2026-11.jsonl/TIME-RANDOM.jsonl      such lines, on an object store
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 PROC = Path("/proc")
 START = 19
-"""Place of the start among the fields behind the name, proc(5): ticks since the machine booted."""
+"""Index of the start time after the name in /proc/PID/stat, proc(5): ticks since boot."""
 
 FOLDER = "runs"
 
@@ -43,7 +43,7 @@ _WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
 
 
 def process_began(number: int) -> str | None:
-    """Return a process's boot and start, whatever the clock, since numbers are reused; or None."""
+    """Return boot and start of a process, as numbers are reused; None if it does not exist."""
     try:
         boot = (PROC / "sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         status = (PROC / str(number) / "stat").read_bytes()
@@ -59,7 +59,7 @@ def write_line(record: Mapping[str, Any]) -> bytes:
 
 
 def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
-    """Return the lines that are what was written, and the numbers, from 1, of changed ones."""
+    """Return the intact lines, and the numbers of changed lines, from 1."""
     intact, changed = [], []
     for number, line in enumerate(content.split(b"\n"), 1):
         match = _WITH_CHECKSUM.fullmatch(line)
@@ -71,10 +71,10 @@ def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
 
 
 def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the files, from a month YYYY-MM on, that have changed lines, and which."""
+    """Yield files with changed lines, from a month YYYY-MM on, and a text on each line."""
     for path, content in _read_history(root, since):
         for number in read_lines(content)[1]:
-            yield f"{FOLDER}/{path}", f"line {number} is not what a run has written"
+            yield f"{FOLDER}/{path}", f"line {number} was changed or damaged"
 
 
 def _read_history(root: Folder, since: str = "") -> list[tuple[str, bytes]]:
@@ -113,9 +113,9 @@ def _checksum(body: bytes) -> bytes:
 
 LOGGER = logging.getLogger("fleet_slip")
 ARGUMENTS_MAX = 50
-"""So many arguments are kept; a glob may have given a hundred thousand."""
+"""Maximum number of recorded arguments; a glob can give a hundred thousand."""
 ERROR_MAX = 2000
-"""So many characters of a message are kept."""
+"""Maximum number of recorded characters of a message."""
 
 _PRIVATE_OPTION = re.compile(r"(?i)--?(?:[\w-]*(?:key|token|secret|passw)[\w-]*|vehicle|drive)")
 _NAMES = re.compile(r"(?i)\b(?:vehicle_id|drive_id|drive_name|source_file|trip_id)\b")
@@ -124,14 +124,14 @@ _DATA_FILE = re.compile(
     r"(?:\.\w+)?)"
 )
 _ADDRESS = re.compile(r"(--?[\w-]+=)?[^\s:/@=]+:\S*@([^\s@]+)")
-"""Of a user with a password, without a scheme."""
+"""A user with a password at a host, without a scheme."""
 
 _current: ContextVar["Run | None"] = ContextVar("run", default=None)
 
 
 @dataclass
 class MeasuredStep:
-    """One step of a run. Whoever does it fills in the figures while it lasts."""
+    """One step of a run; the code of the step sets `rows` and `size_bytes`."""
 
     name: str
     seconds: float = 0.0
@@ -158,7 +158,7 @@ class Run:
 
     @property
     def shown_arguments(self) -> list[str]:
-        """The command line without what the history must not keep."""
+        """The command line without private parts."""
         arguments = publishable(self.arguments)
         more = len(arguments) - ARGUMENTS_MAX
         return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
@@ -247,10 +247,10 @@ def recorded_step(root: Folder, name: str, arguments: Sequence[str]) -> Iterator
 
 
 def publishable(arguments: Sequence[str]) -> list[str]:
-    """Return command line arguments without what the history must not keep.
+    """Return command line arguments without private parts.
 
-    That is keys, tokens, secrets and passwords, users and queries of URLs, and what may name a
-    person's car, since the history outlives it: --vehicle, --drive, conditions on such columns,
+    Private are keys, tokens, secrets, passwords, users and queries of URLs. So is what may name a
+    person's car, as an erasure keeps the history: --vehicle, --drive, predicates on such columns,
     names of data files.
     """
     published: list[str] = []
@@ -275,7 +275,7 @@ def publishable(arguments: Sequence[str]) -> list[str]:
 
 
 def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
-    """Return a message with the arguments that are not shown replaced, wherever it quotes them."""
+    """Return a message in which hidden arguments are replaced."""
     for argument, instead in zip(arguments, shown, strict=True):
         if argument != instead:
             is_option = instead.endswith(f"={HIDDEN}")
@@ -315,7 +315,7 @@ KILLED = "killed"
 
 
 def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "") -> None:
-    """Make the table `runs` of a connection, since a month YYYY-MM; `warehouse/runs.sql` says how.
+    """Make the table `runs` of a connection, since a month YYYY-MM; see `warehouse/runs.sql`.
 
     Raises `StorageError` for a changed line.
     """
@@ -337,7 +337,7 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
 
 
 def runs_under_way(root: Folder) -> list[str]:
-    """Return other runs that have no end: live ones of this machine, those of others for a day."""
+    """Return other runs without an end: live ones of this machine, and of others for a day."""
     host = socket.gethostname()
     since = datetime.now(UTC) - timedelta(days=1)
     begun: dict[str, dict[str, Any]] = defaultdict(dict)

@@ -1,4 +1,4 @@
-"""DuckDB connections: how they are opened, what they may use, and how errors are translated."""
+"""DuckDB connections: opening, limits, errors, and checks of the SQL that users write."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ if TYPE_CHECKING:  # functions import it: it takes as long to start as all else 
     import duckdb
 
 SPILL_LIMIT = "20GB"
-"""Largest size of what one connection may write to disk for a query beyond its memory."""
+"""Maximum size of the files of one connection for queries that exceed the memory."""
 
 LOOK_S = 0.1
-"""How often a waiting query looks whether Ctrl-C was pressed."""
+"""Interval at which a waiting query checks for Ctrl-C."""
 
 STUCK_S = 0.7
-"""So long after a Ctrl-C a query may take to stop."""
+"""Time that a query may take to stop after Ctrl-C."""
 
 Result = TypeVar("Result")
 
 
 def sql_text(text: str | None) -> str:
-    """Return a text as SQL has it, in quotes; NULL for none."""
+    """Return a text as an SQL literal; NULL for None."""
     return "NULL" if text is None else "'" + text.replace("'", "''") + "'"
 
 
@@ -53,9 +53,8 @@ def open_database(
 ) -> duckdb.DuckDBPyConnection:
     """Open an in-memory database. Data stays in Parquet, so that no lock can block a reader.
 
-    It can read the files below the folder `reading`. It takes at most half of the memory that the
-    process may have. What a large query cannot hold in memory goes to disk if it may `spill`;
-    otherwise such a query fails.
+    It can read the files below the folder `reading`, and takes at most half of the memory of the
+    process. With `spill`, larger queries use the disk; otherwise they fail.
     """
     import duckdb
 
@@ -70,8 +69,7 @@ def open_database(
     if threads is not None:
         config["threads"] = threads
     database = duckdb.connect(":memory:", config=config)
-    # Where no script is running, in a notebook say, DuckDB prints a bar on stdout. In a notebook
-    # without ipywidgets it has none, and refuses the setting.
+    # In notebooks DuckDB prints a bar on stdout; without ipywidgets it refuses the setting.
     with contextlib.suppress(duckdb.InvalidInputException):
         database.execute("SET enable_progress_bar = false")
     if reading:
@@ -88,12 +86,12 @@ def _in_common() -> duckdb.DuckDBPyConnection:
 
 
 def open_scratch() -> duckdb.DuckDBPyConnection:
-    """Open a connection for what needs no file: at once, where a database takes 20 ms to make."""
+    """Open a connection that reads no files; a new database would take 20 ms."""
     return _in_common().cursor()
 
 
 def limit_memory() -> None:
-    """Let the process have three quarters of the memory: DuckDB bounds no single value."""
+    """Limit the process to three quarters of the memory: DuckDB limits no single value."""
     limit = max(memory_bytes() // 4 * 3, data_needed())
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     if hard == resource.RLIM_INFINITY or limit < hard:
@@ -101,12 +99,12 @@ def limit_memory() -> None:
 
 
 def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result]) -> Result:
-    """Do work with a connection so that Ctrl-C ends it, in the middle of an operator, too.
+    """Do work with a connection such that Ctrl-C ends it, also in the middle of an operator.
 
-    DuckDB asks whether to stop between tasks only, and a recursive query is one task. It forgets an
-    interruption that comes before the query begins, so it is interrupted again until the work ends.
-    It never stops in the middle of a function: then `QueryGoesOnError` is raised after `STUCK_S`,
-    while the work goes on, in a thread that the end of the process does not wait for.
+    DuckDB checks for interrupts between tasks only, and a recursive query is one task. It ignores
+    an interrupt before the query begins, so interrupts are repeated until the work ends. A function
+    is never interrupted: then `QueryGoesOnError` is raised after `STUCK_S`. Its thread does not
+    delay the end of the process.
     """
     answer: Future[Result] = Future()
     stopped = threading.Event()
@@ -122,7 +120,7 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
 
     threading.Thread(target=unless_stopped, daemon=True).start()
     try:
-        # Where a library has set a handler that restarts system calls, a signal ends no wait.
+        # A signal ends no wait if a library has set a handler that restarts system calls.
         while not wait([answer], LOOK_S).done:
             pass
     except KeyboardInterrupt:
@@ -139,10 +137,10 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
 
 
 _INTERRUPTED = "Query interrupted"
-"""What DuckDB's Python client says when it stopped at a Ctrl-C."""
+"""Message of DuckDB's Python client after Ctrl-C."""
 
 _DELETED = re.compile(r'"(.*)/\*\*/\*\.parquet"')
-"""How DuckDB names a file that was deleted after a view was made of it: as a folder."""
+"""DuckDB names a file that was deleted after its view was created as a folder."""
 
 _STREAMED_ERRORS = {
     "Conversion Error": "ConversionException",
@@ -158,7 +156,7 @@ _STREAMED_ERRORS = {
 
 @contextlib.contextmanager
 def _errors_of_streams() -> Iterator[None]:
-    """Raise DuckDB's exception again: pyarrow hides it if an answer is read batch by batch."""
+    """Raise DuckDB's exception again, which pyarrow hides if results are read by batch."""
     import duckdb
 
     try:
@@ -196,7 +194,7 @@ def database_errors(doing: str) -> Iterator[None]:
     except (duckdb.IOException, duckdb.InvalidInputException, duckdb.InternalException) as error:
         raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
     except duckdb.Error as error:
-        if type(error) is duckdb.Error:  # what its Parquet reader raises at damaged metadata
+        if type(error) is duckdb.Error:  # damaged Parquet metadata
             raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
         raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
@@ -205,10 +203,10 @@ def database_errors(doing: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def reading_files(database: duckdb.DuckDBPyConnection, doing: str) -> Iterator[None]:
-    """Turn DuckDB's errors into ours, and let nothing pass that came from a damaged file.
+    """Translate DuckDB's errors, and raise `StorageError` if a query opened a damaged file.
 
-    DuckDB's own log tells which files the queries of the connection have opened; each is compared
-    with the checksum in its name, whatever came of the query.
+    DuckDB's log lists the files that the queries of the connection opened. Each is compared with
+    the checksum in its name, also after a failed query.
     """
     try:
         with database_errors(doing):
@@ -220,8 +218,8 @@ def reading_files(database: duckdb.DuckDBPyConnection, doing: str) -> Iterator[N
 
 
 def check_opened_files(database: duckdb.DuckDBPyConnection) -> None:
-    """Raise `StorageError` if a file that a connection has opened is not what its name says."""
-    with database_errors("asking which files were read"):
+    """Raise `StorageError` if a file that a connection opened does not match its checksum."""
+    with database_errors("listing the opened files"):
         opened = database.execute(_OPENED_FILES).fetchall()
     check_local_files(path for (path,) in opened if "://" not in path)
 
@@ -247,19 +245,17 @@ def duckdb_message(error: BaseException) -> str:
 _RESTORE = "If a file is missing or damaged, restore it from a backup."
 
 
-# Which SQL may come from people: queries that only read, and predicates that last.
+# SQL of users: queries that only read.
 #
-# The type of a statement does not tell. DuckDB lets a SELECT begin with a common table expression
-# that copies rows to a file or changes a table, and has table functions that run SQL from a
-# string. So what the parser made of the text is searched, where neither comments nor quotes hide
-# anything. A predicate, which manifests keep, may moreover be made only of what means the same
-# everywhere, for ever.
+# The type of a statement is no proof. In DuckDB a common table expression of a SELECT can copy rows
+# to a file or change a table, and table functions can run SQL from a string. So the parsed tree is
+# searched, where neither comments nor quotes hide anything.
 
 LONGEST_QUERY = 100_000
 """Characters of one query. Planning takes more than linear time in some of them."""
 
 QUERY_NODES = frozenset({"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"})
-"""Parts of a statement that read. Others, such as COPY_QUERY_NODE, write."""
+"""Nodes of a statement that read. Others, such as COPY_QUERY_NODE, write."""
 
 
 def split_statements(database: duckdb.DuckDBPyConnection, text: str) -> list[str]:
@@ -368,7 +364,7 @@ Tree = Mapping[str, Any]
 
 
 def nodes_of(tree: Any) -> Iterator[Tree]:
-    """Yield the objects of a parsed text, each before those in it."""
+    """Yield the objects of a parsed text, parents first."""
     waiting = [tree]
     while waiting:
         value = waiting.pop()

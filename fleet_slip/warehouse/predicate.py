@@ -281,14 +281,14 @@ def _split_excluded(cohort: str) -> tuple[str, str]:
 
 
 def problems(tree: Tree, columns: frozenset[str]) -> Iterator[str]:
-    """Yield what is not allowed in an expression on some columns, as what a predicate does."""
+    """Yield the violations of an expression, as the end of a sentence on the predicate."""
     for node in nodes_of(tree):
         if problem := _problem(node, columns):
             yield problem
 
 
 def columns_of(tree: Tree) -> frozenset[str]:
-    """Return the columns that an expression without problems asks for."""
+    """Return the columns that a valid expression reads."""
     return frozenset(
         name.lower()
         for node in nodes_of(tree)

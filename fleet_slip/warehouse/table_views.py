@@ -20,13 +20,13 @@ from fleet_slip.warehouse.erasure_log import find_erased, without_erased
 from fleet_slip.warehouse.warehouse import Warehouse
 
 TABLE_VIEWS = ("log_counts", "log", "grams", "drives", "quarantine")
-"""In the order of their dependence; each is a file in `warehouse/`."""
+"""Views in the order of their dependence; each is a file in `warehouse/`."""
 
 _VIEWS_ON_VIEWS = {"log": {"log_counts"}, "drives": {"log_counts", "grams"}}
 _STORED_IN = {"log_counts": "logs", "grams": "grams", "quarantine": "quarantine"}
 
 SNAPSHOTS = 100
-"""So often two tables are looked at again that change while they are looked at."""
+"""Attempts to read two tables at one moment while others change them."""
 
 
 def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnection:
@@ -42,19 +42,18 @@ def connect_tables(warehouse: Warehouse, query: str) -> duckdb.DuckDBPyConnectio
 def views_in(query: str, views: Iterable[str] = TABLE_VIEWS) -> frozenset[str]:
     """Return the views that a query may need: those whose name occurs in it as a word.
 
-    And what these are made of. DuckDB's own `get_table_names` is no help here: it binds the query,
-    so that JOIN USING, UNPIVOT, COLUMNS and parameters are errors before the views are there. A
-    word too many only opens a view too many.
+    Includes the views that these are made of. DuckDB's `get_table_names` binds the query, so that
+    JOIN USING, UNPIVOT, COLUMNS and parameters are errors without the views.
     """
     named = {name for name in views if re.search(rf"\b{name}\b", query, re.I)}
     return frozenset(named.union(*(_VIEWS_ON_VIEWS.get(name, ()) for name in named)))
 
 
 def table_snapshots(warehouse: Warehouse, views: Iterable[str]) -> list[Snapshot]:
-    """Return snapshots of the tables that some views stand on."""
+    """Return snapshots of the tables that some views read."""
     stored = {_STORED_IN[name] for name in views if name in _STORED_IN}
     snapshots = [warehouse.quarantine.snapshot()] if "quarantine" in stored else []
-    if "grams" in stored:  # the log files tell which Gram rows count
+    if "grams" in stored:  # Gram rows count while their log file is active
         return [*snapshots, *gram_snapshots(warehouse)]
     return [*snapshots, warehouse.logs.snapshot()] if "logs" in stored else snapshots
 
@@ -62,10 +61,10 @@ def table_snapshots(warehouse: Warehouse, views: Iterable[str]) -> list[Snapshot
 def gram_snapshots(
     warehouse: Warehouse, grams: Snapshot | None = None, logs: Snapshot | None = None
 ) -> tuple[Snapshot, Snapshot]:
-    """Return the newest `grams` and `logs` that stood beside each other at one moment.
+    """Return the newest `grams` and `logs` of the same moment.
 
-    Earlier snapshots of them are the result if nobody has committed since. Raises `ConflictError`
-    if the Gram rows change faster than they are looked at.
+    Returns the given snapshots if nobody committed since. Raises `ConflictError` if the Gram rows
+    change faster than they can be read.
     """
     grams = grams.refresh() if grams else warehouse.grams.snapshot()
     for _ in range(SNAPSHOTS):
@@ -98,7 +97,7 @@ def open_tables(
     threads: int | None = None,
     drives: str = ALL_DRIVES,
 ) -> duckdb.DuckDBPyConnection:
-    """Return a connection, to be locked yet, with some views on snapshots of their tables.
+    """Return an unlocked connection with some views on snapshots of their tables.
 
     Logs and Gram rows are those of `drives`, an SQL predicate. No view has rows of
     erased cars and drives, even if the tables have them again.
@@ -129,7 +128,7 @@ def open_tables(
 
 
 def lock(database: duckdb.DuckDBPyConnection, paths: Sequence[str]) -> None:
-    """Let a connection open some files and no others, and its settings not be changed."""
+    """Restrict a connection to some files, and lock its settings."""
     database.execute("SET python_enable_replacements = false")
     database.execute("SET allowed_paths = $paths", {"paths": list(paths)})
     database.execute("SET enable_external_access = false")
@@ -144,7 +143,7 @@ def add_table(database: duckdb.DuckDBPyConnection, name: str, rows: pa.Table) ->
 
 
 def _source(database: duckdb.DuckDBPyConnection, snapshot: Snapshot, signals: SignalCatalog) -> str:
-    """Return what stands after FROM for a stored table, empty ones included."""
+    """Return the SQL after FROM for a stored table, also for an empty one."""
     variable = f"{snapshot.table.folder.name.removesuffix('s')}_files"
     database.execute(f"SET VARIABLE {variable} = $paths", {"paths": snapshot.paths})
     if snapshot.paths:
@@ -175,7 +174,7 @@ def _generated_columns(signals: SignalCatalog) -> Mapping[str, Any]:
     }
 
 
-# What every column of every view means, as a table.
+# Descriptions of the columns of all views, as a table.
 
 COMMON = "common"
 """Section of `warehouse/columns.toml` for columns of several views."""

@@ -266,7 +266,7 @@ def _unpickle(root: Folder, configs: Configs, catalog: Catalog) -> Warehouse:
 
 
 ROOT_VARIABLE, CONFIG_VARIABLE = "FLEET_SLIP_ROOT", "FLEET_SLIP_CONFIG"
-"""Environment variables that stand for `root` and `config` of `open_warehouse`."""
+"""Environment variables with the defaults of `root` and `config` of `open_warehouse`."""
 
 
 def open_warehouse(
