@@ -463,7 +463,7 @@ class Manifest(Config):
             "on board": on_board,
             "cross-validation": f"{pluralize(figures.folds, 'fold')} by {figures.folds_by}",
             "cohort": (
-                f"{describe_cohort(trained.cohort)}: {drives}, {pluralize(trained.rows, 'row')}"
+                f"{drives}, {pluralize(trained.rows, 'row')}{describe_cohort(trained.cohort)}"
             ),
             "tables": f"logs version {trained.logs_version}, grams {trained.grams_version}",
             "selected": f"model {self.selected_by.model} of {self.selected_by.model_list}",

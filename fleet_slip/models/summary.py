@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.grams.cohort import remark_left_out
 from fleet_slip.grams.folding import BANDS, PARTS
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
@@ -126,11 +125,12 @@ def group_skipped(skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 
 def _shortened(predicate: str, everything: bool, hint: str) -> str:
-    """Return a predicate, of a long one its beginning."""
-    predicate = predicate if everything else describe_cohort(predicate)
-    long = not everything and len(predicate) > CONDITION_WIDTH
-    beginning = predicate[:CONDITION_WIDTH].rstrip()
-    return f"{beginning} …{hint and f' ({hint})'}" if long else predicate
+    """Return a cohort for display, of a long one its beginning."""
+    text = describe_cohort(predicate)
+    if everything:
+        return text and f" where {predicate}"
+    beginning = text[:CONDITION_WIDTH].rstrip()
+    return f"{beginning} …{hint and f' ({hint})'}" if len(text) > CONDITION_WIDTH else text
 
 
 def _models(selection: "Selection", everything: bool, hint: str) -> TextTable:
@@ -146,7 +146,7 @@ def _models(selection: "Selection", everything: bool, hint: str) -> TextTable:
     names = {selection.winner.model.name, *(model.name for model in best)}
     shown = models if everything else [model for model in models if model.name in names]
     title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
-    title += "" if where == TRAINING_DRIVES else f" where {_shortened(where, everything, hint)}"
+    title += _shortened(where, everything, hint)
     title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.folds.by}"
     title += "" if selection.intercept else "; no intercept"
     title += "" if len(shown) == len(models) else f"; {len(shown)} of {len(models)} models"

@@ -265,8 +265,19 @@ def with_all_drives(cohort: str) -> str:
 
 
 def describe_cohort(cohort: str) -> str:
-    """Return a predicate for display, with the number of excluded drives, not their hashes."""
-    return "".join(_split_excluded(cohort))
+    """Return a cohort for display after a number of drives: ` of NAME`, ` where PREDICATE`.
+
+    Contains the number of excluded drives, not their hashes.
+    """
+    predicate, excluded = _split_excluded(cohort)
+    if predicate == TRAINING_DRIVES:
+        return excluded
+    campaign = _CAMPAIGN.fullmatch(predicate)
+    return (f" of {campaign[1]}" if campaign else f" where {predicate}") + excluded
+
+
+_CAMPAIGN = re.compile(r"campaign = '([^']*)'")
+"""Matches the cohort of a pipeline: the drives of one campaign or mapping."""
 
 
 def _split_excluded(cohort: str) -> tuple[str, str]:

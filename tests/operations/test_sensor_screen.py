@@ -197,9 +197,10 @@ def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     twice = without_drives(once, "fleet", [hash_drive("fleet", "b")])
     assert once != asked != twice
     assert with_all_drives(twice) == with_all_drives(once) == with_all_drives(asked) == asked
-    assert describe_cohort(once) == f"{asked}, without 1 faulty drive"
+    assert describe_cohort(once) == f" where {asked}, without 1 faulty drive"
     assert Predicate(twice, "").quoted == f"{asked!r}, without 2 faulty drives"
-    assert describe_cohort(asked) == asked
+    assert describe_cohort(asked) == f" where {asked}"
+    assert describe_cohort("campaign = 'golf'") == " of golf"
 
 
 def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
