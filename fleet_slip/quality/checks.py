@@ -77,6 +77,8 @@ class Check:
         What to change.
     source
         Where the threshold is from, if not from here.
+    remedy_of_velocities
+        What to change if the label is computed from velocities, where that differs.
     """
 
     kind: str
@@ -88,6 +90,7 @@ class Check:
     high: float = inf
     unit: str = ""
     source: str = ""
+    remedy_of_velocities: str = ""
 
     def passes(self, value: float) -> bool:
         """Return True for a value of sound data."""

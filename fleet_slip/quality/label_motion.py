@@ -4,8 +4,9 @@ No other drive is needed, so that a fault of all drives shows.
 """
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -31,6 +32,10 @@ WHEELBASE_M, MAX_WHEELBASE_SHARE = (2.0, 4.5), 0.75
 MAX_COMPLIANCE = 0.012
 """Side-slip of the rear axle in rad per m/s²: twice that of a usual car."""
 
+Contradiction: TypeAlias = tuple[str, Mapping[str, float]]
+"""Name of a check that the label fails, and its figures."""
+NONE: Contradiction = ("", {})
+
 
 def check_label(
     label: str,
@@ -39,33 +44,39 @@ def check_label(
     moving: BoolArray,
     *,
     from_velocities: bool,
-) -> Iterator[Fault]:
-    """Yield the first fault of a label that the motion of its car shows."""
+) -> list[Fault]:
+    """Return the first fault of a label that the motion of its car shows."""
     if not {label, "yaw_rate"} <= set(signals):
-        return
+        return []
+    name, figures = _contradiction(label, signals, speed, moving)
+    if not name:
+        return []
+    check = CHECKS[name]
+    if from_velocities:
+        check = replace(check, remedy=check.remedy_of_velocities or check.remedy)
+    return [check.fault(label, **figures)]
+
+
+def _contradiction(
+    label: str, signals: Signals, speed: FloatArray | None, moving: BoolArray
+) -> Contradiction:
     angle = np.where(moving, signals[label], np.nan)
     curvature = signals["yaw_rate"]
     if speed is not None:
         large = np.abs(angle[(speed > FAST_MPS) & np.isfinite(angle)])
         median_deg = float(np.degrees(np.median(large))) if large.size >= MIN_TICKS else 0.0
         if median_deg > CHECKS["size of the label"].high:
-            yield CHECKS["size of the label"].fault(label, median_deg=median_deg)
-            return
+            return "size of the label", {"median_deg": median_deg}
         with np.errstate(divide="ignore", invalid="ignore"):
             curvature = curvature / speed
     inputs = np.array([curvature, *([signals["ay"]] if "ay" in signals else [])])
-    rows = moving & np.isfinite(inputs).all(axis=0)
-    delay = estimate_delay(angle, inputs, rows)
+    delay = estimate_delay(angle, inputs, moving & np.isfinite(inputs).all(axis=0))
     if delay is not None and delay.exceeds(CHECKS["delay of the label"].high):
-        delayed = "the delay_s of vx and vy" if from_velocities else "its delay_s"
-        yield CHECKS["delay of the label"].fault(
-            label, delay_s=delay.value_s, error_s=delay.error_s, delayed=delayed
-        )
-    elif speed is not None and len(inputs) == 2:
+        return "delay of the label", {"delay_s": delay.value_s, "error_s": delay.error_s}
+    if speed is not None and len(inputs) == 2:
         sliding = large.size >= MIN_TICKS and float(np.quantile(large, 0.9)) > SLIDING_RAD
-        yield from _lever(
-            label, signals, speed, moving, sliding=sliding, from_velocities=from_velocities
-        )
+        return _lever(signals[label], signals, speed, moving, sliding=sliding)
+    return NONE
 
 
 def is_yaw_rate_reversed(label: str, signals: Signals, moving: BoolArray) -> bool | None:
@@ -110,43 +121,33 @@ def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
 
 
 def _lever(
-    label: str,
-    signals: Signals,
-    speed: FloatArray,
-    moving: BoolArray,
-    *,
-    sliding: bool,
-    from_velocities: bool,
-) -> Iterator[Fault]:
+    angle: FloatArray, signals: Signals, speed: FloatArray, moving: BoolArray, *, sliding: bool
+) -> Contradiction:
     """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
-    lever_m, zero, explained = _fit_lever(signals[label], signals, speed, moving)
-    check = CHECKS["scale of the label"]
+    lever_m, zero, explained = _fit_lever(angle, signals, speed, moving)
+    check, sign = CHECKS["scale of the label"], CHECKS["sign of the label"]
     low, high = check.low, check.high
     if explained:
         high = min(high, MAX_WHEELBASE_SHARE * _wheelbase_m(signals, speed, moving))
-        is_reversed = explained > MIN_EXPLAINED and lever_m < CHECKS["sign of the label"].low
+        is_reversed = explained > MIN_EXPLAINED and lever_m < sign.low
         is_large = explained > MIN_EXPLAINED and lever_m > SLIDING_M and sliding
         is_scaled = explained > MIN_SURE_EXPLAINED and not low < lever_m < high
     else:
-        lever_m, mean_square, explained = _fit_one_speed(signals[label], signals, speed, moving)
+        lever_m, mean_square, explained = _fit_one_speed(angle, signals, speed, moving)
         low -= MAX_COMPLIANCE * mean_square
-        limit_m = min(low, 0) + CHECKS["sign of the label"].low
-        is_reversed = explained > MIN_SURE_EXPLAINED and lever_m < limit_m
-        is_large = explained > MIN_SURE_EXPLAINED and lever_m > SLIDING_M
-        is_scaled = explained > MIN_SURE_EXPLAINED and 0 < lever_m < low
-    bounds: dict[str, Any] = {"lever_m": lever_m, "low": low, "high": high}
+        is_sure = explained > MIN_SURE_EXPLAINED
+        is_reversed = is_sure and lever_m < min(low, 0) + sign.low
+        is_large = is_sure and lever_m > SLIDING_M
+        is_scaled = is_sure and 0 < lever_m < low
+    bounds = {"lever_m": lever_m, "low": low, "high": high}
     if is_reversed:
-        negate = "Negate vy, or both ay and yaw_rate."
-        negate = negate if from_velocities else "Write negate = true."
-        yield CHECKS["sign of the label"].fault(label, negate=negate, **bounds)
-    elif is_large or is_scaled:
-        units = "its unit, degrees or radians, its factor"
-        units = "the units of vx and vy" if from_velocities else units
-        yield CHECKS["scale of the label"].fault(label, units=units, **bounds)
-    elif explained > MIN_SURE_EXPLAINED and not CHECKS["zero of the label"].passes(
-        zero_deg := math.degrees(zero)
-    ):
-        yield CHECKS["zero of the label"].fault(label, zero_deg=zero_deg, offset_rad=-zero)
+        return "sign of the label", bounds
+    if is_large or is_scaled:
+        return "scale of the label", bounds
+    zero_deg = math.degrees(zero)
+    if explained > MIN_SURE_EXPLAINED and not CHECKS["zero of the label"].passes(zero_deg):
+        return "zero of the label", {"zero_deg": zero_deg, "offset_rad": -zero}
+    return NONE
 
 
 def _wheelbase_m(signals: Signals, speed: FloatArray, moving: BoolArray) -> float:

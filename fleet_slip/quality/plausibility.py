@@ -69,9 +69,7 @@ def check_plausibility(
         faults += _sizes(_without(sound, faults), speed, moving)
         faults += _axles(_without(sound, faults), speed, moving)
     remaining = _without(sound, faults)
-    label = list(
-        check_label(catalog.label, remaining, speed, moving, from_velocities=from_velocities)
-    )
+    label = check_label(catalog.label, remaining, speed, moving, from_velocities=from_velocities)
     if one_sided and catalog.label in one_sided[-1].signals:
         # A biased label is on one side, too.
         label = label if any(fault.kind == "biased" for fault in label) else one_sided[-1:]
