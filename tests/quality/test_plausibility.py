@@ -175,6 +175,19 @@ def test_one_speed_in_place_of_four_at_different_delays_is_no_swap() -> None:
     assert "swapped" not in {kind for kind, _ in kinds(car)}
 
 
+def test_a_spin_swaps_no_axles() -> None:
+    """One speed in place of four, later at the rear, of a car that brakes as it spins."""
+    time_s = np.arange(6000) / 100
+    share = (time_s % 15) / 3
+    spins = share < 1
+    speed = np.where(spins, 13 - 9 * share, 4 + 9 * np.clip((share - 1) / 4, 0, 1))
+    yaw_rate = np.where(spins, 0.1 + 1.2 * share, 0.1 * np.sin(time_s))
+    car = {"yaw_rate": yaw_rate, "ay": yaw_rate * speed}
+    late = np.concatenate([np.full(10, speed[0]), speed[:-10]])
+    car |= {name: (late if name in REAR else speed) / RADIUS_M for name in WHEELS}
+    assert kinds(car) == set()
+
+
 def test_a_dry_run_shows_and_stores_nothing(tmp_path: Path) -> None:
     car = {name: values for name, values in a_car().items() if name in {"ay", "yaw_rate"}}
     file, mapping = write_car(tmp_path, car)
