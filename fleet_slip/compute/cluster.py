@@ -185,9 +185,11 @@ class ClusterExecutor(Executor):
         future: Future[Any] = Future()
         self._futures.add(future)
         with contextlib.suppress(ClosedClientError):  # the watcher fails it
-            theirs = self._dask.submit(work, environment(), task)
-            theirs.add_done_callback(partial(self._settle, future))
-            future.add_done_callback(lambda ours: ours.cancelled() and theirs.cancel())
+            remote_future = self._dask.submit(work, environment(), task)
+            remote_future.add_done_callback(partial(self._settle, future))
+            future.add_done_callback(
+                lambda local_future: local_future.cancelled() and remote_future.cancel()
+            )
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
@@ -197,19 +199,19 @@ class ClusterExecutor(Executor):
         for future in list(self._futures):
             future.cancel()
 
-    def _settle(self, future: Future[Any], theirs: Future[Any]) -> None:
-        if theirs.cancelled():  # with its connection; or by us
+    def _settle(self, future: Future[Any], remote_future: Future[Any]) -> None:
+        if remote_future.cancelled():  # with its connection; or by us
             self._fail(future, "the connection to the Dask scheduler was lost")
             return
         self._futures.discard(future)
-        error = theirs.exception()
+        error = remote_future.exception()
         if isinstance(error, KilledWorker):
             error = LostTaskError(str(error))
         with contextlib.suppress(InvalidStateError):  # it was given up
             if error is not None:
                 future.set_exception(error)
             else:
-                future.set_result(theirs.result())
+                future.set_result(remote_future.result())
 
     def _watch(self) -> None:
         while not self._closing.wait(POLL_S):

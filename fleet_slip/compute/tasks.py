@@ -87,16 +87,16 @@ def _completed(
     limit: Callable[[], int],
     lost: list[Item],
 ) -> Iterator[tuple[Item, Result]]:
-    waiting = iter(items)
-    running: dict[Future[Result], Item] = {}
+    pending = iter(items)
+    futures: dict[Future[Result], Item] = {}
     try:
         while True:
-            for item in islice(waiting, max(0, limit() - len(running))):
-                running[executor.submit(function, item)] = item
-            if not running:
+            for item in islice(pending, max(0, limit() - len(futures))):
+                futures[executor.submit(function, item)] = item
+            if not futures:
                 return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                item = running.pop(future)
+            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+                item = futures.pop(future)
                 try:
                     result = future.result()
                 except LostTaskError:
@@ -104,7 +104,7 @@ def _completed(
                 else:
                     yield item, result
     finally:
-        for future in running:
+        for future in futures:
             future.cancel()
 
 
@@ -114,13 +114,13 @@ def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
     Closing the generator waits for the item being read.
     """
     with ThreadPoolExecutor(1, thread_name_prefix="read-ahead") as thread:
-        taken = deque(thread.submit(_take, items) for _ in range(AHEAD))
+        futures = deque(thread.submit(_take, items) for _ in range(AHEAD))
         try:
-            while item := taken.popleft().result():
-                taken.append(thread.submit(_take, items))
+            while item := futures.popleft().result():
+                futures.append(thread.submit(_take, items))
                 yield from item
         finally:
-            for future in taken:
+            for future in futures:
                 future.cancel()
 
 

@@ -256,8 +256,8 @@ def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: To
     ratio, groups = math.fsum(differences) / sum(rows), len(rows)
     square = math.fsum((d - ratio * n) ** 2 for d, n in zip(differences, rows, strict=True))
     error = math.sqrt(square * groups / (groups - 1)) / sum(rows)
-    both = model.pooled.rmse + other.pooled.rmse
-    return _gap(model, other, tolerance, error / both if both else 0.0)
+    rmse_sum = model.pooled.rmse + other.pooled.rmse
+    return _gap(model, other, tolerance, error / rmse_sum if rmse_sum else 0.0)
 
 
 def nested_fits(
@@ -477,5 +477,5 @@ def cross_validate_selection(
 def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
     if len(training.folds.grams) < MIN_FOLDS:
         raise QuestionError("choosing inside the training folds needs at least three folds.")
-    remaining = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return replace(training, folds=remaining, drives=training.drives.take(fold != number))
+    remaining_folds = training.folds.without(number, int(np.count_nonzero(fold != number)))
+    return replace(training, folds=remaining_folds, drives=training.drives.take(fold != number))

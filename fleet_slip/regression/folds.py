@@ -171,10 +171,10 @@ class CohortFolds:
             tuple(table.totals(fold, len(assignment.names)))
             for table, fold in zip(tables, parts, strict=True)
         )
-        of_table = np.split(numbers, stops)
+        drives_of_table = np.split(numbers, stops)
 
         def count_drives(chosen: Sequence[int]) -> int:
-            rows_of_drive = np.bincount(np.concatenate([of_table[i] for i in chosen]))
+            rows_of_drive = np.bincount(np.concatenate([drives_of_table[i] for i in chosen]))
             return int(np.count_nonzero(rows_of_drive))
 
         return cls(assignment.names, grams, count_drives)
@@ -199,13 +199,13 @@ class CohortFolds:
         Raises `DataError` if a fold, or all but one, has no such row.
         """
         signals = (*inputs, label)
-        served = self.tables_with(signals)
-        if not served:
+        complete = self.tables_with(signals)
+        if not complete:
             available = sorted({name for grams in self.tables for name in grams[0].signals})
             require_signals(available, signals)
             raise missing_signals_error(signals)
         folds = tuple(
-            sum((self.tables[i][f].restrict(signals) for i in served), Gram.zero(signals))
+            sum((self.tables[i][f].restrict(signals) for i in complete), Gram.zero(signals))
             for f in range(len(self.names))
         )
         empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
@@ -222,7 +222,7 @@ class CohortFolds:
             gram.restrict(signals) for gram in self.auxiliary if set(signals) <= set(gram.signals)
         ]
         auxiliary = sum(matching[1:], matching[0]) if matching else None
-        return Folds(folds, names, self.count_drives(served), auxiliary, self.weight)
+        return Folds(folds, names, self.count_drives(complete), auxiliary, self.weight)
 
 
 # Accuracy of predictions from exact sums of predictions and labels.
@@ -423,8 +423,8 @@ class CrossValidation(Record):
     @property
     def named_folds(self) -> list[dict[str, Any]]:
         """The figures of each fold with its name, for a JSON document."""
-        both = zip(self.fold_names, self.folds, strict=True)
-        return [{"fold": name, **figures.as_dict()} for name, figures in both]
+        pairs = zip(self.fold_names, self.folds, strict=True)
+        return [{"fold": name, **figures.as_dict()} for name, figures in pairs]
 
 
 def error_of_mean(values: Sequence[float]) -> float:

@@ -140,12 +140,12 @@ class Gram:
 
     def restrict(self, signals: Sequence[str]) -> "Gram":
         """Return the Gram of some signals, in this order. Raises `DataError` if one is missing."""
-        at = positions(self.signals, signals)
+        index = positions(self.signals, signals)
         return Gram(
             tuple(signals),
             self.n,
-            tuple(self.sums[i] for i in at),
-            tuple(self.products[p] for p in packed_positions(tuple(at))),
+            tuple(self.sums[i] for i in index),
+            tuple(self.products[p] for p in packed_positions(tuple(index))),
         )
 
     def about_origin(self) -> "Gram":
@@ -259,10 +259,10 @@ def positions(signals: Sequence[str], required: Sequence[str]) -> list[int]:
 
 
 @cache
-def packed_positions(at: tuple[int, ...]) -> tuple[int, ...]:
+def packed_positions(index: tuple[int, ...]) -> tuple[int, ...]:
     """Return the positions of the products of some signals, in the order of a packed triangle."""
-    places = np.array(at, dtype=np.int64)
-    row, column = np.tril_indices(len(at))
+    places = np.array(index, dtype=np.int64)
+    row, column = np.tril_indices(len(index))
     larger = np.maximum(places[row], places[column])
     packed = packed_size(larger) + np.minimum(places[row], places[column])
     return tuple(packed.tolist())
@@ -371,9 +371,9 @@ class GramTable:
 
     def restrict(self, signals: Sequence[str]) -> "GramTable":
         """Return the drives with some of the signals. Raises `DataError` if one is missing."""
-        at = positions(self.signals, signals)
-        packed = list(packed_positions(tuple(at)))
-        return GramTable(tuple(signals), self.n, self.sums[:, at], self.products[:, packed])
+        index = positions(self.signals, signals)
+        packed = list(packed_positions(tuple(index)))
+        return GramTable(tuple(signals), self.n, self.sums[:, index], self.products[:, packed])
 
     def about(self, origin: Sequence[int]) -> "GramTable":
         """Return the table of the counts minus an integer origin, exactly.
@@ -412,8 +412,8 @@ def exact_sum(values: IntArray) -> list[int]:
     if values.dtype != object:
         approximate = values.sum(axis=0, dtype=np.float64)
         turns = np.rint((approximate - wrapped.astype(np.float64)) / _MODULUS)
-        for at in np.flatnonzero(turns).tolist():
-            totals[at] += int(turns[at]) * _MODULUS
+        for index in np.flatnonzero(turns).tolist():
+            totals[index] += int(turns[index]) * _MODULUS
     return totals
 
 
@@ -446,11 +446,15 @@ def complete_cases(
     DataError
         If there are none.
     """
-    served = [set(signals) <= set(table.signals) for table in tables]
-    if not any(served):
+    is_complete = [set(signals) <= set(table.signals) for table in tables]
+    if not any(is_complete):
         raise missing_signals_error(signals)
-    parts = [table.restrict(signals) for table, yes in zip(tables, served, strict=True) if yes]
-    mask = np.repeat(served, [len(table) for table in tables])
+    parts = [
+        table.restrict(signals)
+        for table, complete in zip(tables, is_complete, strict=True)
+        if complete
+    ]
+    mask = np.repeat(is_complete, [len(table) for table in tables])
     if len(parts) == 1:
         return parts[0], mask
     stacked = GramTable(

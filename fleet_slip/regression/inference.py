@@ -364,7 +364,7 @@ def _inference(
     names = [INTERCEPT] if fitted.has_intercept else []
     values = [model.offset] if fitted.has_intercept else []
     estimates = []
-    for name, value, error, of_t in zip(
+    for name, value, error, degrees_of_t in zip(
         [*names, *model.signals],
         [*values, *model.weights.values()],
         errors,
@@ -372,8 +372,8 @@ def _inference(
         strict=True,
     ):
         t = value / error if error else math.copysign(math.inf, value)
-        p = student_t_two_sided(t, of_t)
-        estimates.append(Estimate(name, value, error, t, p, of_t))
+        p = student_t_two_sided(t, degrees_of_t)
+        estimates.append(Estimate(name, value, error, t, p, degrees_of_t))
     residual_std = exact.sqrt(sigma2 * scales[fitted.model.label] ** 2)
     return Inference(tuple(estimates), residual_std, degrees)
 
@@ -602,18 +602,22 @@ def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
     log_between = _root(slope, math.log(float(variances.min())) - 16, high)
     information = (slope(log_between - _STEP) - slope(log_between + _STEP)) / (2 * _STEP)
     weights = 1 / (variances + math.exp(log_between))
-    mean, drawn = _mean(values, weights), variances * weights
+    mean, shrinkage = _mean(values, weights), variances * weights
     mean_variance = 1 / float(weights.sum())
-    binomial = drawn * (1 - drawn)
-    of_drawn = binomial**2 / (information + binomial)
-    squares = variances * (1 - drawn) + drawn**2 * mean_variance + of_drawn * (values - mean) ** 2
+    binomial = shrinkage * (1 - shrinkage)
+    shrinkage_variance = binomial**2 / (information + binomial)
+    squares = (
+        variances * (1 - shrinkage)
+        + shrinkage**2 * mean_variance
+        + shrinkage_variance * (values - mean) ** 2
+    )
     spread = math.exp(log_between / 2)
     return Pooled(
         mean=mean,
         mean_error=math.sqrt(mean_variance),
         spread=spread,
         spread_error=spread / (2 * math.sqrt(information)),
-        values=values + drawn * (mean - values),
+        values=values + shrinkage * (mean - values),
         errors=np.sqrt(squares),
     )
 

@@ -335,7 +335,7 @@ class Relation:
     def least_squares(
         cls,
         response: str,
-        by: tuple[str, ...],
+        regressors: tuple[str, ...],
         noise: Mapping[tuple[int, int], Product] = MappingProxyType({}),
     ) -> "Relation":
         """Return the relation of a term to others, which are the instruments.
@@ -352,8 +352,8 @@ class Relation:
         -------
         Relation
         """
-        products = tuple(tuple((a, b) for b in by) for a in by)
-        return cls(by, products, tuple((response, a) for a in by), noise)
+        products = tuple(tuple((a, b) for b in regressors) for a in regressors)
+        return cls(regressors, products, tuple((response, a) for a in regressors), noise)
 
     def system(
         self, sums: Callable[[str, str], Any], variance: Fraction | float
@@ -373,8 +373,8 @@ class Relation:
             A row for each equation, with its right-hand side last.
         """
         rows = [
-            [sums(a, b) for a, b in (*row, of_y)]
-            for row, of_y in zip(self.products, self.response_products, strict=True)
+            [sums(a, b) for a, b in (*row, response_product)]
+            for row, response_product in zip(self.products, self.response_products, strict=True)
         ]
         for (row, column), (a, b) in self.noise.items():
             rows[row][column] = rows[row][column] - variance * sums(a, b)

@@ -220,20 +220,20 @@ class _Search:
         if self._far_from_dependent():
             return list(range(self.inputs))
         work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
-        buffer, taken = np.empty_like(work), list[int]()
-        remaining = np.ones(self.inputs, dtype=np.bool_)
-        while remaining.any():
-            best = int(np.argmax(np.where(remaining, work.diagonal(), -1)))
+        buffer, independent = np.empty_like(work), list[int]()
+        is_remaining = np.ones(self.inputs, dtype=np.bool_)
+        while is_remaining.any():
+            best = int(np.argmax(np.where(is_remaining, work.diagonal(), -1)))
             if work[best, best] < DEPENDENT:
                 break
             np.multiply.outer(work[:, best], work[best] / work[best, best], out=buffer)
             work -= buffer
-            taken.append(int(names[best]))
-            remaining[best] = False
-            if 8 * remaining.sum() < 7 * len(remaining):  # drop the inputs that were taken
-                work, names = work[np.ix_(remaining, remaining)], names[remaining]
-                buffer, remaining = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
-        return sorted(taken)
+            independent.append(int(names[best]))
+            is_remaining[best] = False
+            if 8 * is_remaining.sum() < 7 * len(is_remaining):  # drop the inputs that were taken
+                work, names = work[np.ix_(is_remaining, is_remaining)], names[is_remaining]
+                buffer, is_remaining = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
+        return sorted(independent)
 
     def _far_from_dependent(self) -> bool:
         """Return True if no combination of inputs has twice as little variance as `DEPENDENT`.

@@ -103,8 +103,8 @@ class DocumentFolder:
         accepted = _numbers_in(anchors, "lost")
         present = _numbers_in(self.folder.names(), "json")
         newest = max(present | accepted | _numbers_in(anchors, "sha256"), default=0)
-        absent = (n for n in range(1, newest + 1) if n not in present and n not in accepted)
-        suspects = list(islice(absent, MAX_LOST))
+        absent_numbers = (n for n in range(1, newest + 1) if n not in present and n not in accepted)
+        suspects = list(islice(absent_numbers, MAX_LOST))
         # A listing may miss a document that was written meanwhile.
         contents = self.folder.read_many(list(map(document_file, suspects))) if suspects else []
         lost = [n for n, text in zip(suspects, contents, strict=True) if text is None]

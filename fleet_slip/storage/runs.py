@@ -208,7 +208,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
     begun = time.monotonic()
     token = _current.set(run)
-    recorded = _exists(root) and _append(root, file, run.beginning())
+    is_recorded = _exists(root) and _append(root, file, run.beginning())
     error: BaseException | None = None
     try:
         yield run
@@ -217,7 +217,9 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         raise
     finally:
         end = run.end(error, time.monotonic() - begun)
-        if _exists(root) and not _append(root, file, *([] if recorded else [run.beginning()]), end):
+        if _exists(root) and not _append(
+            root, file, *([] if is_recorded else [run.beginning()]), end
+        ):
             LOGGER.warning(
                 "%s: the run history cannot be written; this run is missing in it.", root
             )
@@ -253,7 +255,7 @@ def publishable(arguments: Sequence[str]) -> list[str]:
     person's car, as an erasure keeps the history: --vehicle, --drive, predicates on such columns,
     names of data files.
     """
-    published: list[str] = []
+    public: list[str] = []
     hide_next = False
     for argument in arguments:
         text = hide_passwords(argument.encode(errors="replace").decode(), to_end=True)
@@ -270,8 +272,8 @@ def publishable(arguments: Sequence[str]) -> list[str]:
         elif data_file := _DATA_FILE.fullmatch(text):
             text = f"{HIDDEN}{data_file[1]}"
         hide_next = private and not equals and not hide_next
-        published.append(text)
-    return published
+        public.append(text)
+    return public
 
 
 def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:

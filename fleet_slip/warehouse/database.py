@@ -58,12 +58,12 @@ def open_database(
     """
     import duckdb
 
-    aside = reading.spill / f"{SPILL_PREFIX}{uuid.uuid4().hex}" if reading and spill else ""
+    spill_folder = reading.spill / f"{SPILL_PREFIX}{uuid.uuid4().hex}" if reading and spill else ""
     config: dict[str, str | bool | int | float | list[str]] = {
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
         "memory_limit": f"{memory_bytes() // 2 // 2**20}MiB",
-        "temp_directory": str(aside),
+        "temp_directory": str(spill_folder),
         "max_temp_directory_size": SPILL_LIMIT,
     }
     if threads is not None:
@@ -125,9 +125,9 @@ def interruptible(database: duckdb.DuckDBPyConnection, work: Callable[[], Result
             pass
     except KeyboardInterrupt:
         stopped.set()
-        until = time.monotonic() + STUCK_S
+        deadline = time.monotonic() + STUCK_S
         while not answer.done():
-            if time.monotonic() > until:
+            if time.monotonic() > deadline:
                 raise QueryGoesOnError from None
             with contextlib.suppress(KeyboardInterrupt):
                 database.interrupt()
@@ -303,8 +303,8 @@ def _explained(text: str) -> str:
     begin = 2 if words[1] == b"analyze" else 1
     if words[1] == b"(":  # options in parentheses, or a query in parentheses
         depths = accumulate((word == b"(") - (word == b")") for word in words[1:])
-        after = 2 + next(i for i, depth in enumerate(depths) if depth == 0)
-        begin = after if after < len(tokens) else 1
+        query_start = 2 + next(i for i, depth in enumerate(depths) if depth == 0)
+        begin = query_start if query_start < len(tokens) else 1
     return encoded[tokens[begin] :].decode()
 
 
@@ -365,11 +365,11 @@ Tree = Mapping[str, Any]
 
 def nodes_of(tree: Any) -> Iterator[Tree]:
     """Yield the objects of a parsed text, parents first."""
-    waiting = [tree]
-    while waiting:
-        value = waiting.pop()
+    pending = [tree]
+    while pending:
+        value = pending.pop()
         if isinstance(value, dict):
             yield value
-            waiting.extend(reversed(value.values()))
+            pending.extend(reversed(value.values()))
         elif isinstance(value, list):
-            waiting.extend(reversed(value))
+            pending.extend(reversed(value))

@@ -218,8 +218,8 @@ class ErasureLog:
         at = datetime.now(UTC).isoformat(timespec="seconds")
         earlier = [(entry["subject"], entry["key"]) for entry in self._entries_of(subject)]
         digest = _digest(f"{subject.kind}:{name_key(subject.value)}", key)
-        for hashed, under in dict.fromkeys([*earlier, (digest, key)]):
-            head = {"kind": subject.kind, "subject": hashed, "key": under, "at": at}
+        for hashed, entry_key in dict.fromkeys([*earlier, (digest, key)]):
+            head = {"kind": subject.kind, "subject": hashed, "key": entry_key, "at": at}
             self._folder.append({**head, **content})
 
 
@@ -276,16 +276,16 @@ def _names_in(grams: Table, snapshots: Sequence[Snapshot]) -> Iterator[tuple[_Na
     """Yield the vehicles and drives of files. A log file with Gram rows is not opened."""
     import pyarrow.compute as pc
 
-    counted: set[str] = set()
+    files_with_grams: set[str] = set()
     for snapshot in sorted(snapshots, key=lambda snapshot: snapshot.table != grams):
         is_grams = snapshot.table == grams
         columns = ["vehicle_id", "drive_id", *(["feature_set", "file"] if is_grams else [])]
         for file in snapshot.files:
-            if file.path in counted:
+            if file.path in files_with_grams:
                 continue
             with suppress(StorageError):
                 rows = snapshot.table.read_combinations(file.path, columns)
                 if is_grams:
                     plain = pc.equal(rows["feature_set"], PLAIN)
-                    counted.update(rows["file"].filter(plain).to_pylist())
+                    files_with_grams.update(rows["file"].filter(plain).to_pylist())
                 yield rows["vehicle_id"].to_pylist(), rows["drive_id"].to_pylist()

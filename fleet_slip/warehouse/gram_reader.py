@@ -116,25 +116,27 @@ class Backlog:
 
 def find_backlog(logs: Snapshot, grams: Snapshot, identity: str = PLAIN) -> Backlog:
     """Compare the active log files with those of the Gram rows of a feature set."""
-    done, named = named_files(grams, identity)
+    computed_files, all_files = named_files(grams, identity)
     active = {file.path for file in logs.files}
     return Backlog(
-        missing=tuple(file for file in logs.files if file.path not in done),
-        stale=frozenset(named - active - _pending_files(logs, named - active)),
+        missing=tuple(file for file in logs.files if file.path not in computed_files),
+        stale=frozenset(all_files - active - _pending_files(logs, all_files - active)),
     )
 
 
 def named_files(grams: Snapshot, identity: str) -> tuple[set[str], set[str]]:
     """Return the log files of the Gram rows of a feature set, and those of all Gram rows."""
-    done: set[str] = set()
-    named: set[str] = set()
+    computed_files: set[str] = set()
+    all_files: set[str] = set()
     for file in grams.files:
         if is_onboard_file(file):  # without logs
             continue
         pairs = grams.table.read_combinations(file.path, ["feature_set", "file"])
-        named.update(pairs["file"].filter(pc.invert(is_onboard(pairs))).to_pylist())
-        done.update(pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist())
-    return done, named
+        all_files.update(pairs["file"].filter(pc.invert(is_onboard(pairs))).to_pylist())
+        computed_files.update(
+            pairs["file"].filter(pc.equal(pairs["feature_set"], identity)).to_pylist()
+        )
+    return computed_files, all_files
 
 
 def _pending_files(logs: Snapshot, paths: Collection[str]) -> set[str]:
@@ -193,9 +195,9 @@ class OpenedGrams:
                 f"FROM ({text}) ORDER BY signals, drive_id, part"
             ).to_arrow_table()
 
-    def batches(self, predicate: Predicate, *more: str) -> Iterator[pa.RecordBatch]:
+    def batches(self, predicate: Predicate, *extra_columns: str) -> Iterator[pa.RecordBatch]:
         """Yield the Gram rows of a cohort in any order, with the columns `SUMMED` and `more`."""
-        columns = ", ".join([*SUMMED, *more])
+        columns = ", ".join([*SUMMED, *extra_columns])
         feature_set = self.catalog.feature_set(self.catalog.name_of(self.identity))
         rows = max(1, min(BATCH_ROWS, BATCH_NUMBERS // packed_size(len(feature_set.columns))))
         text = f"SELECT {columns} FROM ({self.statement('cohort.sql', predicate)})"
@@ -232,8 +234,8 @@ class OpenedGrams:
     def course_delays(self, predicate: Predicate) -> Iterator[tuple[str, tuple[int, int]]]:
         """Yield cars with a course, and the smallest and largest delay of their Gram rows."""
         statement = self.statement("course_delays.sql", predicate, turned=TURNED)
-        for car, least, largest in self._rows(statement, predicate):
-            yield car, (least, largest)
+        for car, smallest, largest in self._rows(statement, predicate):
+            yield car, (smallest, largest)
 
 
 class GramReader:

@@ -74,8 +74,8 @@ class Predicate:
 
     def __and__(self, other: "Predicate") -> "Predicate":
         """Return the conjunction of two predicates."""
-        both = f"({self.sql} AND {other.sql})"
-        return Predicate(both, both)
+        conjunction = f"({self.sql} AND {other.sql})"
+        return Predicate(conjunction, conjunction)
 
 
 @contextlib.contextmanager
@@ -322,8 +322,8 @@ def _problem(node: Tree, columns: frozenset[str]) -> str | None:
     if kind == "FUNCTION":
         return _function_problem(node)
     if kind == "TYPE" and (node["type_name"].upper() not in allowed["types"] or node["schema"]):
-        named = printable(node["type_name"])
-        return f"casts to {named!r}. It may cast to: {', '.join(sorted(allowed['types']))}."
+        quoted_name = printable(node["type_name"])
+        return f"casts to {quoted_name!r}. It may cast to: {', '.join(sorted(allowed['types']))}."
     return None
 
 
@@ -331,10 +331,10 @@ def _column_problem(node: Tree, columns: frozenset[str]) -> str | None:
     names = node["column_names"]
     if len(names) == 1 and names[0].lower() in columns:
         return None
-    named = printable(".".join(map(str, names)))
-    nearest = difflib.get_close_matches(named.lower(), columns, n=1)
+    quoted_name = printable(".".join(map(str, names)))
+    nearest = difflib.get_close_matches(quoted_name.lower(), columns, n=1)
     hint = f" Did you mean {nearest[0]}?" if nearest else ""
-    return f"has an unknown column {named!r}.{hint} Columns: {', '.join(sorted(columns))}."
+    return f"has an unknown column {quoted_name!r}.{hint} Columns: {', '.join(sorted(columns))}."
 
 
 def _function_problem(node: Tree) -> str | None:

@@ -69,10 +69,10 @@ def gram_snapshots(
     grams = grams.refresh() if grams else warehouse.grams.snapshot()
     for _ in range(SNAPSHOTS):
         logs = logs.refresh() if logs else warehouse.logs.snapshot()
-        again = grams.refresh()
-        if again is grams or again.version == grams.version:
+        newest_grams = grams.refresh()
+        if newest_grams is grams or newest_grams.version == grams.version:
             return grams, logs
-        grams = again
+        grams = newest_grams
     raise ConflictError(
         f"{warehouse.root}: other processes keep changing it. Run the same command again."
     )
@@ -201,7 +201,7 @@ def describe_columns(database: duckdb.DuckDBPyConnection, signals: SignalCatalog
     ).fetchall()
     rows = []
     for view, column, data_type in columns:
-        described = by_view.get(view, {}).get(column) or common.get(column) or {}
+        description = by_view.get(view, {}).get(column) or common.get(column) or {}
         row = {"view": view, "column": column, "type": data_type}
-        rows.append(row | {key: described.get(key, "") for key in ("unit", "description")})
+        rows.append(row | {key: description.get(key, "") for key in ("unit", "description")})
     return pa.Table.from_pylist(rows)
