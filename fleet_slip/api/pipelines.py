@@ -269,13 +269,17 @@ class LearnReport(Trained):
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
         """Render the result of each step, and what was assumed."""
-        suspicions = {str(text): log.file for log in self.ingested for text in log.suspicions}
+        suspicions: dict[tuple[str, tuple[str, ...]], str] = {}
+        for log in self.ingested:
+            for fault in log.suspicions:
+                suspicions.setdefault(
+                    (fault.kind, fault.signals), f"{log.file}: looks wrong: {fault}"
+                )
         if self.changed:
             counts = [log.counts for log in self.ingested if log.new]
             drives, rows = sum(c.drives for c in counts), sum(c.ticks for c in counts)
             yield Remark(f"ingested {pluralize(drives, 'drive')}, {pluralize(rows, 'row')}")
-            for text, file in suspicions.items():
-                yield Remark(f"{file}: looks wrong: {text}")
+            yield from map(Remark, suspicions.values())
             yield from self.training_parts(everything)
         else:
             yield self.nothing_done(self.model)

@@ -4,12 +4,11 @@
 `commit_batch` commits them.
 """
 
-import dataclasses
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -20,18 +19,18 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.base import Record, pluralize
+from fleet_slip.base import Record, pluralize, quote_name
 from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
 from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured_log import IngestCounts, MeasuredStream, open_measured
+from fleet_slip.ingest.measured_log import IngestCounts, MeasuredLog, open_measured
 from fleet_slip.ingest.recordings import (
     FILES,
-    PREFIX,
     DuplicateDetector,
+    Duplicates,
     Fingerprints,
     IngestCache,
     Replace,
@@ -40,6 +39,7 @@ from fleet_slip.ingest.recordings import (
     digest_of,
     drop_erased_drives,
     drop_erased_rejects,
+    file_number,
     file_transaction,
     fingerprints_of,
     is_fully_erased,
@@ -69,11 +69,12 @@ class IngestTask(NamedTuple):
 
 
 Batch: TypeAlias = tuple[IngestTask, ...]
+Failure: TypeAlias = tuple[Path, InputError]
 BuildRemoval: TypeAlias = Callable[[TableName, Snapshot, Collection[SourceRef]], Change]
 """Build the commit that deletes the drives, or rejected rows, of these sources from a table."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class FileReport(Record):
     """The counts of a file and what looks implausible in it."""
 
@@ -88,7 +89,7 @@ class FileReport(Record):
         return tuple(fault for fault in self.suspicions if fault.does_harm)
 
 
-@dataclass
+@dataclass(frozen=True)
 class IngestReport(FileReport):
     """The result of ingesting one file."""
 
@@ -118,7 +119,7 @@ class SignalRange:
     """Fraction of the ticks without a value."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Preview(FileReport, Answer):
     """The result that ingesting a file would have."""
 
@@ -143,24 +144,16 @@ class Preview(FileReport, Answer):
         yield from (f"looks wrong: {fault}" for fault in self.suspicions)
 
 
-@dataclass
+@dataclass(frozen=True)
 class WrittenFile:
-    """A file of a batch after writing: its report and its fingerprints.
-
-    Attributes
-    ----------
-    same
-        Sources with its fingerprints, whether their rows still exist or not.
-    replaced
-        The sources that it replaces.
-    """
+    """A file of a batch after writing: its report, longest drive, fingerprints and duplicates."""
 
     log: Path
     digest: str
     report: IngestReport
+    longest: MeasuredDrive | None = None
     fingerprints: dict[str, int] = field(default_factory=dict)
-    same: frozenset[SourceRef] = frozenset()
-    replaced: frozenset[SourceRef] = frozenset()
+    duplicates: Duplicates = field(default_factory=Duplicates)
 
 
 class NewFiles(NamedTuple):
@@ -175,14 +168,14 @@ class WrittenBatch:
     """A batch after writing; `forgotten` are the entries of the erasure log that it respects."""
 
     files: tuple[WrittenFile, ...]
-    failures: tuple[InputError, ...]
+    failures: tuple[Failure, ...]
     forgotten: frozenset[int]
     new: dict[TableName, NewFiles]
 
     @property
     def replaced(self) -> frozenset[SourceRef]:
         """The sources that the batch replaces."""
-        return frozenset[SourceRef]().union(*(file.replaced for file in self.files))
+        return frozenset[SourceRef]().union(*(file.duplicates.replaced for file in self.files))
 
 
 def ingest_files(
@@ -212,21 +205,20 @@ def ingest_files(
         )
     write = partial(write_batch, warehouse, mapping, replace=replace)
     warehouse.logs.require_writable(mapping.signal_names)
-    failures: list[InputError] = []
+    failures: list[Failure] = []
     stored = 0
     tasks = (IngestTask(file, cache.digest_of(file) if cache else None) for file in files)
     for batch, written in _written(executor, write, _batches(tasks)):
         # Not the file's name: it may contain a car's name, and the Delta log outlives erasures.
         digest = digest_of([file.digest for file in written.files])
         note = {"job": "ingest", "mapping": mapping.name, "digest": digest}
-        committed, new = commit_batch(
-            warehouse, written, partial(write, batch), note, build_removal
-        )
-        failures += committed.failures
-        stored += len(committed.files)
-        for file in committed.files:
+        commit = BatchCommit(warehouse, written, partial(write, batch), note, build_removal)
+        new = commit.run()
+        failures += commit.written.failures
+        stored += len(commit.written.files)
+        for file in commit.written.files:
             transaction = file_transaction(file.digest).name
-            yield _finished(warehouse, file, is_new=transaction in new)
+            yield file.report if transaction in new else _not_new(warehouse, file)
             new -= {transaction}  # a second file with the same content is not new
             if cache is not None:
                 cache.remember(file.log, file.digest)
@@ -263,33 +255,33 @@ def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
         yield tuple(batch)
 
 
-def _finished(warehouse: Warehouse, written: WrittenFile, *, is_new: bool) -> IngestReport:
-    """Return the report of a file; `is_new` if this process committed it."""
-    report = written.report
-    report.new = is_new
-    if not is_new:
-        report.suspicions, report.drives_replaced = (), 0
-        if not report.drives_forgotten and is_fully_erased(warehouse, written.digest):
-            report.drives_forgotten = report.counts.drives
-            report.counts = dataclasses.replace(report.counts, drives=0, ticks=0)
-    return report
+def _not_new(warehouse: Warehouse, written: WrittenFile) -> IngestReport:
+    """Return the report of a file that this process did not commit."""
+    report = replace(written.report, new=False, suspicions=(), drives_replaced=0)
+    if report.drives_forgotten or not is_fully_erased(warehouse, written.digest):
+        return report
+    counts = replace(report.counts, drives=0, ticks=0)
+    return replace(report, counts=counts, drives_forgotten=report.counts.drives)
 
 
-def _joined(failures: list[InputError], stored: int) -> InputError:
-    """Return one error for all failures; `stored` is the number of the other files."""
+def _joined(failures: Sequence[Failure], stored: int) -> InputError:
+    """Return one error that names each reason once; `stored` is the number of the other files."""
     if len(failures) == 1:
-        return failures[0]
-    first = " ".join(map(str, failures[:FAILURES_SHOWN]))
-    more = len(failures) - FAILURES_SHOWN
-    others = "; all others are stored" if stored else ""
-    kind = (
-        RepeatedError
-        if all(isinstance(failure, RepeatedError) for failure in failures)
-        else InputError
-    )
-    return kind(
-        f"{pluralize(len(failures), 'file')} cannot be used{others}. {first}"
-        + (f" And {more:,} more." if more > 0 else "")
+        return failures[0][1]
+    reasons: dict[str, list[str]] = {}
+    for file, failure in failures:
+        name = quote_name(file)
+        reasons.setdefault(str(failure).removeprefix(f"{name}: "), []).append(name)
+    texts = []
+    for reason, files in reasons.items():
+        more = f" and {len(files) - FAILURES_SHOWN:,} more" if len(files) > FAILURES_SHOWN else ""
+        texts.append(f"{', '.join(files[:FAILURES_SHOWN])}{more}: {reason}")
+    unshown = len(texts) - FAILURES_SHOWN
+    are_repeated = all(isinstance(failure, RepeatedError) for _, failure in failures)
+    return (RepeatedError if are_repeated else InputError)(
+        f"{pluralize(len(failures), 'file')} cannot be used"
+        f"{'; all others are stored' if stored else ''}. {' '.join(texts[:FAILURES_SHOWN])}"
+        + (f" And {pluralize(unshown, 'other reason')}." if unshown > 0 else "")
     )
 
 
@@ -306,57 +298,32 @@ def write_batch(
 
     A file that cannot be used becomes a failure; the others are written.
     """
-    failures: list[InputError] = []
+    failures: list[Failure] = []
     written: list[WrittenFile] = []
-    longest: list[tuple[FileReport, MeasuredDrive | None]] = []
     with ThreadPoolExecutor(WRITERS) as writers:
-        batch = _Writer(warehouse, mapping, files, writers, replace)
+        batch = _BatchWriter(warehouse, mapping, files, writers, replace)
         for task in files:
             try:
-                with open_measured(task.file, mapping) as stream:
-                    report_of_file = batch.write(stream, task)
+                written.append(batch.write(task))
             except BaseException as error:
                 for data in batch.data.values():
                     data.discard_log()
                 if not isinstance(error, InputError):
                     raise
-                failures.append(error)
-            else:
-                for data in batch.data.values():
-                    data.end_log()
-                written.append(report_of_file)
-                if report_of_file.report.new:
-                    longest.append((report_of_file.report, stream.longest))
-        _check_longest(mapping, longest)
+                failures.append((task.file, error))
+        faults = check_longest(mapping, [file.longest for file in written])
         new = {name: data.finish() for name, data in batch.data.items()}
-    return WrittenBatch(tuple(written), tuple(failures), batch.forgotten, new)
+    checked = tuple(_with_faults(*pair) for pair in zip(written, faults, strict=True))
+    return WrittenBatch(checked, tuple(failures), batch.forgotten, new)
 
 
-def _check_longest(
-    mapping: Mapping, results: Iterable[tuple[FileReport, MeasuredDrive | None]]
-) -> None:
-    """Check the longest drive of each file; report a fault with the longest drive that has it.
-
-    `CHECKED_TICKS` bound the time of a batch: a check takes as long as loading a small file.
-    """
-    drives = [(report, drive) for report, drive in results if drive is not None]
-    drives.sort(key=lambda pair: pair[1].ticks.size, reverse=True)
-    from_velocities = mapping.label is not None and mapping.label.from_velocities
-    faults: dict[tuple[str, tuple[str, ...]], list[tuple[FileReport, Fault]]] = {}
-    for report, drive in drives:
-        ticks = max(CHECKED_TICKS // len(drives), MIN_CHECKED_TICKS)
-        signals = signals_of(mapping.signal_catalog, drive, ticks)
-        for fault in check_plausibility(
-            mapping.signal_catalog, signals, from_velocities=from_velocities
-        ):
-            faults.setdefault((fault.kind, fault.signals), []).append((report, fault))
-    for (report, fault), *repeats in faults.values():
-        also = f", as in {pluralize(len(repeats), 'other file')}" if repeats else ""
-        report.suspicions += (dataclasses.replace(fault, figure=fault.figure + also),)
+def _with_faults(file: WrittenFile, faults: Sequence[Fault]) -> WrittenFile:
+    suspicions = (*file.report.suspicions, *faults)
+    return replace(file, report=replace(file.report, suspicions=suspicions), longest=None)
 
 
-class _Writer:
-    """Writes the files of a batch."""
+class _BatchWriter:
+    """Writes the files of a batch to data files, without a commit."""
 
     def __init__(
         self,
@@ -366,16 +333,16 @@ class _Writer:
         writers: ThreadPoolExecutor,
         replace: Replace,
     ) -> None:
-        self.warehouse, self.mapping = warehouse, mapping
-        self.erasure_log = ErasureLog(warehouse.root)
-        self.forgotten, self._number = self.erasure_log.begun(), len(files)
+        self._warehouse, self._mapping = warehouse, mapping
+        self._erasure_log = ErasureLog(warehouse.root)
+        self.forgotten, self._number = self._erasure_log.begun(), len(files)
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
-        self._same = DuplicateDetector(warehouse, logs, mapping.name, replace)
+        self._duplicates = DuplicateDetector(warehouse, logs, mapping.name, replace)
 
     def _look(self) -> Snapshot:
         """Read the current state of the tables; return a snapshot of the logs."""
-        snapshots = {name: table.snapshot() for name, table in tables_of(self.warehouse).items()}
+        snapshots = {name: table.snapshot() for name, table in tables_of(self._warehouse).items()}
         self._landed = {
             name: written.transaction_lookup(self._number) for name, written in snapshots.items()
         }
@@ -385,48 +352,65 @@ class _Writer:
         """Return True if a file's rows are neither in a table nor in this batch."""
         return digest not in self.data[name].digests and not self._landed[name](FILES + digest)
 
-    def write(self, stream: MeasuredStream, task: IngestTask) -> WrittenFile:
-        """Read a file and write its rows; the last rows wait for those of other files.
-
-        Raises `InputError`, and `RepeatedError` for a stored recording.
-        """
-        digest, first_drive = stream.digest, drive_id(stream.prefix, 0)
-        if not self._lacks("logs", digest) and readmit_file(self.warehouse, digest, first_drive):
+    def _begin(self, digest: str, first_drive: str) -> bool:
+        """Begin a file in the tables that lack it. Returns True if the logs lack it."""
+        if not self._lacks("logs", digest) and readmit_file(self._warehouse, digest, first_drive):
             self._look()
         is_new = self._lacks("logs", digest)
         for name, data in self.data.items():
             data.begin_log(digest, is_new=is_new and self._lacks(name, digest))
-        fingerprints = {f"{PREFIX}{stream.content[:16]}": SourceRef.of_file(digest).number}
-        left_out, ticks = set[str](), 0
-        for drives in _groups(stream.drives()):
-            accepted = drop_erased_drives(
-                sorted(drives, key=lambda drive: drive.drive_id), self.erasure_log
-            )
-            left_out |= {drive.drive_id for drive in drives} - {
-                drive.drive_id for drive in accepted
-            }
+        return is_new
+
+    def write(self, task: IngestTask) -> WrittenFile:
+        """Read a file and write its rows; the last rows wait for those of other files.
+
+        Raises `InputError`, and `RepeatedError` for a stored recording.
+        """
+        with open_measured(task.file, self._mapping) as log:
+            is_new = self._begin(log.digest, drive_id(log.prefix, 0))
+            ticks, erased, fingerprints = self._write_drives(log, is_new=is_new)
+            self._write_rejects(log, erased)
+            report = IngestReport(str(task.file), log.counts, new=is_new)
+            written = WrittenFile(task.file, log.digest, report)
+            if is_new:
+                is_stored = task.earlier and self._landed["logs"](FILES + task.earlier)
+                earlier = task.earlier if is_stored else None
+                duplicates = self._duplicates.find(task.file, log, fingerprints, earlier)
+                drives = log.counts.drives - len(erased)
+                report = replace(
+                    report,
+                    counts=replace(log.counts, drives=drives, ticks=ticks),
+                    suspicions=log.suspicions(),
+                    drives_forgotten=len(erased),
+                    drives_replaced=duplicates.drives,
+                )
+                written = WrittenFile(
+                    task.file, log.digest, report, log.longest, fingerprints, duplicates
+                )
+        for data in self.data.values():
+            data.end_log()
+        return written
+
+    def _write_drives(
+        self, log: MeasuredLog, *, is_new: bool
+    ) -> tuple[int, set[str], dict[str, int]]:
+        """Write the drives of a log; return their ticks, the erased drives, and fingerprints."""
+        ticks, erased, fingerprints = 0, set[str](), {log.fingerprint: file_number(log.digest)}
+        for drives in _groups(log.drives()):
+            ordered = sorted(drives, key=lambda drive: drive.drive_id)
+            accepted = drop_erased_drives(ordered, self._erasure_log)
+            erased |= {drive.drive_id for drive in drives} - {drive.drive_id for drive in accepted}
             ticks += _rows_of(accepted)
             if is_new and accepted:
                 full = _rows_of(drives) >= FILE_ROWS
-                self.data["logs"].add(log_table(accepted, self.mapping), full=full)
+                self.data["logs"].add(log_table(accepted, self._mapping), full=full)
                 fingerprints |= fingerprints_of(accepted)
-        for table, following in pairwise(chain(stream.quarantine(), [None])):
-            allowed = drop_erased_rejects(table, self.erasure_log, left_out)
+        return ticks, erased, fingerprints if ticks else {}
+
+    def _write_rejects(self, log: MeasuredLog, erased: Collection[str]) -> None:
+        for table, following in pairwise(chain(log.quarantine(), [None])):
+            allowed = drop_erased_rejects(table, self._erasure_log, erased)
             self.data["quarantine"].add(allowed, full=following is not None)
-        report = IngestReport(str(task.file), stream.counts, new=is_new)
-        written = WrittenFile(task.file, digest, report)
-        if is_new:
-            report.drives_forgotten, report.suspicions = len(left_out), stream.suspicions()
-            drives_left = stream.counts.drives - len(left_out)
-            report.counts = dataclasses.replace(stream.counts, drives=drives_left, ticks=ticks)
-            written.fingerprints = fingerprints if ticks else {}
-            is_there = task.earlier and self._landed["logs"](FILES + task.earlier)
-            earlier = task.earlier if is_there else None
-            duplicates = self._same.find(
-                task.file, digest, written.fingerprints, stream.name, earlier
-            )
-            written.same, written.replaced, report.drives_replaced = duplicates
-        return written
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
@@ -456,8 +440,11 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
     previews: list[Preview] = []
     for batch in _batches(map(IngestTask, logs)):
         results = [preview_log(task.file, mapping) for task in batch]
-        _check_longest(mapping, results)
-        previews += [preview for preview, _ in results]
+        faults = check_longest(mapping, [drive for _, drive in results])
+        previews += [
+            replace(preview, suspicions=(*preview.suspicions, *of_drive))
+            for (preview, _), of_drive in zip(results, faults, strict=True)
+        ]
     return previews
 
 
@@ -482,18 +469,43 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
     return Preview(str(log), stream.counts, suspicions, tuple(ranges)), stream.longest
 
 
-CHECKED_TICKS, MIN_CHECKED_TICKS = 200_000, 6_000
-"""Ticks that are checked in a batch of files, half an hour, and in each file, a minute."""
+CHECKED_TICKS, MIN_CHECKED_TICKS = 100_000, 6_000
+"""Ticks that are checked in a batch of files, 17 minutes, and in each file, a minute."""
+
+
+def check_longest(
+    mapping: Mapping, drives: Sequence[MeasuredDrive | None]
+) -> list[tuple[Fault, ...]]:
+    """Check the longest drive of each file; return a fault with the longest drive that has it.
+
+    `CHECKED_TICKS` bound the time of a batch: a check takes as long as loading a small file.
+    """
+    present = [(place, drive) for place, drive in enumerate(drives) if drive is not None]
+    present.sort(key=lambda pair: pair[1].ticks.size, reverse=True)
+    from_velocities = mapping.label is not None and mapping.label.from_velocities
+    places: dict[tuple[str, tuple[str, ...]], list[tuple[int, Fault]]] = {}
+    for place, drive in present:
+        ticks = max(CHECKED_TICKS // len(present), MIN_CHECKED_TICKS)
+        signals = signals_of(mapping.signal_catalog, drive, ticks)
+        for fault in check_plausibility(
+            mapping.signal_catalog, signals, from_velocities=from_velocities
+        ):
+            places.setdefault((fault.kind, fault.signals), []).append((place, fault))
+    faults: list[tuple[Fault, ...]] = [()] * len(drives)
+    for (place, fault), *repeats in places.values():
+        also = f", as in {pluralize(len(repeats), 'other file')}" if repeats else ""
+        faults[place] += (replace(fault, figure=fault.figure + also),)
+    return faults
 
 
 def signals_of(signals: SignalCatalog, drive: MeasuredDrive, ticks: int) -> Signals:
     """Return the signals of the first ticks of a drive, as `check_plausibility` reads them."""
-    selected = drive.ticks - drive.ticks[0] < ticks
+    number = int(np.searchsorted(drive.ticks, drive.ticks[0] + ticks))
     counts = {  # by Polars: Arrow's own would load pandas
-        name: pl.Series(values).cast(pl.Float64).fill_null(float("nan")).to_numpy()[selected]
+        name: pl.Series(values[:number]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
         for name, values in drive.counts.items()
     }
-    return to_regular_grid(signals, drive.ticks[selected], counts)
+    return to_regular_grid(signals, drive.ticks[:number], counts)
 
 
 # Writing data files of bounded size.
@@ -585,99 +597,105 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     sizes = [drive.ticks.size for drive in drives]
+    repeat = cache(partial(_repeat, sizes=sizes))  # many columns are the same for all drives
     columns, signal_catalog = {}, mapping.signal_catalog
-    for column in signal_catalog.log_schema:
-        if column.name == "tick":
-            ticks = [as_arrow(drive.ticks) for drive in drives]
-            columns[column.name] = pa.chunked_array(ticks, column.type)
-        elif column.name in mapping.signal_names:
-            columns[column.name] = pa.chunked_array([drive.counts[column.name] for drive in drives])
-        elif column.name in signal_catalog.extras:
+    for name, kind in zip(
+        signal_catalog.log_schema.names, signal_catalog.log_schema.types, strict=True
+    ):
+        if name == "tick":
+            columns[name] = pa.chunked_array([as_arrow(drive.ticks) for drive in drives], kind)
+        elif name in mapping.signal_names:
+            columns[name] = pa.chunked_array([drive.counts[name] for drive in drives])
+        elif name in signal_catalog.extras:
             continue
-        elif column.name in signal_catalog.signals:
-            columns[column.name] = pa.nulls(sum(sizes), column.type)
+        elif name in signal_catalog.signals:
+            columns[name] = pa.nulls(sum(sizes), kind)
         else:
-            values = [drive.metadata.get(column.name) for drive in drives]
-            columns[column.name] = _repeat(values, sizes, column.type)
+            values = tuple(drive.metadata.get(name) for drive in drives)
+            if not pa.types.is_string(kind):
+                columns[name] = repeat(values, kind)
+                continue
+            texts = list(dict.fromkeys(text for text in values if text is not None))
+            codes = tuple(None if text is None else texts.index(text) for text in values)
+            named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
+            columns[name] = pa.DictionaryArray.from_arrays(
+                repeat(codes, pa.int32()), named, safe=False
+            )
     return pa.table(columns)
 
 
-def _repeat(values: Sequence[Any], sizes: Sequence[int], kind: pa.DataType) -> pa.Array:
-    """Return a column with each value so many times; strings are dictionary-encoded.
-
-    Not by `pa.array`, which imports pandas if installed.
-    """
-    if pa.types.is_string(kind):
-        texts = list(dict.fromkeys(text for text in values if text is not None))
-        codes = [None if text is None else texts.index(text) for text in values]
-        named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
-        return pa.DictionaryArray.from_arrays(_repeat(codes, sizes, pa.int32()), named, safe=False)
+def _repeat(values: Sequence[Any], kind: pa.DataType, sizes: Sequence[int]) -> pa.Array:
+    """Return each value so many times. Not by `pa.array`, which imports pandas if installed."""
     column = pl.Series(values, strict=False)
     if column.null_count() == len(column):
         return pa.nulls(sum(sizes), kind)
     numbers = column.to_physical().fill_null(0).to_numpy()
-    absent = column.is_null().to_numpy() if column.null_count() else None
-    repeated = as_arrow(
-        np.repeat(numbers, sizes), None if absent is None else np.repeat(absent, sizes)
-    )
+    absent = np.repeat(column.is_null().to_numpy(), sizes) if column.null_count() else None
+    repeated = as_arrow(np.repeat(numbers, sizes), absent)
     return repeated.view(column.to_arrow().type).cast(kind)
 
 
 # Commits: rejected rows first, then drives.
 
 
-def commit_batch(
-    warehouse: Warehouse,
-    written: WrittenBatch,
-    write: Callable[[], WrittenBatch],
-    note: dict[str, str],
-    build_removal: BuildRemoval | None = None,
-) -> tuple[WrittenBatch, frozenset[str]]:
-    """Commit a batch; return it and the transactions added to the logs.
+class BatchCommit:
+    """The commits of a batch, which is written again whenever it is outdated.
 
-    If an erasure or another process's commit makes the batch outdated, `write` writes it again. The
-    sources that it replaces are deleted in the same commits.
+    An erasure, or another process's commit of the same recording, makes it outdated. The sources
+    that the batch replaces are deleted in the same commits.
     """
-    tables = tables_of(warehouse)
 
-    def is_outdated(name: TableName, snapshot: Snapshot) -> bool:
-        # After the snapshot: an erasure that begins from now on makes this commit a conflict.
-        if ErasureLog(warehouse.root).begun() != written.forgotten:
-            return True
-        landed = snapshot.transaction_lookup(len(written.new[name].transactions))
-        if any(landed(transaction.name) for transaction in written.new[name].transactions):
-            return True
-        new = [file for file in written.files if file.fingerprints] if name == "logs" else []
-        fingerprints = Fingerprints(snapshot.transactions if new else {})
-        return any(fingerprints.find(file.fingerprints) - file.same for file in new)
+    def __init__(
+        self,
+        warehouse: Warehouse,
+        written: WrittenBatch,
+        write: Callable[[], WrittenBatch],
+        note: dict[str, str],
+        build_removal: BuildRemoval | None = None,
+    ) -> None:
+        """Take a written batch, and a function that writes it again."""
+        self._warehouse, self._tables = warehouse, tables_of(warehouse)
+        self.written, self._write = written, write
+        self._note, self._build_removal = note, build_removal
 
-    def commit(name: TableName) -> frozenset[str]:
-        nonlocal written
-        snapshot = tables[name].snapshot()
-        while is_outdated(name, snapshot):
-            for other, table in tables.items():
-                table.discard(written.new[other].files)  # except committed ones
-            written = write()
-            snapshot = tables[name].snapshot()
-        new = written.new[name]
-        removal = Change()
-        if written.replaced and build_removal and written.new["logs"].files:
-            removal = build_removal(name, snapshot, written.replaced)
+    def run(self) -> frozenset[str]:
+        """Commit to both tables; return the transactions that were added to the logs."""
+        retry_conflicts(partial(self._commit, "quarantine"))
+        return retry_conflicts(partial(self._commit, "logs"))
+
+    def _commit(self, name: TableName) -> frozenset[str]:
+        snapshot = self._tables[name].snapshot()
+        while self._is_outdated(name, snapshot):
+            for other, table in self._tables.items():
+                table.discard(self.written.new[other].files)  # except committed ones
+            self.written = self._write()
+            snapshot = self._tables[name].snapshot()
+        new, removal = self.written.new[name], Change()
+        if self.written.replaced and self._build_removal and self.written.new["logs"].files:
+            removal = self._build_removal(name, snapshot, self.written.replaced)
+        if not (new.files or removal.remove):
+            return frozenset()
         transactions = {t.name: t for t in (*removal.transactions, *new.transactions)}
-        for file in written.files if name == "logs" else ():
-            transactions |= {
-                fingerprint: AppTransaction(fingerprint, number)
-                for fingerprint, number in file.fingerprints.items()
-            }
-        if new.files or removal.remove:
-            add = [*new.files, *removal.add]
-            try:
-                snapshot.commit(Change(add, removal.remove, tuple(transactions.values()), note))
-            except ConflictError:
-                tables[name].discard(removal.add)
-                raise
+        if name == "logs":
+            for file in self.written.files:
+                transactions |= {n: AppTransaction(n, v) for n, v in file.fingerprints.items()}
+        added = [*new.files, *removal.add]
+        change = Change(added, removal.remove, tuple(transactions.values()), self._note)
+        try:
+            snapshot.commit(change)
+        except ConflictError:
+            self._tables[name].discard(removal.add)
+            raise
         return frozenset(t.name for t in new.transactions) if new.files else frozenset()
 
-    retry_conflicts(lambda: commit("quarantine"))
-    new = retry_conflicts(lambda: commit("logs"))
-    return written, new
+    def _is_outdated(self, name: TableName, snapshot: Snapshot) -> bool:
+        # After the snapshot: an erasure that begins from now on makes this commit a conflict.
+        if ErasureLog(self._warehouse.root).begun() != self.written.forgotten:
+            return True
+        transactions = self.written.new[name].transactions
+        landed = snapshot.transaction_lookup(len(transactions))
+        if any(landed(transaction.name) for transaction in transactions):
+            return True
+        files = [file for file in self.written.files if file.fingerprints and name == "logs"]
+        stored = Fingerprints(snapshot.transactions if files else {})
+        return any(stored.find(file.fingerprints) - file.duplicates.same for file in files)

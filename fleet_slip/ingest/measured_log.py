@@ -40,7 +40,7 @@ from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.ticks import MeasuredDrive, drive_id, to_ticks
+from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
 from fleet_slip.quality.checks import CHECKS, Check, Fault
 from fleet_slip.warehouse.warehouse import quarantine_schema
@@ -85,7 +85,7 @@ REFUSED_ROWS = 2**18
 """Maximum rejected rows in memory; the others are in a temporary file."""
 
 
-class MeasuredStream:
+class MeasuredLog:
     """A measured file, open for reading through a mapping.
 
     The result depends on the file's bytes and the mapping only, not on its path (but for keys in
@@ -95,7 +95,8 @@ class MeasuredStream:
 
     def __init__(self, file: Path, mapping: Mapping, digest: str, content: str) -> None:
         """Take the file, the mapping, and the two digests of `_identity`."""
-        self.file, self.mapping, self.digest, self.content = file, mapping, digest, content
+        self.file, self.mapping, self.digest = file, mapping, digest
+        self.fingerprint = f"{PREFIX}{content[:16]}"
         self.prefix = f"{mapping.name}-{digest[:12]}"
         self.checker = RowChecker(file, mapping)
         self.counts = IngestCounts()
@@ -314,11 +315,11 @@ class MeasuredStream:
 
 
 @contextmanager
-def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredStream]:
+def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredLog]:
     """Open a measured file. Raises `InputError`, if it changes until the end too."""
     mapping = mapping.for_file(file)
     with require_unchanged_log(file):
-        yield MeasuredStream(file, mapping, *_identity(file, mapping))
+        yield MeasuredLog(file, mapping, *_identity(file, mapping))
 
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:

@@ -19,7 +19,8 @@ from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import RepeatedError
 from fleet_slip.ingest.log_files import state_of
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.ticks import MeasuredDrive
+from fleet_slip.ingest.measured_log import MeasuredLog
+from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive
 from fleet_slip.resources import cache_folder, keep_json
 from fleet_slip.storage.table import (
     WITHDRAWN,
@@ -87,14 +88,13 @@ def drop_erased_rejects(
 
 
 # A fingerprint identifies a recording: a digest of a file's bytes, or of a drive's counts. Each is
-# a transaction in the commit of the rows, so that two processes that store one drive conflict. Its
-# number contains the source, and no name of a car can be derived from it:
-#
-#     40 bits of the file's digest | 3 bits: 0 of a file | 20 bits of the drive's name
+# a transaction in the commit of the rows, so that two processes that store one drive conflict. A
+# transaction has one number, which refers to the source without the name of a car.
 
-FILES, PREFIX = "ingest/", "same/"
+FILES = "ingest/"
 DIGEST_CHARACTERS = 10
-_DRIVE_BITS, _KIND_BITS = 20, 3
+_DRIVES, _NUMBERS = 2**20, 2**23
+"""Hashes of drives, and numbers reserved for each digest; 0 is the file, drives are behind 2^20."""
 
 MEASURED = rf"-([0-9a-f]{{{DIGEST_CHARACTERS}}})[0-9a-f]{{2}}((-[0-9]+){{1,2}})$"
 """The end of a measured drive's name: its file's digest, and the number of the drive."""
@@ -122,19 +122,18 @@ class SourceRef(NamedTuple):
         if (match := _MEASURED.search(drive_id)) is None:
             return None
         hashed = int(sha256(match[2].encode()).hexdigest(), 16)
-        return cls(match[1], 1 + hashed % (2**_DRIVE_BITS - 1))
+        return cls(match[1], 1 + hashed % (_DRIVES - 1))
 
     @classmethod
     def of_number(cls, number: int) -> "SourceRef":
         """Return the reference that a fingerprint's number contains."""
-        digest = number >> (_KIND_BITS + _DRIVE_BITS)
-        return cls(f"{digest:0{DIGEST_CHARACTERS}x}", number % 2**_DRIVE_BITS)
+        digest, drive = divmod(number, _NUMBERS)
+        return cls(f"{digest:0{DIGEST_CHARACTERS}x}", drive % _DRIVES)
 
     @property
     def number(self) -> int:
         """The number of a fingerprint of this source."""
-        kind = int(self.drive != 0) << _DRIVE_BITS
-        return int(self.digest, 16) << (_KIND_BITS + _DRIVE_BITS) | kind | self.drive
+        return int(self.digest, 16) * _NUMBERS + (_DRIVES + self.drive if self.drive else 0)
 
     @property
     def file(self) -> "SourceRef":
@@ -179,6 +178,11 @@ def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
     """Return the fingerprint of each drive's counts, with the number of its source."""
     sources = ((drive, SourceRef.of_drive(drive.drive_id)) for drive in drives)
     return {f"{PREFIX}{drive.counts_digest}": source.number for drive, source in sources if source}
+
+
+def file_number(digest: str) -> int:
+    """Return the number of the fingerprint of a file."""
+    return SourceRef.of_file(digest).number
 
 
 def file_transaction(digest: str) -> AppTransaction:
@@ -247,6 +251,24 @@ def _name_of(log: Path) -> str:
 # Files whose recording is stored already.
 
 
+class Duplicates(NamedTuple):
+    """The stored recordings of a file.
+
+    Attributes
+    ----------
+    same
+        Sources with its fingerprints, whether their rows still exist or not.
+    replaced
+        The sources that it replaces.
+    drives
+        Number of drives that it replaces.
+    """
+
+    same: frozenset[SourceRef] = frozenset()
+    replaced: frozenset[SourceRef] = frozenset()
+    drives: int = 0
+
+
 class DuplicateDetector:
     """Finds recordings that are stored already, or twice in a batch."""
 
@@ -261,32 +283,27 @@ class DuplicateDetector:
         self._files: dict[str, Path] = {}
 
     def find(
-        self,
-        log: Path,
-        digest: str,
-        fingerprints: Named[str, int],
-        name: str,
-        earlier: str | None,
-    ) -> tuple[frozenset[SourceRef], frozenset[SourceRef], int]:
-        """Return the sources with a file's fingerprints, those to replace, and their drives' count.
+        self, file: Path, log: MeasuredLog, fingerprints: Named[str, int], earlier: str | None
+    ) -> Duplicates:
+        """Return the stored recordings of a file that was read.
 
-        `name` is the value of the file's `source_file`; `earlier` is the digest of the stored
-        content that its path had before. Raises `RepeatedError` for a recording not to replace.
+        `earlier` is the digest of the stored content that its path had before. Raises
+        `RepeatedError` for a recording that is not to be replaced.
         """
         for source in Fingerprints(self._batch).find(fingerprints):
             # A file with other bytes: identical files are stored once anyway.
             raise RepeatedError(
-                f"{quote_name(log)}: same recording as {quote_name(self._files[source.digest])}. "
+                f"{quote_name(file)}: same recording as {quote_name(self._files[source.digest])}. "
                 "Leave one of them out."
             )
         if self._logs_have is None:
             self._logs_have = Fingerprints(self._logs.transactions)
         sources = self._logs_have.find(fingerprints)
-        changed = earlier is not None and earlier != digest
+        changed = earlier is not None and earlier != log.digest
         if earlier is not None and changed:
             sources |= {SourceRef.of_file(earlier)}
         stored = _drives_of(self._warehouse, {source.file for source in sources})
-        replaced = _replaced(stored, sources, name)
+        replaced = _replaced(stored, sources, log.name)
         drives = [drive for drive in stored if is_from(drive, replaced)]
         is_replaced = self._replace == "all" or (
             self._replace == "corrected"
@@ -300,13 +317,13 @@ class DuplicateDetector:
             source_file, more = quote_name(stored[drives[0]]), pluralize(len(drives), "drive")
             count = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
             raise RepeatedError(
-                f"{quote_name(log)}: {problem} and would count twice: {count} from {source_file}. "
+                f"{quote_name(file)}: {problem} and would count twice: {count} from {source_file}. "
                 "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
                 f"{drives[0]}"
             )
         self._batch.update(fingerprints)
-        self._files[SourceRef.of_file(digest).digest] = log
-        return sources, replaced if drives else frozenset(), len(drives)
+        self._files[SourceRef.of_file(log.digest).digest] = file
+        return Duplicates(sources, replaced if drives else frozenset(), len(drives))
 
 
 def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:

@@ -36,6 +36,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _FROM_MAPPING = tuple(name for name in DriveMetadata.model_fields if name != "column")
 
 
+PREFIX = "same/"
+"""Prefix of the name of a fingerprint's transaction; see `recordings`."""
+
+
 @dataclass(frozen=True)
 class MeasuredDrive:
     """An uninterrupted segment of a file on ticks.

@@ -55,7 +55,7 @@ class MeasuredLog:
 
 
 def read_measured(file: Path, mapping: Mapping) -> MeasuredLog:
-    """Read a file through a mapping, all of it into memory; see `MeasuredStream`.
+    """Read a file through a mapping, all of it into memory; see `MeasuredLog`.
 
     Raises `InputError` if the file cannot be read, is not what the mapping says, or has no usable
     row.

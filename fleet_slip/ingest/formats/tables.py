@@ -18,7 +18,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.parquet_footer import MAGIC, RowGroup, read_row_groups
 from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
 
-BATCH_ROWS = 2**15
+BATCH_ROWS = 2**16
 """Parquet is read in batches of this many rows."""
 
 BUFFER_BYTES = 2**16
