@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import shlex
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -196,6 +197,11 @@ def name_key(name: str) -> str:
 def pluralize(number: int, noun: str) -> str:
     """Return a number with its noun, such as `1 drive` or `1,500 Gram rows`."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def quote_argument(text: str) -> str:
+    """Return an argument of a command line in double quotes, if a shell keeps it as it is there."""
+    return shlex.quote(text) if set(text) & set('"$`\\!') else f'"{text}"'
 
 
 def quote_name(text: object) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 from fleet_slip.base import pluralize
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
+from fleet_slip.warehouse.predicate import describe_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
 BLIND_COLUMNS = 5
@@ -110,7 +111,7 @@ def _ranking_table(ranking: Mapping[str, Any]) -> TextTable:
 
 def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     """Tabulate statistics on measured drives, the best estimator first."""
-    drives = pluralize(len(content["drives"]), "drive")
+    drives = pluralize(len(content["drives"]), "drive") + describe_cohort(content["cohort"])
     if examined := content.get("examined"):
         yield Remark(examined)
     is_time = content["parts_of"] == "time"
@@ -119,7 +120,7 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     sources = dict(zip(told, ascii_lowercase, strict=False))
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(
-        f"{content['cohort']}: {drives}, held out {held_out}, in {content['parts']} folds",
+        f"{drives}, held out {held_out}, in {content['parts']} folds",
         "estimator|source|RMSE deg|±|mean|std|correlation|rows|worst|kinds held out",
         (
             {

@@ -1,7 +1,6 @@
 """Evaluates a published model on the rows of a cohort."""
 
 import math
-import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.base import pluralize
+from fleet_slip.base import pluralize, quote_argument
 from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import Workspace
@@ -95,7 +94,7 @@ class Score(Answer):
             yield Remark(f"left out: {count} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
             measured = self.measured_cohort
-            options = f" --cohort {shlex.quote(measured)}" if measured else ""
+            options = f" --cohort {quote_argument(measured)}" if measured else ""
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
                 f"{pluralize(self.drives, 'drive')}: its error there is a training error. On "
