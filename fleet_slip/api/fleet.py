@@ -678,4 +678,4 @@ class Fleet:
 
         mapping = self._load_mapping(mapping)
         paths = [files] if isinstance(files, Path | str) else list(files)
-        return mapping, find_logs(paths), any(map(names_several, paths))
+        return mapping, find_logs(paths, mapping), any(map(names_several, paths))

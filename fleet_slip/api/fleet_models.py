@@ -310,7 +310,7 @@ class FleetModels:
 
         if isinstance(mapping, str):
             mapping = load_mapping(mapping, self.warehouse.catalog)
-        logs = find_logs([files] if isinstance(files, Path | str) else list(files))
+        logs = find_logs([files] if isinstance(files, Path | str) else list(files), mapping)
         return predict_logs(self.warehouse, self.get(model), logs, mapping, output, replace=replace)
 
     def log_to_mlflow(self, model: str | ModelVersion, uri: str) -> str:

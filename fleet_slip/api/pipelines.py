@@ -429,7 +429,7 @@ class NightlyPipeline:
                 f"{self.inbox}: no such folder. Name the inbox folder for logs, or mount it."
             )
         try:
-            logs = find_logs([self.inbox])
+            logs = find_logs([self.inbox], mapping)
         except InputError:  # a night without new logs is normal
             state: State = "done" if self.baseline.drives else "attention"
             return state, "No log is in the folder."

@@ -274,16 +274,20 @@ def list_mappings(context: Context, json: opt.Json = False) -> None:
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return the draft of a mapping for a log, and its text."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft
+    from fleet_slip.ingest.file_groups import FileGroup
     from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
     from fleet_slip.ingest.log_files import find_logs
     from fleet_slip.ingest.profile import profile_file
 
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None
     logs = find_logs([file])
-    if len(logs) > 1:
+    groups = [log for log in logs if isinstance(log, FileGroup)]
+    if len(logs) > 1 and len(groups) < len(logs):
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
-    draft = draft_mapping(signals, logs[0], profile_file(logs[0], bus))
-    return draft, write_draft(draft, name_of(logs[0].stem))
+    # Of the sessions of a lake the first with all messages.
+    log = max(groups, key=lambda group: len(group.members)) if groups else logs[0]
+    draft = draft_mapping(signals, log, profile_file(log, bus))
+    return draft, write_draft(draft, name_of(Path(file).stem))
 
 
 # Gram rows.

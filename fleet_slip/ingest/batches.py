@@ -14,8 +14,9 @@ import polars as pl
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.reading import file_errors, open_source
-from fleet_slip.ingest.formats.source import BASE, Budget
+from fleet_slip.ingest.file_groups import open_log, seconds_of
+from fleet_slip.ingest.formats.reading import file_errors
+from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Budget
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.mapping import Mapping
 
@@ -29,8 +30,8 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
     Several time bases are merged by `merge_bases`. Raises `InputError` if the file cannot be read,
     if only one of file and mapping has a clock, or if a column is missing or ambiguous.
     """
-    columns_by_time, time = mapping.time_bases(), str(mapping.time.key)
-    with file_errors(log), open_source(log, mapping.formats) as source:
+    columns_by_time = mapping.time_bases()
+    with file_errors(log), open_log(log, mapping.formats, mapping.member_times) as source:
         if source.has_clock != mapping.time.own_clock:
             raise InputError(
                 f"{quote_name(log)}: {_CLOCK if source.has_clock else _NO_CLOCK}, in the mapping "
@@ -38,41 +39,67 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
             )
         metered = Budget.for_file(log).metered
         if len(columns_by_time) == 1 and not source.has_clock:
-            yield from metered(source.batches(next(iter(columns_by_time.values()))))
+            plain = source.batches(next(iter(columns_by_time.values())))
+            yield from metered(_with_later_hours(plain, mapping))
             return
         if source.has_clock:
             bases = [base for columns in columns_by_time.values() for base in source.bases(columns)]
         else:
             bases = [
-                _with_times(source.batches(columns), log, str(time_column), time)
+                _with_times(source.batches(columns), log, str(time_column), mapping)
                 for time_column, columns in columns_by_time.items()
             ]
         held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
         signals = {signal.column for signal in mapping.signals.values()}
-        for rows in merge_bases([*map(metered, bases)], time, held, split_gap_s, signals):
+        for rows in merge_bases([*map(metered, bases)], OWN_TIME, held, split_gap_s, signals):
             yield from rows.iter_slices(BATCH_ROWS)
 
 
 def read_columns(log: Path, mapping: Mapping, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
     """Yield columns of a log with one time base, in bounded batches. Raises `InputError`."""
-    with file_errors(log), open_source(log, mapping.formats) as source:
+    with file_errors(log), open_log(log, mapping.formats) as source:
         yield from Budget.for_file(log).metered(source.batches(columns))
 
 
 def _with_times(
-    batches: Iterator[pl.DataFrame], log: Path, time_column: str, time: str
+    batches: Iterator[pl.DataFrame], log: Path, column: str, mapping: Mapping
 ) -> Iterator[pl.DataFrame]:
-    """Yield the rows that have a time, in the common column of times."""
+    """Yield the rows that have a time, with their times in s. Raises `InputError`.
+
+    A text that is no time is NaN. Rows without a time are those of other, longer columns.
+    """
     for batch in batches:
-        if not batch[time_column].dtype.is_numeric():
-            raise InputError(
-                f"{quote_name(log)}: the time {time_column!r} of a signal is not numeric. Give its "
-                "column of times in s."
-            )
-        if time_column == time:
-            yield batch
-        else:
-            yield batch.filter(pl.col(time_column).is_not_null()).rename({time_column: time})
+        try:
+            times_s = seconds_of(batch[column], mapping.time, mapping.formats).alias(OWN_TIME)
+        except ValueError as error:
+            raise InputError(f"{quote_name(log)}: {error}") from None
+        rows = batch.with_columns(times_s)
+        yield rows.filter(pl.col(OWN_TIME).is_not_null())
+
+
+LATER = "\0later"
+"""Column that is true in the second of two equal hours, when clocks are set back."""
+_SET_BACK_S = (1200.0, 7500.0)
+"""Steps back in time, in s, by which clocks are set."""
+
+
+def _with_later_hours(batches: Iterator[pl.DataFrame], mapping: Mapping) -> Iterator[pl.DataFrame]:
+    """Yield rows with `LATER`, where the mapping names the zone of its timestamps."""
+    time, column = mapping.time, mapping.time.column
+    if time.zone is None or column is None or time.date is not None:
+        yield from batches
+        return
+    local, before_s, is_later = time.model_copy(update={"zone": None}), np.nan, False
+    for batch in batches:
+        local_s = seconds_of(batch[column], local, mapping.formats).to_numpy()
+        steps_s = np.diff(local_s, prepend=before_s)
+        back = (steps_s <= -_SET_BACK_S[0]) & (steps_s >= -_SET_BACK_S[1])
+        turns = np.where(back, 1, np.where(np.abs(steps_s) >= _SET_BACK_S[0], -1, 0))
+        last = np.maximum.accumulate(np.where(turns != 0, np.arange(turns.size), -1))
+        later = np.where(last >= 0, turns[last] > 0, is_later)
+        if later.size:
+            before_s, is_later = local_s[-1], bool(later[-1])
+        yield batch.with_columns(pl.Series(LATER, later, dtype=pl.Boolean))
 
 
 # Several time bases become one table: a row is a sample of one base, and null in the columns of the

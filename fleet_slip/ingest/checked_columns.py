@@ -19,11 +19,12 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.batches import DISORDER, HELD, ROW, read_batches, read_columns
+from fleet_slip.ingest.batches import DISORDER, HELD, LATER, ROW, read_batches, read_columns
 from fleet_slip.ingest.columns import (
     NO_NUMBER,
     DateColumn,
     SignalColumn,
+    as_clock_s,
     as_moments,
     conversion_factor,
     count_range,
@@ -31,7 +32,7 @@ from fleet_slip.ingest.columns import (
     parse_numbers,
 )
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS, FEWER
-from fleet_slip.ingest.formats.source import BASE
+from fleet_slip.ingest.formats.source import BASE, OWN_TIME
 from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
@@ -141,13 +142,18 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
 
 def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     """Return the field of the time in s, since 1970 for timestamps. Raises `InputError`."""
-    unit = "s" if mapping.time.own_clock else mapping.time.unit
+    unit = "s" if column == OWN_TIME else mapping.time.unit
     if unit is None:
         return _timestamp(column, schema, mapping)
     number, present = as_number(column, schema, mapping)
     faults = _number_faults("time", present, "missing", pl.col("time").is_null())
     time_s = number * conversion_factor(unit, "s")
     return RowField("time", "time", pl.col(RAW + column), time_s, faults)
+
+
+def _later(schema: pl.Schema) -> pl.Expr | None:
+    """Return where an hour that comes twice is the second one."""
+    return pl.col(RAW + LATER) if RAW + LATER in schema else None
 
 
 def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
@@ -158,7 +164,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
         if mapping.time.date is not None:
             text = _dates(mapping.time.date, schema, mapping) + " " + text
         if not mapping.time.is_dated:  # the time of day
-            clock_s = text.str.to_time(mapping.time.format, strict=False).cast(pl.Int64) / 1e9
+            clock_s = as_clock_s(text, mapping.time.format)
             return RowField("time", "time", raw, clock_s, _time_faults("time", text))
         moment = as_moments(text, str(mapping.time.moment_format))
     elif isinstance(kind, pl.Datetime):
@@ -166,10 +172,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     else:
         needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
         raise unfit_column(column, kind, needed)
-    if mapping.time.zone is not None and getattr(kind, "time_zone", None) is None:
-        moment = moment.dt.replace_time_zone(
-            mapping.time.zone, ambiguous="earliest", non_existent="null"
-        )
+    moment = mapping.time.in_utc(moment, kind, _later(schema))
     first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
     outside = (value < 0) | (value >= (end - first).total_seconds())
     faults = _time_faults("time", text, outside)
@@ -198,13 +201,14 @@ def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
         _METADATA[name](name, find_held(column, schema), schema, mapping)
         for name, column in _key_columns(mapping).items()
     ]
-    if mapping.time.key is not None:
-        fields.append(time_field(mapping.time.key, schema, mapping))
+    time = OWN_TIME if RAW + OWN_TIME in schema else mapping.time.key
+    if time is not None:
+        fields.append(time_field(time, schema, mapping))
         if RAW + DISORDER in schema:
             # The faults of times within their base, found by `merge_bases`.
             reasons = ("time_backwards", "time_duplicate", "isolated")
             faults = {reason: pl.col(RAW + DISORDER) == reason for reason in reasons}
-            fields.append(_condition(faults, raw=pl.col(RAW + mapping.time.key), name="time"))
+            fields.append(_condition(faults, raw=pl.col(RAW + time), name="time"))
     names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
     signals = [_signal(name, schema, mapping) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])

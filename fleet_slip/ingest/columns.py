@@ -335,6 +335,43 @@ class TimeBase(Config):
         """The format of a text, preceded by the date if that is a separate column."""
         return self.format if self.date is None else f"{self.date.format} {self.format}"
 
+    def in_s(self, raw: pl.Expr, kind: pl.DataType, *, decimal_comma: bool = False) -> pl.Expr:
+        """Return times in s, since 1970 if they have a date; null for an empty one, NaN for none.
+
+        Raises `ValueError` for a column of another type.
+        """
+        if isinstance(kind, pl.Datetime):
+            return self.in_utc(raw, kind).dt.epoch("us") / 1e6
+        if self.unit is not None:
+            number = raw.cast(pl.Float64) if kind.is_numeric() else raw
+            if kind == pl.String:
+                text = raw.str.strip_chars()
+                number = parse_numbers(text, decimal_comma=decimal_comma)
+                number = number.fill_null(pl.when(text != "").then(float("nan")))
+            return number * conversion_factor(self.unit, "s")
+        if kind != pl.String or self.format is None:
+            raise ValueError(
+                f"column {self.column!r} has the type {kind}; the mapping needs a time: add 'unit' "
+                "for numbers, 'format' for timestamps as text"
+            )
+        text = raw.str.strip_chars()
+        if self.is_dated:
+            time_s = self.in_utc(as_moments(text, self.format), kind).dt.epoch("us") / 1e6
+        else:
+            time_s = as_clock_s(text, self.format)
+        return time_s.fill_null(pl.when(text != "").then(float("nan")))
+
+    def in_utc(self, moment: pl.Expr, kind: pl.DataType, later: pl.Expr | None = None) -> pl.Expr:
+        """Return timestamps without a zone as those of `zone`.
+
+        Of an hour that comes twice, when clocks are set back, it is the second where `later`.
+        """
+        if self.zone is None or getattr(kind, "time_zone", None) is not None:
+            return moment
+        is_later = pl.lit(value=False) if later is None else later
+        ambiguous = pl.when(is_later).then(pl.lit("latest")).otherwise(pl.lit("earliest"))
+        return moment.dt.replace_time_zone(self.zone, ambiguous=ambiguous, non_existent="null")
+
     @property
     def key(self) -> str | None:
         """The column that has the times of a batch, None if the rows are equally spaced."""
@@ -349,6 +386,20 @@ def as_moments(text: pl.Expr, timestamp_format: str) -> pl.Expr:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pl.exceptions.ChronoFormatWarning)
         return text.str.to_datetime(timestamp_format, time_unit="us", strict=False)
+
+
+_DIGITS_ALONE = "%H%M%S"
+
+
+def as_clock_s(text: pl.Expr, clock_format: str) -> pl.Expr:
+    """Return times of the day in s, null where texts are none.
+
+    Digits alone may lack the noughts of the hour: 91430.5 is 09:14:30.5.
+    """
+    if clock_format.startswith(_DIGITS_ALONE):
+        digits = text.str.extract(r"^(\d*)", 1).str.len_chars()
+        text = text.str.zfill(6 + text.str.len_chars() - digits)
+    return text.str.to_time(clock_format, strict=False).cast(pl.Int64) / 1e9
 
 
 def _reads_back(timestamp_format: str) -> bool:

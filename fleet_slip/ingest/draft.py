@@ -17,10 +17,12 @@ from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import TimeBase
+from fleet_slip.ingest.file_groups import FileGroup
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
     guess_cars,
+    guess_rasters,
     guess_signals,
     guess_time,
     headings,
@@ -63,6 +65,13 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     bases = [guess.profile.channel.base for guess in guesses.values()]
     time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
 
+    rasters = guess_rasters(profile, time, guesses, group)
+    guesses = {
+        name: guess.because(f"its times are in {raster}", time=raster)
+        if (raster := rasters.get(guess.column))
+        else guess
+        for name, guess in guesses.items()
+    }
     guesses = {name: _doubted(guess, guesses) for name, guess in guesses.items()}
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
@@ -140,7 +149,8 @@ def name_of(stem: str) -> str:
 
 def write_draft(draft: Draft, name: str) -> str:
     """Return a mapping in TOML, without the day and the car, which the file does not contain."""
-    called = shlex.quote(quote_name(draft.file))
+    is_lake = isinstance(draft.file, FileGroup)
+    called = shlex.quote(quote_name(draft.file.parents[1] if is_lake else draft.file))
     parts = [_HEAD.format(file=called), f"name = {_value(name)}\n"]
     formats = draft.profile.formats
     if draft.profile.missing:
@@ -166,6 +176,8 @@ def _drive(draft: Draft) -> str:
     if trip is not None:
         lines.append(f"column = {_value(trip)}  # each value is a drive of its own")
     car = draft.drive.get("vehicle_id")
+    if isinstance(draft.file, FileGroup):  # of a lake
+        car = {"path": "{}/*"}
     if car is not None:
         lines.append(f"vehicle_id = {_value(car)}")
     else:

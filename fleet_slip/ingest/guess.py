@@ -292,23 +292,13 @@ def guess_time(
     """Return where time is from; of several cars in turns, that of the first is looked at."""
     if profile.has_clock:
         return TimeGuess({"own_clock": True}, "the file says when each sample was taken", None)
-    candidates, time_words = [], set(vocabulary()["time"]["words"])
-    for candidate in profile.profiles:
-        values = (
-            candidate.values[group == group[0]]
-            if group.size == candidate.values.size > 0
-            else candidate.values
-        )
-        words = parts_of(split_unit(candidate.channel.name)[0]) if candidate.is_number else ()
-        named = candidate.time_format is not None or not time_words.isdisjoint(words)
-        if not named or candidate.channel.name in taken or candidate.channel.base not in bases:
-            continue
-        values = values[np.isfinite(values)]
-        steps = np.diff(values)
-        if steps.size and (steps >= 0).mean() >= _MIN_RISING_SHARE:
-            candidates.append((float((steps > 0).mean()), candidate, values))
+    candidates = [
+        (float((np.diff(values) > 0).mean()), candidate, values)
+        for candidate, values in _time_candidates(profile, taken, group)
+        if candidate.channel.base in bases
+    ]
     if candidates:
-        _, candidate, values = max(candidates, key=lambda item: round(item[0], 2))
+        _, candidate, values = max(candidates, key=lambda item: round(item[0], 2))  # the first best
         is_text = candidate.time_format is not None
         guess = _timestamps(candidate, values) if is_text else _numbers(candidate, values)
         written = guess.keys.get("format")
@@ -319,6 +309,70 @@ def guess_time(
     keys = {"rate_hz": 100, "assumed": True}
     reason = "no channel looks like a time: 100 Hz is assumed. Correct it, and remove assumed"
     return TimeGuess(keys, reason, 100.0)
+
+
+def _time_candidates(
+    profile: FileProfile, taken: set[str], group: NDArray[np.int64]
+) -> Iterator[tuple[Profile, FloatArray]]:
+    """Yield the columns that are called times and increase, with their values."""
+    time_words = set(vocabulary()["time"]["words"])
+    for candidate in profile.profiles:
+        values = candidate.values
+        if group.size == values.size > 0:
+            values = values[group == group[0]]
+        words = parts_of(split_unit(candidate.channel.name)[0]) if candidate.is_number else ()
+        named = candidate.time_format is not None or not time_words.isdisjoint(words)
+        if not named or candidate.channel.name in taken:
+            continue
+        values = values[np.isfinite(values)]
+        steps = np.diff(values)
+        if steps.size and (steps >= 0).mean() >= _MIN_RISING_SHARE:
+            yield candidate, values
+
+
+def guess_rasters(
+    profile: FileProfile, time: TimeGuess, guesses: Mapping[str, Guess], group: NDArray[np.int64]
+) -> dict[str, str]:
+    """Return the column of times of each column that has another than the file's.
+
+    In a text file it is the last one before the column, in others one of as many rows. A second
+    clock of the same rows is none.
+    """
+    if profile.has_clock or "column" not in time.keys:
+        return {}
+    taken = {guess.column for guess in guesses.values()}
+    candidates = {
+        candidate.channel.name: (candidate, values)
+        for candidate, values in _time_candidates(profile, taken, group)
+    }
+    main, main_values = candidates.get(time.keys["column"], (None, np.zeros(0)))
+    if main is None:
+        return {}
+    clocks = {
+        name: candidate
+        for name, (candidate, values) in candidates.items()
+        if name == main.channel.name
+        or candidate.channel.base != main.channel.base
+        or _is_raster(values, main_values)
+    }
+    rasters, current = dict[str, str](), main.channel.name
+    for column in profile.profiles:
+        if column.channel.name in clocks:
+            current = column.channel.name
+        same_base = [n for n, c in clocks.items() if c.channel.base == column.channel.base]
+        raster = current if current in same_base else next(iter(same_base), main.channel.name)
+        if column.channel.name in taken and raster != main.channel.name:
+            rasters[column.channel.name] = raster
+    return rasters
+
+
+def _is_raster(values: FloatArray, main: FloatArray) -> bool:
+    """Return True if times are those of other samples: of another number, or shifted by a step."""
+    step, main_step = np.median(np.diff(values)), np.median(np.diff(main))
+    if values.size != main.size:
+        return bool(step <= 1e4 * main_step)
+    shift = np.abs(values - main)
+    return bool(abs(step / main_step - 1) < 0.01 and 0 < shift.max() < 2 * main_step)
 
 
 def _with_date(guess: TimeGuess, profiles: Iterable[Profile]) -> TimeGuess:

@@ -1,7 +1,8 @@
 """Finds measured logs on this machine: files, and those of a folder or a pattern."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cache
 from glob import glob
@@ -9,9 +10,11 @@ from pathlib import Path
 
 from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.file_groups import FileGroup, group_lake
 from fleet_slip.ingest.formats.confined_reader import FORMATS
 from fleet_slip.ingest.formats.parquet_footer import MAGIC
 from fleet_slip.ingest.formats.reading import StrayLink
+from fleet_slip.ingest.mapping import FilePattern, Mapping
 
 SUFFIXES = (
     ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
@@ -50,11 +53,12 @@ class LogFiles(list[Path]):
         )
 
 
-def find_logs(paths: Iterable[Path | str]) -> LogFiles:
+def find_logs(paths: Iterable[Path | str], mapping: Mapping | None = None) -> LogFiles:
     """Return the given files, and the logs in the given folders, sorted.
 
     A path that does not exist may be a pattern such as `2024-*/*.mf4`. The suffix identifies logs
-    in folders, or the first bytes; hidden files and folders are skipped. Raises
+    in folders, or the first bytes; hidden files and folders are skipped. Several files are
+    one log, a `FileGroup`, in a lake of messages and by the patterns of a mapping. Raises
     `InputError` for no files.
     """
     places, passed_over = list(paths), list[Path]()
@@ -65,7 +69,28 @@ def find_logs(paths: Iterable[Path | str]) -> LogFiles:
                 "aws s3 sync URL FOLDER"
             )
     files = [file for place in places for file in _files_of(Path(place), passed_over)]
+    if mapping is not None and mapping.file:
+        files = _group_by_patterns(files, mapping.file, passed_over)
+    elif mapping is None or mapping.time.own_clock:
+        files = group_lake(files)
     return LogFiles(files, sorted(passed_over))
+
+
+def _group_by_patterns(
+    files: Iterable[Path], patterns: Sequence[FilePattern], passed_over: list[Path]
+) -> list[Path]:
+    """Return a log for each drive of which there are all files; others are passed over."""
+    members: dict[Path, dict[str, tuple[Path, ...]]] = defaultdict(dict)
+    for file in files:
+        for pattern in patterns:
+            if (match := pattern.find(file)) is not None:
+                members[match[0] / match[1]][pattern.name] = (file,)
+                break
+        else:
+            passed_over.append(file)
+    return [
+        FileGroup.create(path, files_of_drive) for path, files_of_drive in sorted(members.items())
+    ]
 
 
 def _files_of(path: Path, passed_over: list[Path]) -> list[Path]:

@@ -212,6 +212,35 @@ class DriveMetadata(Config):
     adhesion: PositiveFloat | Elsewhere | None = None
 
 
+class FilePattern(Config):
+    """One of several files of a drive: those whose paths have equal texts at {}."""
+
+    name: Annotated[str, Field(pattern=r"^[^/]+$", max_length=100)]
+    """How its columns begin: `NAME/COLUMN`."""
+    path: Name
+    """Pattern of the path, `{}_imu.csv`: `{}` is the name of the drive."""
+    time: TimeBase | None = None
+    """The column of its times, unless the file has a clock."""
+
+    @model_validator(mode="after")
+    def _is_pattern(self) -> "FilePattern":
+        FromPath(path=self.path)
+        if self.time is not None and self.time.column is None:
+            raise ValueError("time needs a 'column'")
+        return self
+
+    def find(self, file: Path) -> tuple[Path, str] | None:
+        """Return the folder above the pattern, and the text at {}; None for another file."""
+        components = self.path.split("/")
+        names = file.parts[-len(components) :]
+        if len(names) < len(components):
+            return None
+        matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
+        if None in matches:
+            return None
+        return Path(*file.parts[: -len(components)]), "".join(map(str, matches))
+
+
 class Mapping(Config):
     """How one kind of measured file becomes drives. Identifies itself by `name`.
 
@@ -223,6 +252,8 @@ class Mapping(Config):
     missing: tuple[str, ...] = ()
     """Texts that mean "no value", in addition to the empty one; `nan` includes NaN."""
     csv: CsvFormat = CsvFormat()
+    file: tuple[FilePattern, ...] = added(())
+    """Patterns of the files of which each drive has several."""
     can: CanBus | None = added(None)
     time: TimeBase
     drive: DriveMetadata
@@ -265,9 +296,11 @@ class Mapping(Config):
             raise ValueError(
                 "drive.day is missing, and the time has no date. Set a date, a column or a path"
             )
+        if self.file and not self.time.own_clock:
+            raise ValueError("file: set own_clock = true under [time]; each file has its own times")
         for name, signal in self.signals.items():
-            if signal.time is not None and self.time.unit is None:
-                raise ValueError(f"signals.{name}: 'time' needs [time] with 'column' and 'unit'")
+            if signal.time is not None and self.time.column is None:
+                raise ValueError(f"signals.{name}: 'time' needs [time] with a 'column'")
         return self
 
     def __hash__(self) -> int:
@@ -336,6 +369,11 @@ class Mapping(Config):
         return tuple(
             name for name in FRONT_WHEELS if alone and name in self._signal_catalog.signals
         )
+
+    @property
+    def member_times(self) -> dict[str, TimeBase]:
+        """The times of each file of several that belong together, by name."""
+        return {file.name: file.time for file in self.file if file.time is not None}
 
     @property
     def formats(self) -> FileFormats:

@@ -35,7 +35,8 @@ from fleet_slip.ingest.drives import (
     OpenDrives,
     sample_intervals_s,
 )
-from fleet_slip.ingest.formats.reading import file_errors, open_source, require_unchanged_log
+from fleet_slip.ingest.file_groups import FileGroup, open_log
+from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
 from fleet_slip.ingest.mapping import FromColumn, Mapping
@@ -324,9 +325,13 @@ def open_measured(file: Path, mapping: Mapping) -> Iterator[MeasuredLog]:
 
 def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     """Return the digest of a file and a mapping, and that of the file and its folders' keys."""
-    with file_errors(file), file.open("rb") as stream:
-        _require_dense(file, stream.fileno())
-        digest = hashlib.file_digest(stream, "sha256")
+    if isinstance(file, FileGroup):
+        digest = hashlib.sha256()
+        for member, files in sorted(file.members.items()):
+            digests = [_file_digest(part).hexdigest() for part in files]
+            digest.update(canonical_ascii({member: digests}).encode())
+    else:
+        digest = _file_digest(file)
     content, of_folders = digest.copy(), partition_keys(file)
     used = {name for names in mapping.time_bases().values() for name in names}
     if keys := {key: text for key, text in of_folders.items() if key in used}:
@@ -334,6 +339,13 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     content.update(canonical_ascii(of_folders).encode())
     digest.update(mapping.canonical_json().encode())
     return digest.hexdigest(), content.hexdigest()
+
+
+def _file_digest(file: Path) -> "hashlib._Hash":
+    """Return the SHA-256 of a file's bytes. Raises `InputError`."""
+    with file_errors(file), file.open("rb") as stream:
+        _require_dense(file, stream.fileno())
+        return hashlib.file_digest(stream, "sha256")
 
 
 FREE_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
@@ -428,7 +440,7 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
     if mapping.time.own_clock or not unmapped:
         return
     used = {name for names in mapping.time_bases().values() for name in names}
-    with file_errors(file), open_source(file, mapping.formats) as source:
+    with file_errors(file), open_log(file, mapping.formats) as source:
         names = [channel.name for channel in source.channels()]
         for key, words in unmapped.items():
             for name in names:

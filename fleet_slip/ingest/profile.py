@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import parse_numbers
+from fleet_slip.ingest.file_groups import FileGroup, open_log
 from fleet_slip.ingest.formats.csv import decompressed, first_lines
 from fleet_slip.ingest.formats.file_formats import CanBus, CsvFormat, Encoding, FileFormats
 from fleet_slip.ingest.formats.reading import (
     file_errors,
-    open_source,
     require_unchanged_log,
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
@@ -234,10 +234,11 @@ class FileProfile:
 
 def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
     """Look at the first `PROFILE_ROWS` rows of every channel. Raises `InputError`."""
+    is_text = bus is None and not isinstance(file, FileGroup)
     with require_unchanged_log(file), file_errors(file), ExitStack() as opened:
-        layout, units = guess_layout(file) if bus is None else (CsvFormat(), {})
+        layout, units = guess_layout(file) if is_text else (CsvFormat(), {})
         formats = FileFormats(csv=layout, can=bus)
-        source = opened.enter_context(open_source(file, formats))
+        source = opened.enter_context(open_log(file, formats))
         channels = source.channels()
         with suppress(InputError):  # of a column; some files are read once for all of them
             source.bases([channel.name for channel in channels])

@@ -66,7 +66,7 @@ def best_words(signal: str, name: str, section: str = "signals") -> tuple[float,
     score.
     """
     plain, _ = split_unit(name)
-    behind = plain.partition(".")[2] or plain
+    behind = re.split("[./]", plain, maxsplit=1)[-1] or plain
     exact, prefixes = _never(signal)
     for pieces in _stems_of(behind):
         if any(part in exact or part.startswith(prefixes) for part in pieces):

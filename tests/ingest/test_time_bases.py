@@ -141,7 +141,7 @@ def read_in(
     file = folder / "log.mf4"
     file.write_bytes(b"in memory")
     with ExitStack() as patched:
-        patched.enter_context(mock.patch.object(batches, "open_source", opened))
+        patched.enter_context(mock.patch.object(batches, "open_log", opened))
         patched.enter_context(mock.patch.object(batches, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(batches, "WINDOW_ROWS", window))
         patched.enter_context(mock.patch.object(drives, "MANY_SEGMENTS", 1 + batch % 3))

@@ -1,8 +1,10 @@
 """Values as other programs write them: long numbers, grouped digits, NaN, second headers."""
 
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import h5py
 import numpy as np
@@ -137,3 +139,31 @@ def test_nan_of_parquet_is_missing_and_infinity_is_refused(tmp_path: Path) -> No
     log = read_measured(tmp_path / "log.parquet", a_mapping())
     assert log.counts.rows_kept == 3
     assert log.counts.quarantined == {"not_finite": 1}
+
+
+def test_the_hour_that_comes_twice_is_read_in_its_order(tmp_path: Path) -> None:
+    start = datetime(2024, 10, 27, 0, 30, tzinfo=UTC)
+    moments = [start + timedelta(seconds=i / 2) for i in range(2 * 7200)]
+    texts = [f"{m.astimezone(ZoneInfo('Europe/Berlin')):%Y-%m-%d %H:%M:%S.%f}" for m in moments]
+    time = {"unit": None, "format": "%Y-%m-%d %H:%M:%S%.f", "zone": "Europe/Berlin"}
+    slow = {"longest_gap_s": 2, "split_gap_s": 5}
+    mapping = a_mapping(time=time | slow, drive={"day": None}, signals=AX)
+    columns = {"t": texts, "ax": np.arange(len(texts)) % 5}
+    log = read_text(tmp_path, csv_text(columns), mapping)
+    assert log.counts.quarantined == {}
+    assert log.counts.rows_kept == len(texts)
+    started = [moment.astimezone(UTC) for moment in log.drives["started_at"].unique().to_pylist()]
+    assert min(started) == start
+    assert (max(started) - start).total_seconds() < 7200
+    assert log.counts.ticks == pytest.approx(100 * 7200, rel=0.01)
+
+
+def test_times_of_the_day_may_lack_noughts(tmp_path: Path) -> None:
+    for written, times in (
+        ("%H%M%S%.f", ["95958.5", "95959", "95959.5", "100000"]),
+        ("%H:%M:%S%.f", ["9:59:58.5", "9:59:59", "9:59:59.5", "10:00:00"]),
+    ):
+        time = {"unit": None, "format": written, "longest_gap_s": 1}
+        columns = {"t": times, "ax": [1, 2, 3, 4]}
+        log = read_text(tmp_path, csv_text(columns), a_mapping(time=time, signals=AX))
+        assert (log.counts.rows_kept, log.counts.drives) == (4, 1)
