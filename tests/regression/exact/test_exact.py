@@ -189,24 +189,24 @@ def test_a_dependent_input_among_many_is_named() -> None:
         fit(gram_of(counts), names(41)[:-1], "y")
 
 
-def test_the_condition_number_of_second_differences() -> None:
-    k = 20
-    matrix = [[2 * (i == j) - (abs(i - j) == 1) for j in range(k)] for i in range(k)]
-    low, high = (2 - 2 * math.cos(math.pi * i / (k + 1)) for i in (1, k))
-    assert exact.condition_number(matrix) == pytest.approx(high / low, rel=1e-14)
+SECOND_DIFFERENCES = [[2 * (i == j) - (abs(i - j) == 1) for j in range(20)] for i in range(20)]
+EXTREMES = [2 - 2 * math.cos(math.pi * i / 21) for i in (1, 20)]
+HILBERT = [[360360 // (i + j + 1) for j in range(8)] for i in range(8)]
 
 
-@pytest.mark.parametrize("large", [3, 10**8, 10**20])
-def test_a_small_eigenvalue_is_correctly_rounded(large: int) -> None:
-    # Eigenvalues of the correlations: 1 + (large - 1) / large and 1 / large.
-    matrix = [[large, large - 1], [large - 1, large]]
-    assert exact.condition_number(matrix) == float(2 * large - 1)
-
-
-def test_the_condition_number_of_a_hilbert_matrix_is_that_of_mpmath() -> None:
-    """By mpmath's eigsy with 60 digits, of the matrix scaled to a unit diagonal."""
-    matrix = [[360360 // (i + j + 1) for j in range(8)] for i in range(8)]
-    assert exact.condition_number(matrix) == 5933993485.836007
+@pytest.mark.parametrize(
+    ("matrix", "expected"),
+    [
+        (SECOND_DIFFERENCES, pytest.approx(EXTREMES[1] / EXTREMES[0], rel=1e-14)),
+        # By mpmath's eigsy with 60 digits, of the matrix scaled to a unit diagonal.
+        (HILBERT, 5933993485.836007),
+        # Eigenvalues of the correlations: 1 + (n - 1) / n and 1 / n.
+        *(([[n, n - 1], [n - 1, n]], float(2 * n - 1)) for n in (3, 10**8, 10**20)),
+        *((matrix, math.inf) for matrix in ([[1, 1], [1, 1]], [[0, 0], [0, 0]], [[4, 6], [6, 9]])),
+    ],
+)
+def test_condition_numbers_are_correctly_rounded(matrix: list[list[int]], expected: float) -> None:
+    assert exact.condition_number(matrix) == expected
 
 
 def test_the_last_bits_of_eigenvectors_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,11 +223,6 @@ def test_the_last_bits_of_eigenvectors_do_not_matter(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(np.linalg, "eigh", eigh_of_another_machine)
     assert exact.condition_number(matrix) == expected
-
-
-@pytest.mark.parametrize("matrix", [[[1, 1], [1, 1]], [[0, 0], [0, 0]], [[4, 6], [6, 9]]])
-def test_a_singular_matrix_has_an_infinite_condition(matrix: list[list[int]]) -> None:
-    assert exact.condition_number(matrix) == math.inf
 
 
 def test_a_number_without_a_nearest_double_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,18 +38,22 @@ from tests.support.counts import (
 )
 
 
-def moments_of(drives: list[np.ndarray]) -> DriveMoments:
-    return DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
+def moments_of(drives: list[np.ndarray], *, intercept: bool = True) -> DriveMoments:
+    table = table_of([gram_of(counts) for counts in drives])
+    return DriveMoments.from_table(table if intercept else table.about_origin())
 
 
-@settings(max_examples=25)
+@pytest.mark.parametrize("intercept", [True, False])
+@settings(max_examples=20)
 @given(st.integers(0, 10**6), st.integers(1, 5))
-def test_cluster_errors_are_those_of_the_rows(seed: int, inputs: int) -> None:
-    drives = random_drives(seed, drives=9, inputs=inputs)
+def test_cluster_errors_are_those_of_the_rows(intercept: bool, seed: int, inputs: int) -> None:
+    drives = [counts + 500 for counts in random_drives(seed, drives=9, inputs=inputs)]
     order = [*range(inputs)][::-1][:3]
-    fitted = fit(gram_of(np.concatenate(drives)), [f"x{i + 1}" for i in order], "y")
-    result = infer(fitted, unit_scales(inputs), moments_of(drives))
-    errors, degrees = by_rows([drive[:, [*order, -1]] for drive in drives])
+    signals = [f"x{i + 1}" for i in order]
+    fitted = fit(gram_of(np.concatenate(drives)), signals, "y", intercept=intercept)
+    result = infer(fitted, unit_scales(inputs), moments_of(drives, intercept=intercept))
+    columns = [drive[:, [*order, -1]] for drive in drives]
+    errors, degrees = by_rows(columns, intercept=intercept)
     np.testing.assert_allclose([e.standard_error for e in result.estimates], errors, rtol=1e-7)
     np.testing.assert_allclose([e.degrees_of_freedom for e in result.estimates], degrees, rtol=1e-6)
     p = 2 * scipy.stats.t.sf(np.abs([e.t for e in result.estimates]), degrees)
@@ -134,7 +138,8 @@ def collinear(
     return result
 
 
-@settings(max_examples=30)
+@pytest.mark.parametrize("intercept", [True, False])
+@settings(max_examples=20)
 @given(
     seed=st.integers(0, 10**6),
     inputs=st.integers(1, 8),
@@ -142,36 +147,30 @@ def collinear(
     collinearity=st.floats(0, 10),
     scale=st.floats(30, 900),
 )
-def test_coefficients_and_both_kinds_of_errors_agree(
-    seed: int, inputs: int, drives: int, collinearity: float, scale: float
+def test_coefficients_errors_and_evidence_are_those_of_statsmodels(
+    intercept: bool, seed: int, inputs: int, drives: int, collinearity: float, scale: float
 ) -> None:
     parts = collinear(seed, inputs, drives, collinearity, scale)
     counts = np.concatenate(parts)
-    fitted = fit(gram_of(counts), names(inputs)[:-1], "y")
-    model = sm.OLS(counts[:, -1].astype(float), sm.add_constant(counts[:, :-1].astype(float)))
+    fits = nested_fits(gram_of(counts), names(inputs)[:-1], "y", intercept=intercept)
+    x, y = counts[:, :-1].astype(float), counts[:, -1].astype(float)
+    model = sm.OLS(y, sm.add_constant(x) if intercept else x)
+    result, expected = infer(fits[-1], unit_scales(inputs)), model.fit()
+    largest = np.abs(expected.params).max()
+    values, errors, p = zip(
+        *((e.value, e.standard_error, e.p) for e in result.estimates), strict=True
+    )
+    np.testing.assert_allclose(values, expected.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
+    np.testing.assert_allclose(errors, expected.bse, rtol=AGREEMENT)
+    assert abs(result.residual_std / np.sqrt(expected.scale) - 1) < AGREEMENT
+    np.testing.assert_allclose(p, expected.pvalues, rtol=1e-7, atol=1e-14)
     groups = np.repeat(np.arange(drives), [len(part) for part in parts])
-    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]))
-    mine, theirs = infer(fitted, unit_scales(inputs)), model.fit()
-    largest = np.abs(theirs.params).max()
-    values = [estimate.value for estimate in mine.estimates]
-    np.testing.assert_allclose(values, theirs.params, rtol=AGREEMENT, atol=AGREEMENT * largest)
-    errors = [estimate.standard_error for estimate in mine.estimates]
-    np.testing.assert_allclose(errors, theirs.bse, rtol=AGREEMENT)
-    assert abs(mine.residual_std / np.sqrt(theirs.scale) - 1) < AGREEMENT
-    p = [estimate.p for estimate in mine.estimates]
-    np.testing.assert_allclose(p, theirs.pvalues, rtol=1e-7, atol=1e-14)
     clustered = model.fit(cov_type="cluster", cov_kwds={"groups": groups})
-    fits = nested_fits(gram_of(counts), names(inputs)[:-1], "y")
-    last = Evidence.clustered(fits, moments).contributions[-1]
+    last = Evidence.clustered(fits, moments_of(parts, intercept=intercept)).contributions[-1]
     assert last == pytest.approx(clustered.tvalues[-1] ** 2, rel=1e-8)
 
 
 INPUTS = names(4)[:-1]
-
-
-def offset_drives(seed: int, offset: int = 500) -> list[Matrix]:
-    """Drives whose signals are far from zero on average, so that an intercept matters."""
-    return [counts + offset for counts in random_drives(seed)]
 
 
 def through_origin(counts: Matrix) -> Matrix:
@@ -179,43 +178,8 @@ def through_origin(counts: Matrix) -> Matrix:
     return np.asarray(np.linalg.lstsq(x, y, rcond=None)[0])
 
 
-@settings(max_examples=20)
-@given(seed=st.integers(0, 10**6))
-def test_coefficients_and_both_kinds_of_errors_are_those_of_statsmodels(seed: int) -> None:
-    parts = offset_drives(seed)
-    counts = np.concatenate(parts)
-    fitted = fit(gram_of(counts), INPUTS, "y", intercept=False)
-    model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
-    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
-    classical, clustered = (
-        infer(fitted, unit_scales(4)),
-        infer(fitted, unit_scales(4), moments),
-    )
-    expected = model.fit()
-    both = (classical, expected.bse), (clustered, by_rows(parts, intercept=False)[0])
-    for mine, errors_of_rows in both:
-        assert [estimate.name for estimate in mine.estimates] == list(INPUTS)
-        values = [estimate.value for estimate in mine.estimates]
-        np.testing.assert_allclose(values, expected.params, rtol=1e-8, atol=1e-9)
-        errors = [estimate.standard_error for estimate in mine.estimates]
-        np.testing.assert_allclose(errors, errors_of_rows, rtol=1e-7)
-
-
-def test_the_evidence_of_the_last_signal_is_its_squared_t_value() -> None:
-    parts = offset_drives(3)
-    gram = gram_of(np.concatenate(parts))
-    moments = DriveMoments.from_table(table_of([gram_of(part) for part in parts]).about_origin())
-    fits = nested_fits(gram, INPUTS, "y", intercept=False)
-    counts = np.concatenate(parts)
-    model = sm.OLS(counts[:, -1].astype(float), counts[:, :-1].astype(float))
-    groups = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    theirs = model.fit(cov_type="cluster", cov_kwds={"groups": groups})
-    last = Evidence.clustered(fits, moments).contributions[-1]
-    assert last == pytest.approx(theirs.tvalues[-1] ** 2, rel=1e-9)
-
-
 def test_the_best_subsets_and_orders_are_those_of_the_rows() -> None:
-    counts = np.concatenate(offset_drives(4))
+    counts = np.concatenate(random_drives(4)) + 500
     gram = gram_of(counts).about_origin()
 
     def rss(columns: list[int]) -> float:
