@@ -126,15 +126,6 @@ def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Ware
     assert not any(map(warehouse.quarantine.snapshot().transaction_lookup(99), names))
 
 
-def test_a_snapshot_does_not_see_later_commits(warehouse: Warehouse) -> None:
-    first = warehouse.logs.write_file("one", rows("a"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[first], transactions=[AppTransaction("1", 1)]))
-    before = warehouse.logs.snapshot()
-    second = warehouse.logs.write_file("two", rows("b"), DAY)
-    warehouse.logs.snapshot().commit(Change(add=[second], transactions=[AppTransaction("2", 1)]))
-    assert (before.rows, warehouse.logs.snapshot().rows) == (1000, 2000)
-
-
 def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
     (tmp_path / "data").write_text("not a folder")
     with pytest.raises(
