@@ -17,6 +17,7 @@ from fleet_slip.catalog.definitions import (
     Definition,
     Made,
     Product,
+    Slope,
     limit_of,
     parity,
     plain_column,
@@ -134,6 +135,8 @@ class EstimateSubstitution:
         if isinstance(composite, Combination):
             terms = tuple((factor, self(column)) for factor, column in composite.terms)
             return composite.model_copy(update={"terms": terms})
+        if not isinstance(composite, Slope):  # a filter reads no estimate
+            return composite
         equations = [
             equation.model_copy(
                 update={

@@ -15,10 +15,18 @@ from collections.abc import Iterator, Mapping
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
+from itertools import pairwise
 from random import Random
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, StringConstraints, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    StringConstraints,
+    ValidationInfo,
+    model_validator,
+)
 
 from fleet_slip.catalog.arithmetic import evaluate, parse
 from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
@@ -117,6 +125,9 @@ LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
 
 
 _LEFT_OUT = Field(exclude_if=lambda value: value is None)
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NotNegativeFloat = Annotated[FiniteFloat, Field(ge=0)]
 
 
 class AttributeFactor(Config):
@@ -298,7 +309,114 @@ class Slope(Config):
         return tuple(column for equation in self.equations for column in equation.columns)
 
 
-Made = Combination | Product | Slope
+class ObserverInput(Config):
+    """A measured quantity: `scale` times the sum of columns, or their difference, minus `offset`.
+
+    The scale is that of the count in SI units, with the gain of the sensor.
+    """
+
+    of: tuple["Definition", ...] = Field(min_length=1, max_length=2)
+    scale: FiniteFloat
+    adds: bool = True
+    offset: FiniteFloat = 0.0
+
+
+class ObserverCar(Config):
+    """Car and noise of an observer, in SI units; stiffnesses are the peaks of one tyre."""
+
+    mass_kg: Positive
+    yaw_inertia_kgm2: Positive
+    front_axle_m: Positive
+    rear_axle_m: Positive
+    height_m: Positive
+    track_front_m: Positive
+    track_rear_m: Positive
+    front_roll_share: Positive
+    roll_lag_s: Positive
+    pitch_lag_s: Positive
+    stiffness_front_n: Positive
+    stiffness_rear_n: Positive
+    stiffness_load_n: Positive
+    friction: Positive
+    friction_load_sensitivity: NotNegativeFloat
+    nominal_load_n: Positive
+    ax_std_mps2: NotNegativeFloat
+    lateral_model_std_mps2: NotNegativeFloat
+    yaw_model_std_rad_s2: NotNegativeFloat
+    wheel_speed_std_mps: Positive
+    yaw_rate_std_rad_s: Positive
+    ay_std_mps2: Positive
+    ay_bias_std_mps2: NotNegativeFloat
+    gyro_std_rad_s: Positive
+    gyro_bias_std_rad_s: Positive
+    wheel_yaw_rate_std_rad_s: Positive
+    yaw_acceleration_std_rad_s2: Positive
+
+
+class Observer(Config):
+    """An extended Kalman filter of the single-track model (`fleet_slip.columns.observer`).
+
+    Its value is the side-slip angle in 2⁻¹⁶ rad.
+
+    Attributes
+    ----------
+    speed, wheels
+        Speed of the wheels, and the right wheel's minus the left one's; without `wheels` a single
+        speed replaces those of all wheels.
+    ax
+        None if it is not logged: the change of the speed replaces it.
+    axle
+        The axle of `speed` and `wheels`: front wheels turn.
+    """
+
+    ay: ObserverInput
+    yaw_rate: ObserverInput
+    speed: ObserverInput
+    steer: ObserverInput
+    ax: Annotated[ObserverInput | None, _LEFT_OUT] = None
+    wheels: Annotated[ObserverInput | None, _LEFT_OUT] = None
+    axle: Literal["front", "rear"] = "rear"
+    car: ObserverCar
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        inputs = (self.ay, self.yaw_rate, self.speed, self.steer, self.ax, self.wheels)
+        return tuple(column for entry in inputs if entry for column in entry.of)
+
+
+class Blend(Config):
+    """The filter plus a share of the clipped difference to the line, in 2⁻¹⁶ rad.
+
+    See `fleet_slip.regression.combination`; `shares` are in 2⁻¹⁶, `limits` in 2⁻¹⁶ rad, at `knots`
+    in counts of the column `lateral`. Where the line has no value it is the filter.
+    """
+
+    filter: "Definition"
+    line: "Annotated[Definition | None, _LEFT_OUT]" = None
+    anchor: Literal["line", "filter"] = "filter"
+    shares: tuple[Annotated[int, Field(ge=0, le=2**16)], ...] = (0,)
+    limits: tuple[Annotated[int, Field(ge=0, lt=2**19)], ...] = (0,)
+    lateral: "Annotated[Definition | None, _LEFT_OUT]" = None
+    knots: tuple[Annotated[int, Field(ge=0, lt=2**20)], ...] = (0,)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Blend":
+        if not len(self.shares) == len(self.limits) == len(self.knots):
+            raise ValueError("shares, limits and knots have the same number of values")
+        if any(a >= b for a, b in pairwise(self.knots)):
+            raise ValueError("the knots increase")
+        if (self.lateral is None) != (len(self.knots) == 1):
+            raise ValueError("several knots need a column lateral, a single one has none")
+        return self
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of."""
+        return tuple(column for column in (self.filter, self.line, self.lateral) if column)
+
+
+Made = Combination | Product | Slope | Observer | Blend
 """Composites of other columns."""
 
 

@@ -36,6 +36,7 @@ from fleet_slip.columns.lowering import (
     plain_of,
     size_of,
 )
+from fleet_slip.columns.recursion import Recursion
 from fleet_slip.errors import QuestionError
 
 # The operations of a program over blocks of rows: whole numbers, and one of four ratios or limits.
@@ -50,7 +51,8 @@ BLOCK_ROWS = 2**10
     LEAST, MOST, DIVIDE, NEAREST, FILL, BROADCAST, AT_LEAST, WHERE, ELSE, TO_BINARY64, CLIP, SHARE,
     SCALE, POWER,
     ADD_UP, KEEP, QUOTIENT, AGO,  # on the rows of before
-) = range(25)  # fmt: skip
+    PUT, RECUR,  # an input of the recursive steps, and these steps row by row
+) = range(27)  # fmt: skip
 
 INTEGERS = 30
 """An operation plus this writes int64; that of `COPY` reads binary64."""
@@ -86,6 +88,7 @@ class Region(IntEnum):
     COUNT = 6
     VALUE = 7
     BEGIN = 8
+    RECURSION = 9
 
 
 # A program of vector operations: how it is written, and put into a memory.
@@ -131,6 +134,8 @@ class Code:
         The values that are summed, and stored, over a drive.
     kinds
         Windows of different lengths in ticks.
+    recursion, outputs
+        The recursive steps, and those of them that others read, with their numbers.
     """
 
     operations: list[VectorOperation] = field(default_factory=list)
@@ -139,6 +144,8 @@ class Code:
     summed: dict[Value, int] = field(default_factory=dict)
     stored: dict[Value, int] = field(default_factory=dict)
     kinds: dict[int, int] = field(default_factory=dict)
+    recursion: Recursion = field(default_factory=lambda: Recursion((), ()))
+    outputs: dict[int, int] = field(default_factory=dict)
     _numbers: dict[VectorOperation, int] = field(default_factory=dict)
 
     def add(self, operation: VectorOperation) -> int:
@@ -167,7 +174,7 @@ class Code:
         }
         count, free = len(registers), list[int]()
         for number, operation in enumerate(self.operations):
-            if number not in registers and operation.operation not in {ADD_UP, KEEP}:
+            if number not in registers and operation.operation not in {ADD_UP, KEEP, PUT, RECUR}:
                 if not free:
                     free, count = [count], count + 1
                 registers[number] = free.pop()
@@ -202,6 +209,12 @@ class BlockProgram:
         """The ratio of each step, shape (steps, 4)."""
         return np.array([operation.ratio for operation in self.code.operations])
 
+    @cached_property
+    def outputs(self) -> NDArray[np.int64]:
+        """Places of the recursive steps that others read."""
+        places = self.code.recursion.places
+        return np.array([places[number] for number in self.code.outputs], dtype=np.int64)
+
     def regions(self, rows: int) -> NDArray[np.int64]:
         """Return each region's begin and stride for so many rows, and the memory's size last."""
         code = self.code
@@ -215,6 +228,7 @@ class BlockProgram:
             Region.COUNT: (len(code.summed), rows + 1),
             Region.VALUE: (len(code.stored), rows),
             Region.BEGIN: (len(code.kinds), rows),
+            Region.RECURSION: (len(code.recursion.inputs) + len(code.outputs), STRIDE),
         }
         # Whoever reads what is of the car as a block must not read beyond the end.
         sizes = [parts * size for parts, size in shapes.values()] + [BLOCK_ROWS]
@@ -284,6 +298,8 @@ class _Writer:
         self._of_car = [*counted.lowered.facts, *counted.lowered.numbers]
         self._counted, self._steps, self._ranges = counted, counted.steps, counted.ranges
         self._facts = len(counted.lowered.facts)
+        self.code.recursion = Recursion.of_steps(counted.steps)
+        self._recursive = frozenset(self.code.recursion.members)
         self.value = cache(self._value)
         self.integers = cache(self._integers)
         self._is_integer = cache(self._needs_integers)
@@ -296,6 +312,8 @@ class _Writer:
             return self._do(FILL, ratio=(float(constant), 1.0, 0.0, inf))
         if name in GIVEN:
             return self._signal_or_car(name, plain[0])
+        if number in self._recursive:
+            return self._recur(number)
         if self._is_integer(number):
             value = self._do(TO_BINARY64, self.integers(number, guard))
             return self._do(WHERE, value, self._present(number, guard))
@@ -303,6 +321,15 @@ class _Writer:
         if not any(self._is_integer(operand) for operand in operands_of(step)):
             fused = self._fused(number, guard)
         return self._plain(number, guard) if fused is None else fused
+
+    def _recur(self, number: int) -> Value:
+        """Run the recursive steps once, and read one of them."""
+        inputs = self.code.recursion.inputs
+        for place, source in enumerate(inputs):
+            self._do(PUT, self.value(source), (Region.RECURSION, place))
+        self._do(RECUR, NOWHERE, (Region.RECURSION, 0), number=len(inputs))
+        place = len(inputs) + _number(self.code.outputs, number)
+        return self._do(COPY, (Region.RECURSION, place))
 
     def _signal_or_car(self, name: str, place: int) -> Value:
         if name == "signal":
@@ -318,7 +345,9 @@ class _Writer:
                 return write(self, number, bindings, guard)
         return None
 
-    def _plain(self, number: int, guard: int | None) -> Value:
+    def _plain(  # noqa: PLR0911 - one for each kind of operation
+        self, number: int, guard: int | None
+    ) -> Value:
         name, plain = operation_of(self._steps[number]), plain_of(self._steps[number])
         if name == "at_least" and self._is_integer(plain[0]):
             # Rounded to binary64, the difference keeps its sign.
@@ -330,6 +359,10 @@ class _Writer:
             return self._ago(plain[0], plain[1])
         if name == "sum":  # of a slope: what is missing is 0 there already
             return self._quotient(number, {"row": plain[0], "ticks": plain[1], "#fixed": 1}, guard)
+        if name == "shift":
+            return self._do(
+                SCALE, self.value(plain[0], guard), ratio=(1.0, 2.0 ** plain[1], 0.0, inf)
+            )
         if name == "clip":
             return self._clip(number, plain[0], self._ranges[plain[1]][1], guard)
         if name == "where":
@@ -383,6 +416,8 @@ class _Writer:
         """Return True if an operation on the counts of a row, or an operand, may reach 2^53."""
         step = self._steps[number]
         if step[0] not in _INTEGERS or self._constant(number) is not None:
+            return False
+        if number in self._recursive:
             return False
         if any(OPERATIONS[operation_of(self._steps[n])].over_time for n in operands_of(step)):
             return False  # a drive with so many rows is refused

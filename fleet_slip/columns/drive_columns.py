@@ -101,8 +101,10 @@ class Workspace:
         place, stride = self._regions[Region.REGISTER]
         registers = self._memory[place : place + columns * stride].reshape(columns, stride)
         program, ticks = (self._steps, self._program.ratios), self._regions[Region.TICK, 0]
+        recursion = self._program.code.recursion
+        recursive = (recursion.code, recursion.memory(), self._program.outputs)
         for first in range(0, rows, BLOCK_ROWS):
-            run(*program, self._memory, self._flags, rows, ticks, first)
+            run(*program, self._memory, self._flags, rows, ticks, first, *recursive)
             size = min(BLOCK_ROWS, rows - first)
             yield slice(first, first + size), registers[:, :size], self._memory[:size]
 

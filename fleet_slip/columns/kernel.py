@@ -6,6 +6,7 @@ import numpy as np
 
 from fleet_slip.columns import block_program as op
 from fleet_slip.columns.block_program import EACH, FIXED, LIMIT, NUMERATOR
+from fleet_slip.columns.recursion import run_recursion
 from fleet_slip.compiling import equation, inner_loop, kernel
 
 # Compiled loops of integer arithmetic on the rows of a block.
@@ -285,17 +286,32 @@ GAPS, FOUND = 0, 1
 
 @kernel
 def run(
-    steps: Any, ratios: Any, memory: Any, flags: Any, rows: int, ticks: int, first: int
+    steps: Any,
+    ratios: Any,
+    memory: Any,
+    flags: Any,
+    rows: int,
+    ticks: int,
+    first: int,
+    recursion: Any,
+    words: Any,
+    outputs: Any,
 ) -> None:
     """Compute the block of rows that begins with `first`.
 
     `steps` and `ratios` are a program, `memory` its registers, `flags` the state of sums and
-    windows, and `ticks` the place of the ticks in the memory.
+    windows, and `ticks` the place of the ticks in the memory. `recursion` has the recursive steps,
+    `words` their memory and `outputs` the places that others read.
     """
     size = min(op.BLOCK_ROWS, rows - first)
     memory[:size] = 0.0
     for number in range(len(steps)):
-        _do(steps[number], ratios[number], memory, flags, rows, ticks, first, size)
+        step = steps[number]
+        if step[op.OPERATION] == op.RECUR:
+            at, inputs = step[op.B], step[op.NUMBER]
+            run_recursion(recursion, words, outputs, memory, at, op.STRIDE, inputs, size)
+        else:
+            _do(step, ratios[number], memory, flags, rows, ticks, first, size)
 
 
 @inner_loop
@@ -327,6 +343,9 @@ def _do(
         )
     elif operation == op.ADD_UP:
         flags[GAPS, slot] = add_up(memory, a, b, c, first, size, flags[GAPS, slot])
+    elif operation == op.PUT:
+        for i in range(size):
+            memory[b + i] = memory[a + i]
     elif operation == op.KEEP:
         for i in range(size):
             memory[b + first + i] = memory[a + i]

@@ -19,16 +19,19 @@ from fleet_slip.catalog.definitions import (
     MAX_ATTRIBUTE,
     WEIGHT,
     AttributeFactor,
+    Blend,
     Definition,
     Equation,
     Gate,
     Made,
+    Observer,
     ParameterFactor,
     Product,
     Slope,
     limit_of,
 )
 from fleet_slip.catalog.signals import COUNT_MAX
+from fleet_slip.columns.observer import ObserverLowering, lower_blend
 from fleet_slip.errors import QuestionError
 
 Step = tuple[str | int, ...]
@@ -108,6 +111,7 @@ OPERATIONS: Mapping[str, Operation] = {
     "sign": Operation(lambda a: ((a[0] > 0) - (a[0] < 0), (a[1] > 0) - (a[1] < 0)), 1),
     "clip": Operation(lambda _, limit: (-limit[1], limit[1])),
     "power": Operation(_powers),  # of two, the least p with a <= b p
+    "shift": Operation(lambda a, bits: (nearest(a[0], 1 << bits), nearest(a[1], 1 << bits)), 1),
     # Missing values.
     "at_least": Operation(_first, missing="less"),
     "where": Operation(_first),
@@ -116,6 +120,9 @@ OPERATIONS: Mapping[str, Operation] = {
     "ago": Operation(_first, 1, "given", over_time=True),
     "sum": Operation(_sums, 1, "never", over_time=True),
     "values": Operation(lambda *operands: (0, operands[2]), 1, "never", over_time=True),
+    # Recursion: a number of the tick before, 0 at the start, within a limit; its next value.
+    "state": Operation(lambda _, limit: (-limit, limit), 0, "never"),
+    "next": Operation(_first),
 }
 
 GIVEN = ("signal", "fact", "number")
@@ -207,6 +214,8 @@ def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
     if step[0] == "nearest":
         a, b = (size_of(ranges[i]) for i in operands_of(step))
         return 2 * a + b
+    if step[0] == "shift":
+        return size_of(ranges[plain_of(step)[0]]) + (1 << (plain_of(step)[1] - 1))
     return size_of(ranges[number])
 
 
@@ -419,6 +428,10 @@ class Lowering:
         """
         if isinstance(composite, Slope):
             return self._slope(composite)
+        if isinstance(composite, Observer):
+            return ObserverLowering(self, composite).angle()
+        if isinstance(composite, Blend):
+            return lower_blend(self, composite)
         if isinstance(composite, Product):
             factors = [self.column(column) for column in composite.of] or [self.constant(1)]
             product = factors[0] if len(factors) == 1 else self.do("*", *factors)

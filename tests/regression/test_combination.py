@@ -43,8 +43,8 @@ def test_weights_by_hand() -> None:
     label = np.array([0.5, 0.0])
     result = fit_combination(pairs_of(line, filtered, label, np.array([0.0, 1.0])), "constant")
     w_cv = 0.5 * ((-1) * (-0.5) + (-3) * (-3)) / 5
-    assert result.line_share == (pytest.approx(1 - (w_cv + 0.5) / 2),)
-    assert result.std_rad == (pytest.approx(math.sqrt(5)),)
+    assert result.line_share[0] == pytest.approx(1 - (w_cv + 0.5) / 2)
+    assert result.std_rad[0] == pytest.approx(math.sqrt(5))
 
 
 def test_each_group_has_the_same_weight() -> None:

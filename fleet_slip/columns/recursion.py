@@ -1,0 +1,162 @@
+"""Steps that depend on the tick before, run row by row in int64: an interpreter for the kernel."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_slip.columns.lowering import Step, operands_of, operation_of, plain_of
+from fleet_slip.compiling import inner_loop
+
+NAMES = (
+    "state", "next", "+", "-", "*", "shift", "nearest", "//", "clip", "min", "max", "negative",
+    "abs", "sign", "at_least", "where", "else",
+)  # fmt: skip
+"""Operations of the interpreter, by number."""
+
+(
+    STATE, NEXT, ADD, SUBTRACT, MULTIPLY, SHIFT, NEAREST, DIVIDE, CLIP, LEAST, MOST, NEGATE,
+    ABSOLUTE, SIGN, AT_LEAST, WHERE, ELSE,
+) = range(len(NAMES))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Recursion:
+    """The recursive steps of a program.
+
+    Attributes
+    ----------
+    steps
+        All steps.
+    members
+        Numbers of the steps between the states of the tick before and the next ones, in order.
+    """
+
+    steps: Sequence[Step]
+    members: tuple[int, ...]
+
+    @classmethod
+    def of_steps(cls, steps: Sequence[Step]) -> "Recursion":
+        """Find the steps that depend on a state, and that a next state depends on."""
+        after, before = set[int](), set[int]()
+        for number, step in enumerate(steps):
+            if step[0] == "state" or any(operand in after for operand in operands_of(step)):
+                after.add(number)
+        for number in range(len(steps) - 1, -1, -1):
+            if number in before or steps[number][0] == "next":
+                before |= {number, *operands_of(steps[number])}
+        return cls(steps, tuple(sorted(after & before)))
+
+    @cached_property
+    def inputs(self) -> tuple[int, ...]:
+        """Numbers of the steps that members read, constants excepted."""
+        operands = [i for number in self.members for i in operands_of(self.steps[number])]
+        inner = set(self.members)
+        read = dict.fromkeys(i for i in operands if i not in inner)
+        return tuple(i for i in read if self.steps[i][0] != "constant")
+
+    @cached_property
+    def places(self) -> dict[int, int]:
+        """Place of each step in the memory of the interpreter: inputs, constants, members."""
+        operands = [i for number in self.members for i in operands_of(self.steps[number])]
+        constants = [i for i in operands if self.steps[i][0] == "constant"]
+        order = dict.fromkeys((*self.inputs, *constants, *self.members))
+        return {number: place for place, number in enumerate(order)}
+
+    @cached_property
+    def code(self) -> NDArray[np.int64]:
+        """Operation, place of the result, and places of the operands or a number, by member."""
+        rows = []
+        for number in self.members:
+            name, plain = operation_of(self.steps[number]), plain_of(self.steps[number])
+            operands = [self.places[i] for i in operands_of(self.steps[number])]
+            rest = plain[len(operands) :] if name != "state" else ()
+            rows.append([NAMES.index(name), self.places[number], *operands, *rest, 0, 0][:4])
+        return np.array(rows, dtype=np.int64).reshape(-1, 4)
+
+    def memory(self) -> NDArray[np.int64]:
+        """Return values and presence of all places at the start of a drive, shape (2, places)."""
+        memory = np.zeros((2, len(self.places)), dtype=np.int64)
+        for number, place in self.places.items():
+            if self.steps[number][0] == "constant":
+                memory[:, place] = plain_of(self.steps[number])[0], 1
+            elif self.steps[number][0] == "state":
+                memory[1, place] = 1
+        return memory
+
+
+@inner_loop
+def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
+    code: Any, words: Any, outputs: Any, memory: Any, at: int, stride: int, inputs: int, size: int
+) -> None:
+    """Execute the recursive steps for a block of rows.
+
+    Inputs and outputs are binary64 in the memory from `at` on, NaN where missing, `stride` apart.
+    """
+    values, present = words[0], words[1]
+    for row in range(size):
+        for number in range(inputs):
+            x = memory[at + number * stride + row]
+            present[number] = 0 if np.isnan(x) else 1
+            values[number] = 0 if np.isnan(x) else np.int64(x)
+        for step in range(len(code)):
+            operation, out, first, second = code[step]
+            if operation in (STATE, NEXT):
+                continue
+            a = values[first]
+            if operation == SHIFT:
+                half = np.int64(1) << (second - 1)
+                value = (a + half) >> second if a >= 0 else -((half - a) >> second)
+                values[out], present[out] = value, present[first]
+                continue
+            if operation in (NEGATE, ABSOLUTE, SIGN):
+                if operation == NEGATE:
+                    value = -a
+                elif operation == ABSOLUTE:
+                    value = abs(a)
+                else:
+                    value = np.int64(1 if a > 0 else (-1 if a < 0 else 0))
+                values[out], present[out] = value, present[first]
+                continue
+            b = values[second]
+            there = present[first] & present[second]
+            if operation == ADD:
+                value = a + b
+            elif operation == SUBTRACT:
+                value = a - b
+            elif operation == MULTIPLY:
+                value = a * b
+            elif operation == NEAREST:
+                there = there if b > 0 else 0
+                divisor = max(b, 1)
+                value = (2 * abs(a) + divisor) // (2 * divisor)
+                value = -value if a < 0 else value
+            elif operation == DIVIDE:
+                there = there if b > 0 else 0
+                value = abs(a) // max(b, 1)
+                value = -value if a < 0 else value
+            elif operation == CLIP:
+                value = min(max(a, -b), b)
+            elif operation == LEAST:
+                value = min(a, b)
+            elif operation == MOST:
+                value = max(a, b)
+            elif operation == AT_LEAST:
+                there = there if a >= b else 0
+                value = a
+            elif operation == WHERE:
+                value = a
+            else:
+                value = a if present[first] else b
+                there = present[first] | present[second]
+            values[out], present[out] = (value if there else 0), there
+        for number in range(len(outputs)):
+            place = outputs[number]
+            there = present[place] == 1
+            memory[at + (inputs + number) * stride + row] = values[place] if there else np.nan
+        for step in range(len(code)):
+            if code[step, 0] == NEXT:
+                values[code[step, 3]] = values[code[step, 2]]
