@@ -12,11 +12,13 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
+    from fleet_slip.api.calls import CarMeasures
     from fleet_slip.api.fleet_cohort import FleetCohort
     from fleet_slip.export.program import Target
     from fleet_slip.export.stepping import Estimator
     from fleet_slip.ingest.mapping import Mapping as LogMapping
     from fleet_slip.models.log_predictions import Predictions
+    from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
     from fleet_slip.models.select import Selection
@@ -78,6 +80,7 @@ class FleetModels:
         *,
         force: bool = False,
         candidate: bool = False,
+        with_filter: "CarMeasures | None" = None,
     ) -> "Publication":
         """Publish the winner of a selection as the next version of a model, and its champion.
 
@@ -93,6 +96,10 @@ class FleetModels:
         candidate
             Publish as a candidate, which becomes champion by `promote`. A winner also becomes a
             candidate while the champion is pinned.
+        with_filter
+            Measured data of the car: mass and axle distances at least. The model is combined with
+            an extended Kalman filter in the car, which is identified from the drives, where that
+            is better in cross-validation. Default: as the champion.
 
         Raises
         ------
@@ -109,6 +116,7 @@ class FleetModels:
         options = {"force": force, "candidate": candidate}
         registry, selection = self.registry, self._selection(name, choice)
         manifest = build_challenger(self.warehouse, registry, selection, name, **options)
+        manifest = self._with_filter(manifest, selection, with_filter)
         return publish_challenger(registry, manifest, selection, **options)
 
     def preview(
@@ -118,6 +126,7 @@ class FleetModels:
         *,
         force: bool = False,
         candidate: bool = False,
+        with_filter: "CarMeasures | None" = None,
     ) -> "DryRun":
         """Return what `publish` with these arguments would do, also a refusal; write nothing."""
         from fleet_slip.models.publish import DryRun, build_challenger, would_publish
@@ -127,9 +136,27 @@ class FleetModels:
         try:
             selection = self._selection(name, choice)
             manifest = build_challenger(self.warehouse, registry, selection, name, **options)
+            manifest = self._with_filter(manifest, selection, with_filter)
             return would_publish(registry, manifest, selection, **options)
         except RefusedError as error:
             return DryRun(name, False, str(error), refused=True)
+
+    def _with_filter(
+        self, manifest: "Manifest", selection: "Selection", measures: "CarMeasures | None"
+    ) -> "Manifest":
+        """Combine a model with a filter in the car of the measures, else in the champion's car."""
+        champion = self.registry.champion(manifest.name)
+        previous = champion.manifest.combination if champion else None
+        numbers = {**measures} if measures else dict(previous.measures) if previous else None
+        if numbers is None:
+            return manifest
+        from fleet_slip.api.calls import open_workers
+        from fleet_slip.evaluation.filter_column import with_filter
+        from fleet_slip.evaluation.identify import measures_of
+
+        car = measures_of("car", numbers)
+        with open_workers(self.warehouse.root, None) as executor:
+            return with_filter(self.warehouse, manifest, selection, car, executor)
 
     def _selection(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
         """Return a selection, by the recipe of the model if none is given."""

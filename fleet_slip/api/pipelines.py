@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from fleet_slip.api.calls import ShowStep, Workers, step_progress
 from fleet_slip.base import pluralize
@@ -37,6 +37,7 @@ from fleet_slip.warehouse.predicate import hash_drive
 from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:
+    from fleet_slip.api.calls import CarMeasures
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.logs import IngestReport
@@ -57,6 +58,8 @@ class Training:
     models: str
     tolerance: str | None = None
     label: "Label | None" = None
+    vehicle: "dict[str, float | None] | None" = None
+    """Measured data of the car: the model is combined with a filter in it."""
 
     @classmethod
     def on_mapping(cls, name: str, mapping: "Mapping") -> "Training":
@@ -66,7 +69,8 @@ class Training:
         """
         cohort, label = f"campaign = '{mapping.name}'", mapping.signal_catalog.label
         if label in mapping.signal_names:
-            return cls(name, cohort, DEFAULT_MODELS)
+            vehicle = mapping.vehicle.measures if mapping.vehicle else None
+            return cls(name, cohort, DEFAULT_MODELS, vehicle=vehicle)
         if COURSE not in mapping.signals:
             raise ConfigError(
                 f"mapping {mapping.name!r}: nothing to learn from. Map {label} (the angle of a "
@@ -105,6 +109,8 @@ class Training:
             return None
         manifest = champion.manifest
         if not is_current(manifest, fleet.warehouse, self.cohort, self.models, self.tolerance):
+            return None
+        if self.vehicle and not (manifest.combination and manifest.combination.is_of(self.vehicle)):
             return None
         return Publication(champion, False, "The champion was made from the same data and list.")
 
@@ -146,9 +152,15 @@ class Training:
             and champion.reference in marked_models(fleet.warehouse)
         )
         try:
-            return fleet.models.publish(self.name, selection, force=force), ""
+            published = fleet.models.publish(
+                self.name,
+                selection,
+                force=force,
+                with_filter=cast("CarMeasures | None", self.vehicle),
+            )
         except RefusedError as error:
             return None, str(error)
+        return published, ""
 
 
 @dataclass(frozen=True)

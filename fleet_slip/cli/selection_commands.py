@@ -103,6 +103,14 @@ def publish(
     robust: opt.Robust = False,
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
+    with_filter: Annotated[
+        str | None,
+        typer.Option(
+            help="Combine the model with a Kalman filter in this car, identified from the drives: "
+            "a vehicle of configs/vehicles, or a TOML file with mass_kg, front_axle_m and "
+            "rear_axle_m. Default: the champion's."
+        ),
+    ] = None,
     force: Annotated[
         bool, Option("--force", help="Publish even a model that is worse than the champion.")
     ] = False,
@@ -126,6 +134,7 @@ def publish(
 
     Example: fleet-slip publish wet --cohort "adhesion < 0.8"
     """
+    from fleet_slip.api.calls import load_measures
     from fleet_slip.models.manifest import require_model_name
     from fleet_slip.models.publish import DryRun, Publication, recipe_for
     from fleet_slip.models.request import SelectionRequest
@@ -141,8 +150,9 @@ def publish(
     with step("select"):
         selection = drives.run_request(recipe.request, nested=True)
     publish_or_preview = fleet.models.preview if dry_run else fleet.models.publish
+    car = load_measures(with_filter, fleet.warehouse.configs) if with_filter else None
     answer: DryRun | Publication = publish_or_preview(
-        name, selection, force=force, candidate=candidate
+        name, selection, force=force, candidate=candidate, with_filter=car
     )
     if json:
         if selection.examined:

@@ -596,17 +596,25 @@ class ColumnPlan:
     @property
     def facts(self) -> tuple[str, ...]:
         """The drive columns that are needed."""
-        components = [
-            component for column in self.windows.values() for component in components_of(column)
-        ]
+        components = [component for column in self._columns for component in components_of(column)]
         return tuple(
             dict.fromkeys(component.fact.name for component in components if component.fact)
         )
 
     @property
+    def _columns(self) -> list[Definition]:
+        """The columns that look back, and those that the combinations among them are made of."""
+        columns, seen = list(self.windows.values()), set[int]()
+        for column in columns:
+            if column.made and id(column.made) not in seen:
+                seen.add(id(column.made))
+                columns += [c for c in column.made.columns if c.made or c.fact or c.number]
+        return columns
+
+    @property
     def numbers(self) -> tuple[str, ...]:
         """Calibration parameters of the car that the columns need."""
-        names = (column.number.name for column in self.windows.values() if column.number)
+        names = (column.number.name for column in self._columns if column.number)
         return tuple(dict.fromkeys(names))
 
     @property

@@ -1,16 +1,43 @@
 """The filter in an identified car as a column: an integer observer, and its blend with a line."""
 
+import math
 from collections.abc import Collection, Sequence
+from concurrent.futures import Executor
+from decimal import Decimal
+from fractions import Fraction
 
+import numpy as np
+
+from fleet_slip.catalog.catalog import Catalog, integer_combination
 from fleet_slip.catalog.definitions import (
+    Blend,
     Definition,
     Observer,
     ObserverCar,
     ObserverInput,
+    plain_column,
 )
 from fleet_slip.catalog.signals import SignalCatalog
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.combined import LATERAL_ROWS, CombinedEstimate, combine
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.identify import IdentifiedVehicle
+from fleet_slip.evaluation.held_out import HeldOutDrive, Learner, read_measured_drives
+from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures
+from fleet_slip.evaluation.measured_evaluation import prepare_drive
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
+from fleet_slip.models.score import calibrated_cars
+from fleet_slip.models.select import Selection
+from fleet_slip.regression.combination import CLIP_STD
+from fleet_slip.warehouse.warehouse import Warehouse
+
+COUNT_RAD = Fraction(1, 2**16)
+"""Count of the observer and of a combination with it."""
+
+COLUMN_BITS = 20
+
+COMBINED, FILTERED, LINE = "combined_with_filter", "filter_estimate", "line_estimate"
+"""Names of the columns."""
 
 WHEELS = {"rear": ("wheel_rl", "wheel_rr"), "front": ("wheel_fl", "wheel_fr")}
 
@@ -86,3 +113,116 @@ def car_of(vehicle: IdentifiedVehicle) -> ObserverCar:
         **{name: getattr(noise, name) for name in ObserverCar.model_fields if hasattr(noise, name)},
         **{name: getattr(yaw, name) for name in ObserverCar.model_fields if hasattr(yaw, name)},
     )
+
+
+def with_filter(
+    warehouse: Warehouse,
+    manifest: Manifest,
+    selection: Selection,
+    measures: VehicleMeasures,
+    executor: Executor,
+) -> Manifest:
+    """Return a manifest with the best combination of its line and a filter in the car.
+
+    In every inner group of drives the car is identified and the line chosen again. If the drives
+    lack what the filter needs, the line stays alone, with the reason.
+    """
+    predicate = selection.cohort.predicate.text
+    numbers = measures.model_dump(exclude={"name"})
+    try:
+        drives = [
+            prepare_drive(drive, measures.vehicle())
+            for drive in read_measured_drives(warehouse, load_cohort(warehouse, predicate))
+        ]
+        learner = Learner.prepare(warehouse, selection.request, predicate, drives)
+        is_calibrated = warehouse.catalog.feature_set(learner.plan.feature_set).calibrated
+        combined = combine(
+            learner,
+            drives,
+            measures,
+            frozenset(),
+            executor,
+            cars=calibrated_cars(warehouse) if is_calibrated else {},
+            prior=selection.cohort.prior,
+        )
+        observer = observer_of_drives(combined.vehicle, warehouse.catalog.signals, drives)
+    except (DataError, QuestionError) as error:
+        combination = CombinedWithFilter(
+            method="line", rmse_deg={}, worst_rmse_deg={}, groups=0, measures=numbers,
+            reason=str(error),
+        )  # fmt: skip
+        return manifest.model_copy(update={"combination": combination})
+    choice = combined.choice
+    combination = CombinedWithFilter(
+        method=choice.method,
+        term=None
+        if choice.method == "line"
+        else combined_term(warehouse.catalog, manifest, combined, observer),
+        rmse_deg={name: math.degrees(rad) for name, rad in choice.rmse_rad.items()},
+        worst_rmse_deg={name: math.degrees(rad) for name, rad in choice.worst_rmse_rad.items()},
+        groups=choice.groups,
+        measures=numbers,
+    )
+    return manifest.model_copy(update={"combination": combination})
+
+
+def observer_of_drives(
+    vehicle: IdentifiedVehicle, signals: SignalCatalog, drives: Sequence[HeldOutDrive]
+) -> Observer:
+    """Return the observer of a car for the signals that all drives have."""
+    logged = [
+        name
+        for name in signals.signals
+        if all(
+            name in drive.rows.column_names and drive.rows[name].null_count < len(drive.rows)
+            for drive in drives
+        )
+    ]
+    one_speed = all(
+        np.array_equal(drive.signals.wheel_rl_rad_s, drive.signals.wheel_rr_rad_s, equal_nan=True)
+        for drive in drives
+    )
+    return observer_of(vehicle, signals, logged, one_speed=one_speed)
+
+
+def combined_term(
+    catalog: Catalog, manifest: Manifest, combined: CombinedEstimate, observer: Observer
+) -> ModelTerm:
+    """Return the column of a combination as the only term of an estimate."""
+    combination, is_alone = combined.choice.combination, combined.choice.method == "filter"
+    several = len(combination.knots_mps2) > 1
+    ay_mps2 = float(catalog.signals["ay"].scale)
+    blend = Blend(
+        filter=Definition(of=FILTERED, made=observer, of_bits=COLUMN_BITS),
+        line=None if is_alone else line_column(catalog, manifest),
+        anchor=combination.anchor if not is_alone else "filter",
+        shares=tuple(round(share * 2**16) for share in combination.line_share),
+        limits=tuple(round(CLIP_STD * std * 2**16) for std in combination.std_rad),
+        lateral=Definition(of="ay", over="mean", ticks=LATERAL_ROWS) if several else None,
+        knots=tuple(round(knot / ay_mps2) for knot in combination.knots_mps2),
+    )
+    definition = Definition(of=COMBINED, made=blend, of_bits=COLUMN_BITS)
+    return ModelTerm(
+        signal=COMBINED,
+        column=manifest.label.column,
+        unit=manifest.label.unit,
+        scale=Decimal(COUNT_RAD.numerator) / COUNT_RAD.denominator,
+        definition=definition,
+        signal_scales={name: catalog.signals[name].scale for name in definition.signals},
+        coefficient=1.0,
+        coefficient_exact=Fraction(1),
+    )
+
+
+def line_column(catalog: Catalog, manifest: Manifest) -> Definition:
+    """Return the estimate of a manifest's terms as a column. Raises `QuestionError`."""
+    columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
+    scales = catalog.input_scales
+    slopes = [
+        term.coefficient_exact
+        * (scales[term.signal] if term.logged else term.scale_exact)
+        / COUNT_RAD
+        for term in manifest.terms
+    ]
+    made = integer_combination(manifest.intercept_exact / COUNT_RAD, slopes, columns)
+    return Definition(of=LINE, made=made, of_bits=COLUMN_BITS)

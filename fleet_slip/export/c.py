@@ -97,19 +97,31 @@ class StepWriter:
         values = [self.value(operand) for operand in operands]
         if name == "*" and "1" in values:
             return values[values[0] == "1"]
-        if name == "max" and self.size(step) > MAX_32:
-            name = "max_64"
+        is_wide = max(map(self.size, (step, *operands))) > MAX_32
+        if name in ("min", "max") and is_wide:
+            name = f"{name}_64"
         self.counts[name] += 1
         if name in "+-*" and self.size(step) > MAX_32 >= max(map(self.size, operands)):
             values[0] = f"(int64_t){values[0]}"
-        return self._set(step, _OPERATIONS[name].format(*values))
+        text = _OPERATIONS[name].format(*values)
+        narrows = name in ("min_64", "max_64") and self.size(step) <= MAX_32
+        return self._set(step, f"(int32_t){text}" if narrows else text)
+
+    def _shift(self, step: int, source: int, bits: int) -> str:
+        self.counts["shift"] += 1
+        call = f"shifted({self.value(source)}, {bits}U)"
+        return self._set(step, f"(int32_t){call}" if self._narrows(step, wide=True) else call)
+
+    def _state(self, step: int, *_: int) -> str:
+        return self._set(step, f"state->state_{step}")
 
     def _clip(self, step: int, source: int, bound: int) -> str:
         value, limit = self.value(source), self.size(bound)
         if self.size(source) <= limit:
             return value
-        self.counts["clip"] += 1
-        return self._set(step, f"clip({value}, {limit})")
+        name = "clip" if limit <= MAX_32 else "clip_64"
+        self.counts[name] += 1
+        return self._set(step, f"{name}({value}, {literal(limit)})")
 
     def _else(self, step: int, a: int, b: int) -> str:
         first, second = self.value(a), self.value(b)
@@ -197,6 +209,8 @@ _WRITERS: Mapping[str, Callable[..., str]] = {
     "nearest": StepWriter._nearest,
     "sum": StepWriter._sum,
     "values": StepWriter._sum,
+    "shift": StepWriter._shift,
+    "state": StepWriter._state,
 }
 """Writers of the operations that are not in `_OPERATIONS`."""
 
@@ -205,6 +219,7 @@ _OPERATIONS = {
     "-": "{0} - {1}",
     "*": "{0} * {1}",
     "min": "smaller({0}, {1})",
+    "min_64": "smaller_64({0}, {1})",
     "max": "larger({0}, {1})",
     "max_64": "larger_64({0}, {1})",
     "power": "power_of_two({0}, {1})",
@@ -290,6 +305,10 @@ def state_fields(program: Steps) -> list[StateField]:
     for source, ticks, limit in program.sums:
         key, kind = sum_key(source, ticks, limit), sum_type(program, source, limit)
         fields += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}")]
+    fields += [
+        StateField(integer_type(size_of(program.ranges[step])), f"state_{step}")
+        for step in program.states
+    ]
     fields += [StateField("int32_t", name) for name in (*names["facts"], *names["numbers"])]
     return fields or [StateField("uint8_t", "nothing", comment="this model has no state")]
 
@@ -388,6 +407,7 @@ def start_lines(program: Steps, writer: StepWriter) -> list[str]:
     for window in program.sums:
         key = sum_key(*window)
         lines += [f"state->sum_{key} = 0;", f"state->values_{key} = 0U;"]
+    lines += [f"state->state_{step} = 0;" for step in program.states]
     ranges = [*program.input_ranges["fact"], *program.input_ranges["number"]]
     for field, (low, high) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
         writer.counts["within"] += 1
@@ -410,7 +430,8 @@ def step_lines(program: Program, writer: StepWriter) -> tuple[list[str], str, li
 def keep_lines(program: Steps, writer: StepWriter) -> list[str]:
     """Return the statements that write this tick into the rings, after all steps are computed."""
     words = {source: writer.word(source) for source, ticks in program.rings.items() if ticks}
-    lines = []
+    values = {step: writer.value(following) for step, following in program.states.items()}
+    lines = [f"state->state_{step} = {value};" for step, value in values.items()]
     for source, word in words.items():
         width = ring_width(program, source)
         writer.counts[f"keep_{width}"] += 1

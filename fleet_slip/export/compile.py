@@ -55,6 +55,13 @@ class TestVector:
     """Counts at each tick."""
     angles: tuple[int | None, ...]
     """Counts of the program's angle at each tick; None: no angle."""
+    states: tuple[tuple[int, ...], ...] = ()
+    """Values of the steps `state` after each tick, if there are any."""
+
+    @property
+    def written(self) -> set[str]:
+        """Names of the attributes that the JSON document contains."""
+        return {name for name in vars(self) if name != "car" and (name != "states" or self.states)}
 
 
 def make_checks(

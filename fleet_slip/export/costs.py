@@ -135,10 +135,12 @@ _OPERATIONS: Mapping[str, Mapping[str, int]] = {
     "keep_32": {"+": 1},
     "term": {"*": 2, "+": 2},
     "floor_shift": {"+": 1},
+    "shift": {"+": 1},
 }
 """Multiplications, additions and divisions of each helper and operation, at most."""
 
 _ARITHMETIC = ("+", "-", "*", "//", "negative", "abs", "sign", "min", "max", "max_64", "clip")
+_LONG = ("shift", "min_64", "clip_64")
 _WINDOWS = ("ago_16", "ago_32", "slide_32", "slide_64", "keep_16", "keep_32", "gather")
 _WIDE = ("//64", "nearest_64", "power")
 
@@ -149,6 +151,7 @@ _INSTRUCTIONS: tuple[int, _Weights] = (
     (
         (5, _ARITHMETIC),
         (10, _WINDOWS),
+        (20, _LONG),
         (40, ("nearest_32",)),
         (125, _WIDE),
         (33, ("term",)),
@@ -169,6 +172,7 @@ _CODE_BYTES: tuple[int, _Weights] = (
         (290, _WIDE),
         (46, ("term",)),
         (7, _WINDOWS),
+        (20, _LONG),
     ),
 )
 _DIVISION_BYTES = 920

@@ -4,20 +4,21 @@ import base64
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 from fleet_slip.base import canonical_json, install_command, sha256_of
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S
 from fleet_slip.columns.column_sql import PLAIN_SQL, SqlLayers, attribute_sql
-from fleet_slip.errors import ConfigError, UsageError
+from fleet_slip.errors import ConfigError, RefusedError, UsageError
 from fleet_slip.export.c import c_header, c_source
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
 from fleet_slip.export.compile import TestVector, checks_csv, compile_program, make_checks
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program, Target
+from fleet_slip.export.stepping import Estimator
 from fleet_slip.export.templating import c_prefix, distinct, file_prefix, fill_in_version
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -63,7 +64,7 @@ def document_of(subject: Subject) -> dict[str, Any]:
         "program": program_content(subject.program),
         "costs": count_costs(subject.program).as_dict(),
         "checks": [
-            {name: value for name, value in vars(check).items() if name != "car"}
+            {name: value for name, value in vars(check).items() if name in check.written}
             for check in subject.checks
         ],
     }
@@ -168,10 +169,27 @@ def _subject(
 ) -> Subject:
     program = compile_program(version.catalog, version.manifest)
     checks = make_checks(version.catalog.signals, version.manifest, program)
+    if program.states:
+        checks = tuple(with_states(version, program, check) for check in checks)
     drives = None
     if warehouse is not None:
         drives = Registry.open(warehouse).trained_drives(version.manifest).content
     return Subject(version, program, checks, drives, with_gram)
+
+
+def with_states(version: ModelVersion, program: Program, check: TestVector) -> TestVector:
+    """Return a test vector with the states of the filter after each tick."""
+    numbers = zip(program.numbers, check.numbers, strict=True)
+    car = {number.name: None if n is None else n * number.grain for number, n in numbers}
+    used = {fact.name for fact in program.facts}
+    facts = {name: value for name, value in check.car.items() if name in used}
+    estimator = Estimator(version.catalog, version.manifest, {**facts, **car})
+    states = []
+    for sample in check.samples:
+        pairs = zip(program.signals, sample, strict=True)
+        estimator.step({s.column: None if n is None else float(n * s.scale) for s, n in pairs})
+        states.append(estimator.states)
+    return replace(check, states=tuple(states))
 
 
 def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:
@@ -221,6 +239,11 @@ def _sql(subject: Subject) -> dict[str, str]:
     The columns are `drive_id`, `tick`, and the angle in counts and in SI units, or null.
     """
     version, program = subject.version, subject.program
+    if program.states:
+        raise RefusedError(
+            f"{version.reference} contains a filter, a recursion over the ticks of a drive, which "
+            "no SQL of a row computes. Export it as c, fmu, onnx or json."
+        )
     prefix, layers = file_prefix(version), [*_input_layers(program), *_step_layers(program)]
 
     def statement(rows: str, macro: str = "") -> str:

@@ -4,7 +4,7 @@ Everything up to the columns is computed in integers of 64 bits, so that the col
 the warehouse. The dot product has the requested float type.
 
     inputs   signals (cars, signals) float      facts, numbers (cars, ...) int64, if there are any
-             ring_I (cars, ticks) int64, sum_K and values_K (cars, 1) int64
+             ring_I (cars, ticks) int64, sum_K, values_K and state_I (cars, 1) int64
     outputs  angle (cars, 1) float, NaN without an angle; each state as NAME_next
 
 The oldest value of a ring is the first. A missing value of a ring, an unknown fact or number is
@@ -135,7 +135,7 @@ def error_bound(version: ModelVersion, program: Program, kind: FloatName) -> flo
 
 def _radians(version: ModelVersion) -> list[Fraction]:
     """Return the intercept, and the coefficients of counts, in the unit of the angle."""
-    exact = version.manifest.counts_model(version.catalog)
+    exact = version.manifest.estimate.counts_model(version.catalog)
     unit = Fraction(version.catalog.signals[version.manifest.label.signal].scale)
     return [value * unit for value in (exact.intercept, *exact.coefficients)]
 
@@ -179,6 +179,9 @@ class _Writer(Nodes):
         for i, place in enumerate(places):
             if self._is_constant(place):  # a scalar, which needs a row for each car
                 values[i] = self.do("Where", present, values[i], 0)
+        for step, following in program.states.items():
+            name, value = self.declare_next(f"state_{step}", 1), self._value(following)
+            self.do("Identity", value, out=name)
         self._angle(values, present, exact)
 
     def _is_constant(self, step: int) -> bool:
@@ -220,9 +223,15 @@ class _Writer(Nodes):
                 self._value(step)
         return self._present[step]
 
-    def _computed(self, step: int, name: str, plain: tuple[int, ...]) -> str:
+    def _computed(  # noqa: PLR0911 - one for each kind of operation
+        self, step: int, name: str, plain: tuple[int, ...]
+    ) -> str:
         if name in ("constant", "where", "at_least"):
             return self.constant(plain[0]) if name == "constant" else self._value(plain[0])
+        if name in ("state", "shift"):
+            if name == "state":
+                return self.declare(f"state_{step}", 1)
+            return self.nearest(self._value(plain[0]), self.constant(1 << plain[1]))
         if name in GIVEN:
             return self._input(step, name, plain[0])
         if name == "ago":

@@ -220,6 +220,11 @@ class Steps:
         return rings_of(self.steps)
 
     @property
+    def states(self) -> dict[int, int]:
+        """Steps that hold a number of the tick before, with the step of their next value."""
+        return {plain_of(s)[1]: plain_of(s)[0] for s in self.steps if s[0] == "next"}
+
+    @property
     def sums(self) -> list[tuple[int, ...]]:
         """Sums over time: the step, its ticks, and the maximum number of values."""
         return list(dict.fromkeys(plain_of(s) for s in self.steps if s[0] in ("sum", "values")))
@@ -272,6 +277,7 @@ def write_program(catalog: Catalog, manifest: Manifest) -> Program:
     Raises `RefusedError` if counts have another meaning now or the error cannot be bounded, and
     `DataError` for a feature without a signal.
     """
+    manifest = manifest.estimate
     signals = _inputs(catalog.signals, manifest)
     columns = [term.definition or plain_column(term.signal, term.sql) for term in manifest.terms]
     lowered, places = Lowering.from_columns([signal.name for signal in signals], columns)

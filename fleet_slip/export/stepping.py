@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
@@ -24,6 +25,12 @@ _OPERATIONS: Mapping[str, Callable[..., int | None]] = {
     "where": lambda a, _: a,
 }
 """Operations on values of one tick, none of which is missing."""
+
+
+def _shifted(value: int, bits: int) -> int:
+    """Return a value over 2^bits, to the nearest."""
+    return nearest(value, 1 << bits)
+
 
 RETAINED_PARTS = 256
 """Parts of the sums of a drive that can be retained for the next drive."""
@@ -55,6 +62,7 @@ class Estimator:
     def __init__(
         self, catalog: Catalog, manifest: Manifest, car: Mapping[str, Any] | None = None
     ) -> None:
+        manifest = manifest.estimate
         self._program = program = compile_program(catalog, manifest)
         properties = _parse_car(manifest, program, car or {})
         self.columns = tuple(signal.column for signal in program.signals)
@@ -65,10 +73,12 @@ class Estimator:
             "number": properties.number_counts(program),
         }
         self._initial: list[int | None] = [None] * len(steps)
-        self._steps = []
+        self._steps: list[tuple[int, str, Callable[..., int | None] | None, tuple[int, ...]]] = []
         for place, (name, plain) in enumerate(steps):
             if name == "constant":
                 self._initial[place] = plain[0]
+            elif name == "shift":
+                self._steps.append((place, name, partial(_shifted, bits=plain[1]), plain[:1]))
             elif name in car_counts:
                 self._initial[place] = car_counts[name][plain[0]]
             else:
@@ -103,6 +113,7 @@ class Estimator:
             If the sample lacks a column.
         """
         counts, now = self._counts(sample), self._initial.copy()
+        following: dict[int, int] = {}
         for place, name, compute, plain in self._steps:
             if compute is not None:
                 values = [now[operand] for operand in plain]
@@ -113,12 +124,17 @@ class Estimator:
                 now[place] = now[plain[1]] if now[plain[0]] is None else now[plain[0]]
             elif name == "ago":
                 now[place] = self._ago(*plain)
+            elif name == "state":
+                now[place] = self._states[place]
+            elif name == "next":
+                following[plain[1]] = now[plain[0]] or 0
             elif name == "sum":
                 now[place] = self._slide(now[plain[0]], *plain)
             else:
                 now[place] = self._windows[plain][1]
         for source, ring in self._rings.items():
             ring[self._tick % len(ring)] = now[source]
+        self._states |= following
         self._tick += 1
         estimate = self._manifest.intercept
         for place, scale, coefficient in self._terms:
@@ -127,6 +143,11 @@ class Estimator:
                 return None
             estimate += coefficient * (count * scale)
         return estimate
+
+    @property
+    def states(self) -> tuple[int, ...]:
+        """States of the filter after the last tick, in the order of the program's steps."""
+        return tuple(self._states.values())
 
     def skip(self, ticks: int = 1) -> None:
         """Advance by ticks without a message."""
@@ -151,6 +172,7 @@ class Estimator:
             raise InputError(f"retained = {retained}: choose 0 to {RETAINED_PARTS} parts.")
         previous = self._windows
         self._tick = 0
+        self._states = dict.fromkeys(self._program.states, 0)
         rings = self._program.rings.items()
         self._rings: dict[int, list[int | None]] = {place: [None] * n for place, n in rings if n}
         self._windows = {window: [0, 0] for window in self._program.sums}

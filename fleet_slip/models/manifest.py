@@ -5,6 +5,7 @@ A manifest may come from anywhere: texts and numbers are bounded, and SQL in it 
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -29,6 +30,7 @@ from pydantic import (
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import (
+    Blend,
     Combination,
     Definition,
     Made,
@@ -281,6 +283,85 @@ class SelectedBy(Config):
     ] = None
 
 
+class CombinedWithFilter(Config):
+    """Combination of the line, the terms of a manifest, with a filter in the identified car.
+
+    Attributes
+    ----------
+    method
+        The winner among the combinations (`fleet_slip.regression.combination`).
+    term
+        The column that contains filter, line and weights; None if the line alone is better.
+    rmse_deg, worst_rmse_deg
+        RMSE of every method, cross-validated in inner groups of drives, and that of its worst
+        group.
+    groups
+        Number of inner groups.
+    measures
+        Measured vehicle data, from which the car is identified again.
+    """
+
+    method: Literal["line", "filter", "constant", "by_lateral", "line_by_lateral"]
+    term: Annotated[ModelTerm | None, _OPTIONAL] = None
+    rmse_deg: dict[Identifier, NotNegative]
+    worst_rmse_deg: dict[Identifier, NotNegative]
+    groups: Count
+    measures: dict[Identifier, FiniteFloat]
+    reason: Annotated[str, Field(max_length=2000, exclude_if=lambda text: not text)] = ""
+    """Why there is no filter."""
+
+    @model_validator(mode="after")
+    def _agrees(self) -> Self:
+        if (self.term is None) != (self.method == "line"):
+            raise ValueError("every method but the line has a column of filter and line")
+        if self.term and not isinstance(self._made, Blend):
+            raise ValueError("its column does not contain a filter")
+        return self
+
+    def is_of(self, measures: Mapping[str, Any]) -> bool:
+        """Return True if the car has these measures, apart from those that are None."""
+        stated = {name: value for name, value in measures.items() if value is not None}
+        return stated.items() <= self.measures.items()
+
+    @property
+    def _made(self) -> Made | None:
+        return self.term.definition.made if self.term and self.term.definition else None
+
+    def __str__(self) -> str:
+        """Return which estimate is used where, as a sentence."""
+        if self.reason:
+            return f"The line alone: {self.reason}"
+        figures = ", ".join(
+            f"{name.replace('_', ' ')} {deg:.3f}" for name, deg in self.rmse_deg.items()
+        )
+        compared = f" RMSE in {self.groups} inner groups: {figures} deg."
+        blend = self._made
+        if not isinstance(blend, Blend):
+            return f"The line alone: the filter does not improve it.{compared}"
+        if blend.line is None:
+            return (
+                f"The filter in the identified car alone: the line does not improve it.{compared}"
+            )
+        shares = " to ".join(
+            dict.fromkeys(
+                f"{share / 2**16:.0%}" for share in (min(blend.shares), max(blend.shares))
+            )
+        )
+        limits = " to ".join(
+            dict.fromkeys(
+                f"{math.degrees(limit / 2**16):.2g}"
+                for limit in (min(blend.limits), max(blend.limits))
+            )
+        )
+        where = "" if blend.lateral is None else ", by lateral acceleration"
+        start = (
+            f"The filter in the identified car, plus {shares} of the difference to the line"
+            if blend.anchor == "filter"
+            else f"The line, of whose difference to the filter {shares} remains"
+        )
+        return f"{start}, clipped at {limits} deg{where}.{compared}"
+
+
 class ImportedFrom(Config):
     """Version of another data root that a version was imported from."""
 
@@ -289,6 +370,9 @@ class ImportedFrom(Config):
 
 
 _MADE: TypeAdapter[Made] = TypeAdapter(Made)
+
+_WITH_COLUMNS = ("terms", "combination")
+"""Keys of a manifest that contain definitions of columns."""
 
 
 class Manifest(Config):
@@ -312,6 +396,8 @@ class Manifest(Config):
     learned_from: Annotated[LearnedFrom | None, _OPTIONAL] = None
     """None if the label is a reference sensor."""
     prior: Annotated[Prior | None, _OPTIONAL] = None
+    combination: Annotated[CombinedWithFilter | None, _OPTIONAL] = None
+    """None if no filter was compared: the terms are the estimate."""
     imported_from: Annotated[ImportedFrom | None, _OPTIONAL] = None
     assumed: Annotated[
         tuple[Annotated[str, Field(max_length=200)], ...],
@@ -343,7 +429,8 @@ class Manifest(Config):
             return node
 
         remaining = {key: value for key, value in content.items() if key != "made"}
-        return {**remaining, "terms": expand(content.get("terms"))}
+        expanded = {name: expand(content[name]) for name in _WITH_COLUMNS if name in content}
+        return {**remaining, **expanded}
 
     @model_serializer(mode="wrap")
     def _collect_combinations(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -362,10 +449,8 @@ class Manifest(Config):
                 node = {**node, "made": name}
             return {key: collect(value) for key, value in node.items()}
 
-        terms = collect(content["terms"])
-        if not combinations:
-            return {**content, "terms": terms}
-        return {**content, "terms": terms, "made": combinations}
+        content |= {name: collect(content[name]) for name in _WITH_COLUMNS if name in content}
+        return {**content, "made": combinations} if combinations else content
 
     @model_validator(mode="after")
     def _agrees(self) -> "Manifest":
@@ -378,6 +463,14 @@ class Manifest(Config):
     def signals(self) -> tuple[str, ...]:
         """Names of the model's inputs."""
         return tuple(term.signal for term in self.terms)
+
+    @property
+    def estimate(self) -> "Manifest":
+        """The manifest whose terms are the whole estimate: the combination is a term."""
+        if self.combination is None or self.combination.term is None:
+            return self
+        changes = {"terms": (self.combination.term,), "combination": None}
+        return self.model_copy(update={**changes, "intercept": 0.0, "intercept_exact": Fraction(0)})
 
     def counts_model(self, catalog: Catalog, feature_set: str | None = None) -> "LinearModel":
         """Return the model of counts, exactly; see `counts_coefficients`."""
@@ -470,6 +563,8 @@ class Manifest(Config):
             "why": self.selected_by.reason,
             "assumed": "; ".join(self.assumed),
         }
+        if self.combination:
+            properties["with filter"] = str(self.combination)
         if line := self.line:
             stacked = f"{line}, fitted first; feature set {trained.feature_set}"
             properties["first-stage model"] = stacked
@@ -487,6 +582,10 @@ class Manifest(Config):
         return {name: text for name, text in properties.items() if text}
 
     def same_estimator(self, other: "Manifest") -> bool:
+        """Return True if both have the same terms and combination from the same rows."""
+        return self.same_line(other) and self.combination == other.combination
+
+    def same_line(self, other: "Manifest") -> bool:
         """Return True if both have the same terms from the same rows."""
         return (
             self.intercept_exact == other.intercept_exact

@@ -50,6 +50,7 @@ class Predictor:
         Raises `DataError` if these contradict each other, `RefusedError` if counts mean otherwise
         now.
         """
+        manifest = manifest.estimate
         manifest.require_same_counts(signals)
         coefficients = tuple(term.coefficient for term in manifest.terms)
         scales = tuple(
@@ -192,7 +193,7 @@ def predict(
     opened, plan = open_frame(frame), predictor.plan
     if not plan.signals:
         raise DataError(f"the columns of {manifest.name} use no signal. Publish it again.")
-    columns = opened.numbers(manifest.columns(signals), f"the model {manifest.name}")
+    columns = opened.numbers(manifest.estimate.columns(signals), f"the model {manifest.name}")
     counts = {
         name: round_chunks(
             [valid_values(columns[signals[name].column], signals[name])], signals[name]
@@ -240,7 +241,7 @@ def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fr
     """Return what a car's drives tell of it, in SI units by row with NaN, and grains."""
     used = {
         definition.number.name: definition.number
-        for definition in manifest.definitions.values()
+        for definition in manifest.estimate.definitions.values()
         if definition.number
     }
     if missing := [name for name in used if name not in frame.names]:

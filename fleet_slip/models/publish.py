@@ -548,6 +548,9 @@ def _decide(
     if champion and champion.manifest.same_estimator(manifest):
         return _Decision("The champion is the same model.", champion)
     held = registry.history(manifest.name).held_by(CHAMPION)
+    if champion and champion.manifest.same_line(manifest):
+        reason = f"The terms are the champion's. {manifest.combination or 'No filter any more.'}"
+        return _Decision(reason, None, candidate or held is not None, held, champion.version)
     review = review_challenger(registry, champion, manifest, selection)
     if not force and not candidate:
         review.require_passed(manifest.name)

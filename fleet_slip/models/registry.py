@@ -246,7 +246,7 @@ class ModelVersion(Answer):
     @property
     def columns(self) -> tuple[str, ...]:
         """Columns in SI units that `predict` needs, named as in the view `log`."""
-        return self.manifest.columns(self.catalog.signals)
+        return self.manifest.estimate.columns(self.catalog.signals)
 
     @overload
     def predict(self, frame: "pl.DataFrame") -> "pl.Series": ...

@@ -221,7 +221,7 @@ def choose_combination(pairs: PairedEstimates) -> CombinationChoice:
 
     The numbers that a group is judged by come from the other groups. The criterion is the mean of
     two mean squares: of all groups, and of the worst. A method replaces a safer one only if its
-    criterion is lower by more than a factor 1 + 1/n, for n groups.
+    root is lower by more than a factor 1 + 1/√n, for n groups.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def choose_combination(pairs: PairedEstimates) -> CombinationChoice:
     squares = {method: _group_squares(pairs, method) for method in METHODS}
     criterion = {m: (squares[m].mean() + squares[m].max()) / 2 for m in METHODS}
     chosen: Method = METHODS[0]
-    guard = 1 + 1 / len(groups)
+    guard = 1 + 1 / math.sqrt(len(groups))
     for method in sorted(METHODS[1:], key=lambda name: criterion[name]):
         if math.sqrt(criterion[method]) * guard < math.sqrt(criterion[METHODS[0]]):
             chosen = method

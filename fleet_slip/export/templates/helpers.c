@@ -14,6 +14,21 @@ static int32_t clip(int64_t value, int32_t limit)
     return (value > bound) ? limit : ((value < -bound) ? -limit : (int32_t)value);
 }
 
+//: clip_64
+static int64_t clip_64(int64_t value, int64_t limit)
+{
+    return (value > limit) ? limit : ((value < -limit) ? -limit : value);
+}
+
+//: shift
+/* Value over a power of two to the nearest integer, halves away from zero. */
+static int64_t shifted(int64_t value, uint32_t bits)
+{
+    const uint64_t size = (uint64_t)((value < 0) ? -value : value);
+    const int64_t result = (int64_t)((size + ((uint64_t)1U << (bits - 1U))) >> bits);
+    return (value < 0) ? -result : result;
+}
+
 //: sign
 static int32_t sign(int64_t value)
 {
@@ -38,6 +53,12 @@ static int32_t smaller(int32_t a, int32_t b)
 static int32_t larger(int32_t a, int32_t b)
 {
     return (a > b) ? a : b;
+}
+
+//: min_64
+static int64_t smaller_64(int64_t a, int64_t b)
+{
+    return (a < b) ? a : b;
 }
 
 //: max_64
