@@ -80,9 +80,9 @@ class Number:
     step: int
     bits: int
 
-    def do(self, operation: str, *others: "Number | int") -> "Number":
+    def do(self, operation: str, *operands: "Number | int") -> "Number":
         """Return the result of an operation that keeps the bits."""
-        steps = [other.step if isinstance(other, Number) else other for other in others]
+        steps = [other.step if isinstance(other, Number) else other for other in operands]
         return Number(self.low, self.low.do(operation, self.step, *steps), self.bits)
 
     def like(self, value: "Number | float") -> "Number":
@@ -144,8 +144,8 @@ class Number:
 
     def present(self) -> "Number":
         """Return 1 with no bits where there is a value, else 0."""
-        one, zero = self.low.constant(1), self.low.constant(0)
-        return Number(self.low, self.low.do("else", self.low.do("where", one, self.step), zero), 0)
+        unit, zero = self.low.constant(1), self.low.constant(0)
+        return Number(self.low, self.low.do("else", self.low.do("where", unit, self.step), zero), 0)
 
     def exceeds(self, value: "Number | float") -> "Number":
         """Return 1 with no bits where this is larger, else 0."""
@@ -161,8 +161,8 @@ class Number:
 
     def where(self, condition: "Number") -> "Number":
         """Return the number where a condition is 1; missing elsewhere."""
-        one = self.low.constant(1)
-        return self.do("where", self.low.do("at_least", condition.step, one))
+        limit = self.low.constant(1)
+        return self.do("where", self.low.do("at_least", condition.step, limit))
 
 
 def choose(condition: Number, first: Number, second: Number) -> Number:
@@ -201,7 +201,7 @@ class ObserverLowering:
         if self.observer.axle == "front":
             turned = (sine * rate.times(car.front_axle_m)).to(STATE)
             speed = (speed - turned).over(cosine, STATE).within(VX_MPS)
-        road = Road(sine, cosine, *self._axles(acceleration, now["ay"], begins))
+        road = WheelsOnRoad(sine, cosine, *self._axles(acceleration, now["ay"], begins))
 
         initial = [speed, rate.times(car.rear_axle_m).within(VY_MPS), rate, rate.like(0.0)]
         variances = (*INITIAL_VARIANCES, car.ay_bias_std_mps2**2)
@@ -348,7 +348,7 @@ class ObserverLowering:
         slack = load.times(-per_load, RATIO) + friction
         return Axle(stiffness, (slack * load).to(STATE))
 
-    def _rates(self, mean: Sequence[Number], road: "Road") -> "Motion":
+    def _rates(self, mean: Sequence[Number], road: "WheelsOnRoad") -> "Accelerations":
         """Return the lateral and the yaw acceleration, with derivatives by vx, vy and r."""
         car, (vx, vy, r, _) = self.car, mean
         forces = []
@@ -372,14 +372,14 @@ class ObserverLowering:
         yaw_by_r = [part.times(lever / inertia) for part, lever in zip(by_r, levers, strict=True)]
         lateral, *derivatives = (a + b for a, b in zip(*forces, strict=True))
         yaw, *yaw_derivatives = (a + b for a, b in zip(*turning, strict=True))
-        return Motion(
+        return Accelerations(
             lateral,
             yaw,
             [d.within(DERIVATIVE) for d in (*derivatives, by_r[0] + by_r[1])],
             [d.within(DERIVATIVE) for d in (*yaw_derivatives, yaw_by_r[0] + yaw_by_r[1])],
         )
 
-    def _predict(self, x: "Gaussian", ax: Number, road: "Road") -> "Gaussian":
+    def _predict(self, x: "Gaussian", ax: Number, road: "WheelsOnRoad") -> "Gaussian":
         """Time update: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
         car, (vx, vy, r, bias) = self.car, x.mean
         motion = self._rates(x.mean, road)
@@ -510,7 +510,7 @@ class Axle(NamedTuple):
     grip: Number
 
 
-class Road(NamedTuple):
+class WheelsOnRoad(NamedTuple):
     """Direction of the front wheels, and both axles."""
 
     sine: Number
@@ -527,7 +527,7 @@ class Force(NamedTuple):
     per_vy: Number
 
 
-class Motion(NamedTuple):
+class Accelerations(NamedTuple):
     """Lateral and yaw acceleration, and their derivatives by vx, vy and r."""
 
     lateral: Number
@@ -536,7 +536,7 @@ class Motion(NamedTuple):
     yaw_derivatives: list[Number]
 
 
-def _lateral_force(axle: Axle, across: Number, along: Number, road: Road | None) -> Force:
+def _lateral_force(axle: Axle, across: Number, along: Number, road: WheelsOnRoad | None) -> Force:
     """Return the force of an axle by Fiala; `road` has the direction of steered wheels."""
     rolling = along.at_least(SLOWEST_MPS)
     turning = along.exceeds(SLOWEST_MPS)

@@ -73,8 +73,10 @@ class Recursion:
         for number in self.members:
             name, plain = operation_of(self.steps[number]), plain_of(self.steps[number])
             operands = [self.places[i] for i in operands_of(self.steps[number])]
-            rest = plain[len(operands) :] if name != "state" else ()
-            rows.append([NAMES.index(name), self.places[number], *operands, *rest, 0, 0][:4])
+            plain_numbers = plain[len(operands) :] if name != "state" else ()
+            rows.append(
+                [NAMES.index(name), self.places[number], *operands, *plain_numbers, 0, 0][:4]
+            )
         return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
     def memory(self) -> NDArray[np.int64]:
@@ -122,7 +124,7 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
                 values[out], present[out] = value, present[first]
                 continue
             b = values[second]
-            there = present[first] & present[second]
+            valid = present[first] & present[second]
             if operation == ADD:
                 value = a + b
             elif operation == SUBTRACT:
@@ -130,12 +132,12 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
             elif operation == MULTIPLY:
                 value = a * b
             elif operation == NEAREST:
-                there = there if b > 0 else 0
+                valid = valid if b > 0 else 0
                 divisor = max(b, 1)
                 value = (2 * abs(a) + divisor) // (2 * divisor)
                 value = -value if a < 0 else value
             elif operation == DIVIDE:
-                there = there if b > 0 else 0
+                valid = valid if b > 0 else 0
                 value = abs(a) // max(b, 1)
                 value = -value if a < 0 else value
             elif operation == CLIP:
@@ -145,18 +147,18 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
             elif operation == MOST:
                 value = max(a, b)
             elif operation == AT_LEAST:
-                there = there if a >= b else 0
+                valid = valid if a >= b else 0
                 value = a
             elif operation == WHERE:
                 value = a
             else:
                 value = a if present[first] else b
-                there = present[first] | present[second]
-            values[out], present[out] = (value if there else 0), there
+                valid = present[first] | present[second]
+            values[out], present[out] = (value if valid else 0), valid
         for number in range(len(outputs)):
             place = outputs[number]
-            there = present[place] == 1
-            memory[at + (inputs + number) * stride + row] = values[place] if there else np.nan
+            valid = present[place] == 1
+            memory[at + (inputs + number) * stride + row] = values[place] if valid else np.nan
         for step in range(len(code)):
             if code[step, 0] == NEXT:
                 values[code[step, 3]] = values[code[step, 2]]

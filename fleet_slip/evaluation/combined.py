@@ -95,8 +95,8 @@ def inner_groups(drives: Sequence[HeldOutDrive], held_out: Segments) -> list[Seg
     training = frozenset((d.name, q) for d in drives for q in range(QUARTERS)) - held_out
     trips = {drive.name: drive.trip for drive in drives}
     names = list(dict.fromkeys(trips[name] for name in trips if (name, 0) in training))
-    whole = len(training) == QUARTERS * len({name for name, _ in training})
-    if not whole or len(names) < 2:
+    has_whole_drives = len(training) == QUARTERS * len({name for name, _ in training})
+    if not has_whole_drives or len(names) < 2:
         quarters = sorted({quarter for _, quarter in training})
         return [frozenset(part for part in training if part[1] == q) for q in quarters]
     count = min(len(names), MAX_GROUPS)

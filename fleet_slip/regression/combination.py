@@ -101,7 +101,7 @@ class PairedEstimates:
 
 
 @dataclass(frozen=True)
-class Combination:
+class EstimateCombination:
     """A combination with its numbers.
 
     Attributes
@@ -134,11 +134,11 @@ class Combination:
         return np.where(np.isnan(line), filtered, combined)
 
 
-LINE = Combination("line", (1.0,), (0.0,))
-FILTER = Combination("filter", (0.0,), (0.0,))
+LINE = EstimateCombination("line", (1.0,), (0.0,))
+FILTER = EstimateCombination("filter", (0.0,), (0.0,))
 
 
-def fit_combination(pairs: PairedEstimates, method: Method) -> Combination:
+def fit_combination(pairs: PairedEstimates, method: Method) -> EstimateCombination:
     """Fit the numbers of a combination.
 
     With weights v, which give every group the same total, the filter's weight is
@@ -162,7 +162,7 @@ def fit_combination(pairs: PairedEstimates, method: Method) -> Combination:
 
     Returns
     -------
-    Combination
+    EstimateCombination
     """
     if method == "line":
         return LINE
@@ -175,7 +175,7 @@ def fit_combination(pairs: PairedEstimates, method: Method) -> Combination:
     filter_weight = float(v @ (-z * (pairs.label - pairs.line))) / square
     share = 1.0 - min(max((min(max(filter_weight, -1.0), 2.0) + 0.5) / 2, 0.0), 1.0)
     if method == "constant":
-        return Combination("filter", (share,), (math.sqrt(square),))
+        return EstimateCombination("filter", (share,), (math.sqrt(square),))
     hats = hat_functions(pairs.lateral_mps2)
     normal = (hats * (v * z**2)) @ hats.T
     ridge = RIDGE * np.trace(normal) / len(hats) * np.eye(len(hats))
@@ -183,7 +183,7 @@ def fit_combination(pairs: PairedEstimates, method: Method) -> Combination:
     shares = np.clip(share + np.linalg.solve(normal + ridge, moments), 0.0, 1.0)
     variances = (hats @ (v * z**2) + STD_ROWS * square) / (hats @ v + STD_ROWS)
     anchor: Anchor = "line" if method == "line_by_lateral" else "filter"
-    return Combination(
+    return EstimateCombination(
         anchor, tuple(shares.tolist()), tuple(np.sqrt(variances).tolist()), KNOTS_MPS2
     )
 
@@ -210,7 +210,7 @@ class CombinationChoice:
     """
 
     method: Method
-    combination: Combination
+    combination: EstimateCombination
     rmse_rad: Mapping[Method, float]
     worst_rmse_rad: Mapping[Method, float]
     groups: int

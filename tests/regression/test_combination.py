@@ -1,4 +1,4 @@
-"""Combination of two estimators: answers by hand, properties, and the choice."""
+"""EstimateCombination of two estimators: answers by hand, properties, and the choice."""
 
 import math
 
@@ -11,7 +11,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.regression.combination import (
     KNOTS_MPS2,
     METHODS,
-    Combination,
+    EstimateCombination,
     PairedEstimates,
     choose_combination,
     fit_combination,
@@ -61,15 +61,15 @@ def test_extreme_weights_are_clipped_before_they_are_shrunk() -> None:
 
 
 def test_difference_is_clipped_and_missing_lines_leave_the_filter() -> None:
-    combined = Combination("filter", (0.5,), (1.0,))
+    combined = EstimateCombination("filter", (0.5,), (1.0,))
     line = np.array([2.0, 10.0, -10.0, np.nan])
     assert combined(line, np.zeros(4), np.zeros(4)).tolist() == [1.0, 1.5, -1.5, 0.0]
-    anchored = Combination("line", (0.5,), (1.0,))
+    anchored = EstimateCombination("line", (0.5,), (1.0,))
     assert anchored(line, np.zeros(4), np.zeros(4)).tolist() == [1.0, 8.5, -8.5, 0.0]
 
 
 def test_shares_are_linear_between_knots() -> None:
-    combined = Combination("filter", (0.0, 1.0, 1.0, 0.0), (9.0,) * 4, KNOTS_MPS2)
+    combined = EstimateCombination("filter", (0.0, 1.0, 1.0, 0.0), (9.0,) * 4, KNOTS_MPS2)
     lateral = np.array([0.0, 1.5, 3.0, 7.5, 20.0])
     assert combined(np.ones(5), np.zeros(5), lateral).tolist() == [0.0, 0.5, 1.0, 0.5, 0.0]
 
