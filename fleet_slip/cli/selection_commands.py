@@ -105,7 +105,7 @@ def publish(
     prior: opt.Prior = None,
     with_filter: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="Combine the model with a Kalman filter in this car, identified from the drives: "
             "a vehicle of configs/vehicles, or a TOML file with mass_kg, front_axle_m and "
             "rear_axle_m. Default: the champion's."

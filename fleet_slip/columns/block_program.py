@@ -327,7 +327,7 @@ class _Writer:
         inputs = self.code.recursion.inputs
         for place, source in enumerate(inputs):
             self._do(PUT, self.value(source), (Region.RECURSION, place))
-        self._do(RECUR, NOWHERE, (Region.RECURSION, 0), number=len(inputs))
+        self._do(RECUR, UNUSED_PLACE, (Region.RECURSION, 0), number=len(inputs))
         place = len(inputs) + _number(self.code.outputs, number)
         return self._do(COPY, (Region.RECURSION, place))
 

@@ -224,5 +224,5 @@ def line_column(catalog: Catalog, manifest: Manifest) -> Definition:
         / COUNT_RAD
         for term in manifest.terms
     ]
-    made = integer_combination(manifest.intercept_exact / COUNT_RAD, slopes, columns)
-    return Definition(of=LINE, made=made, of_bits=COLUMN_BITS)
+    line = integer_combination(manifest.intercept_exact / COUNT_RAD, slopes, columns)
+    return Definition(of=LINE, made=line, of_bits=COLUMN_BITS)

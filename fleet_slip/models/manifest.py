@@ -314,7 +314,7 @@ class CombinedWithFilter(Config):
     def _agrees(self) -> Self:
         if (self.term is None) != (self.method == "line"):
             raise ValueError("every method but the line has a column of filter and line")
-        if self.term and not isinstance(self._made, Blend):
+        if self.term and not isinstance(self._content, Blend):
             raise ValueError("its column does not contain a filter")
         return self
 
@@ -324,7 +324,7 @@ class CombinedWithFilter(Config):
         return stated.items() <= self.measures.items()
 
     @property
-    def _made(self) -> Made | None:
+    def _content(self) -> Made | None:
         return self.term.definition.made if self.term and self.term.definition else None
 
     def __str__(self) -> str:
@@ -335,7 +335,7 @@ class CombinedWithFilter(Config):
             f"{name.replace('_', ' ')} {deg:.3f}" for name, deg in self.rmse_deg.items()
         )
         compared = f" RMSE in {self.groups} inner groups: {figures} deg."
-        blend = self._made
+        blend = self._content
         if not isinstance(blend, Blend):
             return f"The line alone: the filter does not improve it.{compared}"
         if blend.line is None:

@@ -255,8 +255,8 @@ def _group_squares(pairs: PairedEstimates, method: Method) -> FloatArray:
     squares = []
     for group in pairs.groups:
         held_out = pairs.group == group
-        others = pairs.where(~held_out)
-        combination = fit_combination(others if len(others) else pairs, method)
+        training = pairs.where(~held_out)
+        combination = fit_combination(training if len(training) else pairs, method)
         rows = pairs.where(held_out)
         error = combination(rows.line, rows.filter, rows.lateral_mps2) - rows.label
         squares.append(float(np.mean(error**2)))
