@@ -3,7 +3,7 @@
 # `make test-all` installs outside programs, such as a browser, and passes the checks that need them or minutes.
 # `make report` does what `make run` does, then writes ./data/report/report.html.
 # `make report MODEL=gated` adds hard driving and slippery roads before, and reports on the model with gates.
-# `make docs` builds the pages as a site, ./site/index.html; a warning is an error.
+# `make docs` builds the pages as a site, ./site/index.html; a warning is an error. It lists figures that are older than the code.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -56,6 +56,7 @@ lint: $(VENV)/.dev-installed
 	$(BIN)/mypy
 
 docs: $(VENV)/.docs-installed
+	$(BIN)/python -m benchmarks.measured_page
 	$(BIN)/python -m zensical build --clean --strict
 	(printf 'window.searchIndex = '; cat site/search.json) > site/search.js
 
