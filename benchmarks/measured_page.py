@@ -1,8 +1,8 @@
 """Writes docs/measured.md from the records of figures in benchmarks/figures/*.json.
 
-    python -m benchmarks.measured_page              write the page, and list figures older than the code
+    python -m benchmarks.measured_page              write the page, and list old figures
     python -m benchmarks.measured_page --check      list them only
-    python -m benchmarks.measured_page --measured BEGINNING ...   first record that figures are of today
+    python -m benchmarks.measured_page --measured BEGINNING ...   first date figures by today
 
 A figure that was measured again is changed in its file by hand; `--measured` then records commit,
 date, machine and the checksum of its code.

@@ -1,8 +1,8 @@
 """Records of measured figures, and the page that is written from them (docs/measured.md).
 
-A file of `benchmarks/figures` with a title is a section of the page. Each of its figures has the command
-that measures it, the commit, the date, the machine, and the code that it depends on. The checksum of
-that code is recorded with it: if the code has changed since, the page says so.
+A file of `benchmarks/figures` with a title is a section of the page. Each of its figures has its
+command, commit, date, machine, and the code that it depends on, with its checksum. If the code
+has changed since, the page marks the figure.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ def load_sections(folder: Path = FIGURES) -> dict[Path, dict[str, Any]]:
 
 
 def digest_code(paths: list[str], root: Path = HERE) -> str:
-    """Return the checksum of source files: of all modules and tables below some folders or files."""
+    """Return the checksum of the source files at or below some paths."""
     checksum = hashlib.sha256()
     for name in sorted(paths):
         place = root / name
