@@ -181,6 +181,14 @@ class MeanMoments:
         mean = self.matrices[:, 0, 1:]
         return np.asarray(self.matrices[:, 1:, 1:] - mean[:, :, None] * mean[:, None, :])
 
+    def correlations(self) -> FloatArray:
+        """Return the correlation matrices, shape (drives, k, k); 0 of constant signals."""
+        covariances = self.covariances()
+        std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
+        product = std[:, :, None] * std[:, None, :]
+        empty = np.zeros_like(product)
+        return np.asarray(np.divide(covariances, product, out=empty, where=product > 0))
+
 
 @dataclass(frozen=True)
 class DriveBatches:

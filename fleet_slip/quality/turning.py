@@ -60,7 +60,7 @@ def check_moments(
     for first, batch in zip(count(0, BATCH), DriveBatches.from_table(table)):
         moments = batch.in_si(signals)
         in_batch = find_swapped_steering(moments)
-        if len(_witnesses(moments)) >= MIN_WITNESSES:
+        if len(_witnesses(moments).signals) >= MIN_WITNESSES:
             turning = find_reversed_or_swapped(moments, min_correlation)
             in_batch |= {drive: _join(several) for drive, several in turning.items()}
             in_batch |= find_magnitudes(moments)
@@ -99,11 +99,12 @@ def find_reversed_or_swapped(
     these: their axes are not ISO 8855. A witness is at fault if the median of its correlations with
     the other group is below -`min_correlation`, by default the threshold of the check.
     """
-    names = _witnesses(moments)
+    witnesses = _witnesses(moments)
+    names = witnesses.signals
     if len(names) < 2:
         return {}
     lowest = CHECKS["sign of turning"].low if min_correlation is None else -min_correlation
-    correlations = _without_equal_wheels(_correlations(moments, names), moments, names)
+    correlations = _without_equal_wheels(witnesses)
     if len(names) == 2:
         between = correlations[:, 0, 1]
         both = [signal for name in names for signal in WITNESSES[name]]
@@ -141,13 +142,11 @@ def find_magnitudes(moments: MeanMoments) -> dict[int, Fault]:
     The mean of such a witness is far from zero. It hardly correlates with the others, which agree
     with one another and turn to both sides.
     """
-    names = _witnesses(moments)
-    weights = _weights(moments, names)
-    m = moments.matrices
-    means = m[:, 0, 1:] @ weights.T
-    squares = np.diagonal(weights @ m[:, 1:, 1:] @ weights.T, axis1=1, axis2=2)
+    witnesses = _witnesses(moments)
+    names, m = witnesses.signals, witnesses.matrices
+    means, squares = m[:, 0, 1:], np.diagonal(m, axis1=1, axis2=2)[:, 1:]
     away = np.divide(np.abs(means), np.sqrt(squares), out=np.zeros_like(means), where=squares > 0)
-    agreement = np.abs(_correlations(moments, names))
+    agreement = np.abs(witnesses.correlations())
     is_peer = ~np.eye(len(names), dtype=bool)
     faults = {}
     for i, name in enumerate(names):
@@ -170,11 +169,7 @@ def find_swapped_axes(moments: MeanMoments) -> dict[int, Fault]:
     if not {"ax", "ay"} <= set(moments.signals) or not turning:
         return {}
     at = [moments.signals.index(name) for name in ("ax", "ay", *turning)]
-    covariances = moments.covariances()[:, at][:, :, at]
-    std = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0))
-    product = std[:, :2, None] * std[:, None, 2:]
-    shared = np.abs(covariances[:, :2, 2:])
-    agreement = np.divide(shared, product, out=np.zeros_like(shared), where=product > 0)
+    agreement = np.abs(moments.correlations()[:, at][:, :2, at[2:]])
     ax, ay = agreement[:, 0].min(axis=1), agreement[:, 1].max(axis=1)
     check = CHECKS["axes of the accelerometer"]
     return {
@@ -208,16 +203,28 @@ def find_swapped_steering(moments: MeanMoments) -> dict[int, Fault]:
     }
 
 
-def _witnesses(moments: MeanMoments) -> list[str]:
-    """Return the witnesses that have all their signals; of equal signals only the first.
+def _witnesses(moments: MeanMoments) -> MeanMoments:
+    """Return the moments of the witnesses that have all their signals; of equal ones the first.
 
-    One angle of both front wheels fills three signals, and is one witness.
+    One angle of both front wheels fills three signals, and is one witness. The difference of two
+    equal signals is 0, not what rounding leaves.
     """
     signals: list[str] = []
     for name in (*WITNESSES, *moments.signals):
         if name in moments.signals and not any(_are_equal(moments, name, o) for o in signals):
             signals.append(name)
-    return [name for name, parts in WITNESSES.items() if set(parts) <= set(signals)]
+    names = [name for name, parts in WITNESSES.items() if set(parts) <= set(signals)]
+    weights = np.zeros((1 + len(names), 1 + len(moments.signals)))
+    weights[0, 0] = 1
+    for row, name in enumerate(names, start=1):
+        for signal, weight in WITNESSES[name].items():
+            weights[row, moments.position(signal)] = weight
+    matrices = weights @ moments.matrices @ weights.T
+    squares, parts_squares = (
+        np.diagonal(m, axis1=1, axis2=2) for m in (matrices, moments.matrices)
+    )
+    differ = squares > ROUNDING * parts_squares @ (weights**2).T
+    return MeanMoments(tuple(names), matrices * (differ[:, :, None] & differ[:, None, :]))
 
 
 def _are_equal(moments: MeanMoments, a: str, b: str) -> bool:
@@ -226,37 +233,15 @@ def _are_equal(moments: MeanMoments, a: str, b: str) -> bool:
     return bool(np.array_equal(m[:, i, :], m[:, j, :]) and m[:, i, i].any())
 
 
-def _weights(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
-    weights = np.zeros((len(names), len(moments.signals)))
-    for row, name in enumerate(names):
-        for signal, weight in WITNESSES[name].items():
-            weights[row, moments.signals.index(signal)] = weight
-    return weights
-
-
-def _correlations(moments: MeanMoments, names: Sequence[str]) -> FloatArray:
-    weights = _weights(moments, names)
-    of_signals = moments.covariances()
-    covariances = weights @ of_signals @ weights.T
-    variances = np.diagonal(covariances, axis1=1, axis2=2)
-    summed = np.diagonal(of_signals, axis1=1, axis2=2) @ (weights**2).T
-    std = np.sqrt(np.where(variances > ROUNDING * summed, variances, 0))
-    product = std[:, :, None] * std[:, None, :]
-    return np.asarray(
-        np.divide(covariances, product, out=np.zeros_like(covariances), where=product > 0)
-    )
-
-
-def _without_equal_wheels(
-    correlations: FloatArray, moments: MeanMoments, names: Sequence[str]
-) -> FloatArray:
+def _without_equal_wheels(witnesses: MeanMoments) -> FloatArray:
     """Return correlations that are zero of wheels whose difference is too small for the turns."""
+    names, correlations = witnesses.signals, witnesses.correlations()
     if "yaw_rate" not in names:
         return correlations
-    weights, at = _weights(moments, names), names.index("yaw_rate")
-    with_yaw_rate = (weights @ moments.covariances() @ weights.T)[:, at]
-    expected = MIN_WHEEL_DIFFERENCE * TRACK_M / RADIUS_M * with_yaw_rate[:, at]
-    for i in (i for i, name in enumerate(names) if name in AXLES):
-        is_equal = np.abs(with_yaw_rate[:, i]) < expected
-        correlations[is_equal, i] = correlations[is_equal, :, i] = 0.0
+    at = names.index("yaw_rate")
+    shared = np.abs(witnesses.covariances()[:, at])
+    expected = MIN_WHEEL_DIFFERENCE * TRACK_M / RADIUS_M * shared[:, at]
+    for i in (names.index(name) for name in AXLES if name in names):
+        correlations[shared[:, i] < expected, i] = 0.0
+        correlations[shared[:, i] < expected, :, i] = 0.0
     return correlations

@@ -18,6 +18,7 @@ from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.simulate import (
     SimulationReport,
     lane_drive,
+    simulate_batch,
     simulate_batches,
     simulate_campaign,
 )
@@ -25,6 +26,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.highway import FourWheelVehicle, HighwayLanes
 from fleet_slip.warehouse.warehouse import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run_on
 from tests.support.rolling import simulate_drives
 
@@ -158,7 +160,7 @@ def test_highway_env_drives_whole_drives_as_the_kernel() -> None:
     plan = load_campaign("fleet_realistic", SHIPPED_CONFIGS)
     smoke = load_campaign("smoke", SHIPPED_CONFIGS)
     specs = [*plan.drives(plan.first_day)[:1], *smoke.drives(smoke.first_day)[:1]]
-    drives = [lane_drive(replace(spec, laps=min(spec.laps, 1.2))) for spec in specs]
+    drives = [lane_drive(replace(spec, laps=min(spec.laps, 1.1))) for spec in specs]
     by_kernel = simulate_drives(drives)
     by_highway_env = simulate_drives(drives, simulate_lanes=HighwayLanes(drives))
     for expected, truth in zip(by_kernel, by_highway_env, strict=True):
@@ -166,8 +168,12 @@ def test_highway_env_drives_whole_drives_as_the_kernel() -> None:
         for name in batch_kernel.CHANNELS:
             values = getattr(truth, name)
             np.testing.assert_allclose(values, getattr(expected, name), rtol=2e-11, atol=2e-11)
+    batch = Batch("smoke", smoke.first_day, 0, (replace(specs[1], laps=0.1),))
+    logs = simulate_batch(SIGNALS, batch, "highway-env")
+    assert logs.equals(simulate_batch(SIGNALS, batch))
 
 
+@pytest.mark.long
 def test_a_campaign_that_highway_env_drives_has_the_same_logs(
     run_command: RunCommand, tmp_path: Path
 ) -> None:
