@@ -26,6 +26,8 @@ from fleet_slip.ingest.formats.source import OWN_TIME
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")
 _POWER = re.compile(r"(?<=[^\W\d_])([2-9])(?!\w)")
+_GRAD = re.compile(r"(?<![^\W\d_])grad(?:e|s)?(?![^\W\d_])", re.IGNORECASE)
+"""Gradians in English, degrees in German; with a capital letter pint reads 10^9 radians."""
 _MAX_UNIT_CHARACTERS = 40
 
 _NEEDS = {
@@ -55,6 +57,12 @@ def conversion_factor(unit: str, si_unit: str, quantity: str = "it") -> float:
     # The pattern keeps pint from evaluating arithmetic: '9^9^9^9' would never end.
     if len(unit) > _MAX_UNIT_CHARACTERS or not _EXPRESSION.fullmatch(unit):
         raise ValueError(f"has the invalid unit {unit[:_MAX_UNIT_CHARACTERS]!r}; {needs}")
+    if _GRAD.search(unit):
+        degrees, gradians = (_GRAD.sub(word, unit) for word in ("deg", "gon"))
+        raise ValueError(
+            f"has the ambiguous unit {unit!r}: write {degrees!r} for degrees (360 a turn), or "
+            f"{gradians!r} for gradians (400 a turn)"
+        )
     registry = pint.application_registry
     name = "standard_gravity" if unit == "g" and si_unit == "m/s^2" else unit
     if name not in registry:  # a digit after a letter is a power, as in m/s2

@@ -7,6 +7,7 @@ contain: until then the draft does not load. A dry run of the ingest checks sign
 import json
 import re
 import shlex
+import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from fleet_slip.ingest.guess import (
     headings,
 )
 from fleet_slip.ingest.profile import FileProfile
+from fleet_slip.quality.drive_signals import RADIUS_M
 
 _MAX_REFUSED = 20
 
@@ -72,7 +74,7 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
         else guess
         for name, guess in guesses.items()
     }
-    guesses = {name: _doubted(guess, guesses) for name, guess in guesses.items()}
+    guesses = {name: _doubted(guess) for name, guess in guesses.items()}
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SATELLITE_SPEED}  # which stand together
@@ -83,10 +85,9 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     return Draft(file, profile, time, sure, doubtful, drive_keys, absent, notes)
 
 
-def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
-    """Return a guess, doubtful if its name is weak, it has no unit, and no other signal agrees."""
-    agreeing = {"yaw_rate", "ay", "steering_wheel"} & set(guesses) - {guess.signal}
-    if guess.is_weak and guess.readings and not agreeing:
+def _doubted(guess: Guess) -> Guess:
+    """Return a guess, doubtful if its name may mean something else and it has no unit."""
+    if guess.is_weak and guess.readings:
         return guess.doubted("name and unit are ambiguous")
     return guess
 
@@ -94,13 +95,22 @@ def _doubted(guess: Guess, guesses: dict[str, Guess]) -> Guess:
 def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
     """Yield the questions on headings, missing values, and the label's sensor."""
     taken = {guess.column for guess in guesses.values()}
-    for name in headings(profile.profiles, taken) if COURSE not in guesses else ():
+    for name, unit in headings(profile.profiles, taken) if COURSE not in guesses else ():
         yield (
             f"{quote_name(name)}: is it where the car points, or where it goes? If a satellite "
             "receiver "
             f"derives it from motion: course = {{ column = {_value(name)}, "
-            'unit = "deg", clockwise_from_north = true, antenna_x_m = ..., antenna_y_m = ... }, '
+            f"unit = {_value(unit)}, clockwise_from_north = true, antenna_x_m = ..., "
+            "antenna_y_m = ... }, "
             "with satellite_speed beside it. A heading says nothing of side-slip."
+        )
+    speeds = [guesses[name] for name in ("vehicle_speed", "vx") if name in guesses]
+    if speeds and not any(name.startswith("wheel_") for name in guesses):
+        keys = {"column": speeds[0].column, **speeds[0].keys, "radius_m": RADIUS_M}
+        yield (
+            "no wheel speeds: a speed of the car may stand in for all four, from which curvature "
+            f"and yaw rate times speed follow: wheel_fl = {_value(keys)}, and wheel_fr, wheel_rl, "
+            "wheel_rr alike. On a simulator it halved the error."
         )
     if {"vx", "vy"} <= set(guesses) and "sideslip" not in guesses:
         yield (
@@ -141,6 +151,17 @@ _HEAD = """\
 """
 
 
+_COLUMNS = 80
+"""Columns of a terminal: a longer line would be broken there, and a copy be no TOML."""
+
+
+def comment(text: str) -> list[str]:
+    """Return a text as lines of a comment."""
+    return textwrap.wrap(
+        text, _COLUMNS - 1, initial_indent="# ", subsequent_indent="#   ", break_on_hyphens=False
+    )
+
+
 def name_of(stem: str) -> str:
     """Return the name of a mapping for a file, whatever that is called, such as 2024-05-30."""
     plain = re.sub("[^a-z0-9]", "_", stem.lower())
@@ -160,11 +181,13 @@ def write_draft(draft: Draft, name: str) -> str:
         parts.append(_table("csv", keys | decimal_comma))
     if formats.can is not None:
         parts.append(_table("can", {"database": formats.can.database}))
-    parts.append(f"# {draft.time.reason}\n" + _table("time", draft.time.keys))
+    reason = "\n".join(comment(draft.time.reason))
+    parts.append(f"{reason}\n" + _table("time", draft.time.keys))
     parts.append(_drive(draft))
     parts.append(_signals(draft))
     if draft.open_questions:
-        parts.append("".join(f"# To check: {text}\n" for text in draft.open_questions))
+        notes = (line for text in draft.open_questions for line in comment(f"To check: {text}"))
+        parts.append("".join(f"{line}\n" for line in notes))
     return "\n".join(parts)
 
 
@@ -189,39 +212,45 @@ def _drive(draft: Draft) -> str:
 def _signals(draft: Draft) -> str:
     lines = ["[signals]"]
     for name, guess in draft.guesses.items():
-        lines.append(f"# {name}: {'; '.join(guess.reasons)}")
+        lines += comment(f"{name}: {'; '.join(guess.reasons)}")
         if guess.component != "east":  # stands beside north
-            end = "  # antenna_x_m and antenna_y_m: to be filled in" if name == COURSE else ""
             if guess.readings:
-                lines.append(f"# Choose the unit: {_choices(guess)}.")
-            lines.append(_line(name, guess, draft.guesses) + end)
+                lines += comment(f"Choose the unit: {_choices(guess)}.")
+            lines += _lines(name, guess, draft.guesses)
+            if name == COURSE:
+                lines += comment("antenna_x_m and antenna_y_m of the course: to be filled in")
     for name, guess in draft.questions.items():
         doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
-        lines.append(f"# Doubtful: {name}: {doubts}")
+        lines += comment(f"Doubtful: {name}: {doubts}")
         if guess.component != "east":
             if guess.readings:
-                lines.append(f"# Choose the unit too: {_choices(guess)}.")
-            lines += ["# " + _line(name, o, draft.questions) for o in (guess, *guess.rivals)]
+                lines += comment(f"Choose the unit too: {_choices(guess)}.")
+            for rival in (guess, *guess.rivals):
+                lines += [f"# {line}" for line in _lines(name, rival, draft.questions)]
     if draft.absent:
-        lines.append(f"# No channel looks like {', '.join(draft.absent)}.")
+        lines += comment(f"No channel looks like {', '.join(draft.absent)}.")
     return "\n".join(lines) + "\n"
 
 
 def _choices(guess: Guess) -> str:
     """Return the units that are possible, as a person writes them."""
-    return " or ".join(
-        f'"{keys["unit"]}"' + (f" with radius_m = {keys['radius_m']}" if "radius_m" in keys else "")
-        for keys in guess.readings
-    )
+    units = [f'"{keys["unit"]}"' for keys in guess.readings]
+    if "radius_m" in guess.readings[0]:  # as every velocity of a wheel
+        units[0] += f" with radius_m = {guess.readings[0]['radius_m']}"
+    return " or ".join(units)
 
 
-def _line(name: str, guess: Guess, guesses: dict[str, Guess]) -> str:
+def _lines(name: str, guess: Guess, guesses: dict[str, Guess]) -> list[str]:
+    """Return the keys of a signal: on a line, or on one each where that is too long."""
     keys = signal_keys(guess)
     if guess.component:
         east = guesses[SATELLITE_SPEED].column
         keys = {"north": keys["column"], "east": east, "unit": keys["unit"]}
     text = ", ".join(f"{key} = {_value(value)}" for key, value in keys.items())
-    return f"{name} = {{ {text} }}"
+    line = f"{name} = {{ {text} }}"
+    if len(line) < _COLUMNS:
+        return [line]
+    return [f"{name}.{key} = {_value(value)}" for key, value in keys.items()]
 
 
 def _table(name: str, keys: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 Every guess has reasons as texts, for a person to check. A guess with doubts becomes a question.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
@@ -181,11 +182,11 @@ def _with_sign(guess: Guess, profiles: tuple[Profile, ...]) -> Guess:
     return guess
 
 
-def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
-    """Return the channels that are a heading or a course, whichever."""
+def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[tuple[str, str]]:
+    """Return the channels that are a heading or a course, whichever, and their units."""
     never = set(vocabulary()["never"]["course"])
     return [
-        p.channel.name
+        (p.channel.name, _unit_of(p) or CHOOSE)
         for p in profiles
         if p.is_number
         and p.channel.name not in taken
@@ -194,12 +195,23 @@ def headings(profiles: tuple[Profile, ...], taken: set[str]) -> list[str]:
     ]
 
 
+_VSS = re.compile(r"([^./]+/)?Vehicle(\.[A-Z]\w*)+$|([^./]+/)?Vehicle(_[A-Z][A-Za-z0-9]*){2,}$")
+"""A path of COVESA's Vehicle Signal Specification, which defines units."""
+
+
+def _unit_of(profile: Profile) -> str | None:
+    """Return the unit that the file, or the name of a column, states; None without a known one."""
+    name, in_brackets = split_unit(profile.channel.name)
+    return unit_called(profile.channel.unit.strip() or in_brackets) or unit_behind(name)
+
+
 def _guess(catalog: SignalCatalog, signal: str, profile: Profile, words: str) -> Guess | None:
     """Return a guess with a unit that the signal can have, or None."""
-    name, in_brackets = split_unit(profile.channel.name)
     largest = float(np.nanquantile(np.abs(profile.values), 0.999))  # but for outliers
-    text = profile.channel.unit.strip() or in_brackets
-    unit = unit_called(text) or unit_behind(name) or ("1" if signal == "gear" else None)
+    text = profile.channel.unit.strip() or split_unit(profile.channel.name)[1]
+    unit = _unit_of(profile) or ("1" if signal == "gear" else None)
+    if unit is None and _VSS.match(profile.channel.name):
+        unit = vocabulary()["vss"].get("wheels" if signal in WHEELS else signal)
     how = "the format calls it" if profile.channel.title else "its name contains"
     named = f"{how} {words!r}"
     if unit is None:

@@ -467,6 +467,11 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
                 "antenna at the centre of gravity (antenna_x_m, antenna_y_m)",
             ),
             (mapping.front_wheels, "both front wheels steer alike (steer_fl, steer_fr)"),
+            (
+                not wheels and any(name in signals for name in OWN_SPEEDS),
+                "no wheel speeds, so that curvature is left out; a speed of the car may stand in "
+                "for them (docs/real-data.md)",
+            ),
         )
         if assumed
     )

@@ -13,12 +13,14 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
+from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.measured_log import IngestCounts, open_measured
+from fleet_slip.ingest.profile import profile_file
 from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.ingest.vocabulary import unit_called
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
-from tests.support.catalog import CATALOG
+from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.measured import read_measured
 from tests.support.reported import call
 from tests.support.textbook_car import Car, a_car
@@ -217,7 +219,7 @@ def read(file: Path, mapping: Any) -> tuple[list[MeasuredDrive], IngestCounts]:
 LOGS: dict[str, tuple[Callable[[Path], None], int, set[str]]] = {
     "bench.csv": (write_bench, 1, {"ax", "ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
     "fleet.parquet": (write_fleet, 4, {"ay", "yaw_rate", "steering_wheel", *WHEELS}),
-    "student.csv": (write_student, 1, {"ax", "ay", "yaw_rate", "steering_wheel", "vx", "vy"}),
+    "student.csv": (write_student, 1, {"ax", "ay", "vx", "vy"}),
     "bus.csv": (write_bus, 1, {"ay", "yaw_rate", "steering_wheel", *WHEELS, "sideslip"}),
 }
 
@@ -289,3 +291,67 @@ def test_a_rate_that_is_assumed_is_said_at_each_ingest(tmp_path: Path) -> None:
     words = ("ingest", str(tmp_path / "log.csv"), "--mapping", str(tmp_path / "m.toml"))
     with pytest.raises(AlarmError, match="100 Hz is assumed"):
         call(tmp_path / "root", *words)
+
+
+def draft_of(folder: Path, **columns: Any) -> str:
+    """Return the draft of a CSV file with these columns, each of 100 rows."""
+    time_s = np.arange(100) / 100
+    table = {"t_s": time_s, **{name: np.sin(7 * time_s) * scale for name, scale in columns.items()}}
+    pl.DataFrame(table).write_csv(folder / "log.csv")
+    file = folder / "log.csv"
+    return write_draft(draft_mapping(SIGNALS, file, profile_file(file)), "log")
+
+
+def test_units_in_names_are_read_and_weak_names_without_a_unit_are_questions(
+    tmp_path: Path,
+) -> None:
+    text = draft_of(
+        tmp_path, dpsi_radps=0.2, ay_mps2=3, deltawheel_rad=0.04, pBrakeR_bar=18, yawAngle_rad=1,
+        gz=2, r_Nm=5, v=20,
+    )  # fmt: skip
+    lines = text.splitlines()
+    assert 'yaw_rate = { column = "dpsi_radps", unit = "rad/s" }' in lines
+    assert 'steer = { column = "deltawheel_rad", unit = "rad" }' in lines
+    assert 'brake_pressure = { column = "pBrakeR_bar", unit = "bar" }' in lines
+    assert '# vehicle_speed = { column = "v", unit = "choose" }' in lines
+    assert "r_Nm" not in text
+    flat = " ".join(line.removeprefix("#").strip() for line in lines)
+    assert 'course = { column = "yawAngle_rad", unit = "rad", clockwise_from_north' in flat
+
+
+@pytest.mark.parametrize("separator", [".", "_"])
+def test_names_of_the_vehicle_signal_specification_have_its_units(
+    tmp_path: Path, separator: str
+) -> None:
+    names = {
+        "Vehicle.Acceleration.Lateral": ("ay", "m/s^2"),
+        "Vehicle.AngularVelocity.Yaw": ("yaw_rate", "deg/s"),
+        "Vehicle.Chassis.SteeringWheel.Angle": ("steering_wheel", "deg"),
+        "Vehicle.Chassis.Axle.Row1.Wheel.Left.Speed": ("wheel_fl", "km/h"),
+        "Vehicle.Chassis.Axle.Row2.Wheel.Right.Speed": ("wheel_rr", "km/h"),
+    }
+    text = draft_of(tmp_path, **{name.replace(".", separator): 10 for name in names})
+    signals = tomllib.loads(text)["signals"]
+    for name, (signal, unit) in names.items():
+        assert signals[signal]["column"] == name.replace(".", separator)
+        assert signals[signal]["unit"] == unit
+
+
+def test_a_lone_speed_may_stand_in_for_the_wheels(tmp_path: Path) -> None:
+    text = draft_of(tmp_path, **{"Car.ay [m/s^2]": 3, "Car.v [m/s]": 20})
+    assert 'vehicle_speed = { column = "Car.v [m/s]", unit = "m/s" }' in text
+    assert "no wheel speeds: a speed of the car may stand in for all four" in text
+    wheels = {f"wheel_{corner} [rad/s]": 60 for corner in ("fl", "fr", "rl", "rr")}
+    assert "no wheel speeds" not in draft_of(tmp_path, **{"Car.v [m/s]": 20, **wheels})
+
+
+def test_a_draft_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
+    name = "a very long name of a recorder's channel and its device, lateral acceleration [m/s^2]"
+    text = draft_of(tmp_path, **{name: 3, "Car.v [m/s]": 20, "yaw rate with no unit": 1})
+    assert [
+        line
+        for line in text.splitlines()
+        if len(line) >= 80 and name not in line and "log.csv" not in line
+    ] == []
+    draft = tomllib.loads(text)
+    assert draft["signals"]["ay"] == {"column": name, "unit": "m/s^2"}

@@ -443,3 +443,11 @@ def test_a_pattern_matches_the_end_of_a_path(pattern: str, path: str, value: str
 def test_a_pattern_of_many_stars_ends() -> None:
     with pytest.raises(InputError, match="does not end as in"):
         FromPath(path="*_" * 60 + "{}.csv").find(Path("/" + "_" * 205 + ".txt"))
+
+
+@pytest.mark.parametrize("unit", ["grad", "Grad", "grad/s", "Grad/s", "GRAD/s", "grad/sec"])
+def test_a_unit_with_two_readings_is_refused_with_both(unit: str) -> None:
+    si_unit = "rad/s" if "/" in unit else "rad"
+    with pytest.raises(ValueError, match=r"ambiguous unit .*: write 'deg.*' for degrees"):
+        conversion_factor(unit, si_unit)
+    assert conversion_factor("gon", "rad") == pytest.approx(np.pi / 200)

@@ -64,7 +64,17 @@ def score(columns: list[Named], folder: Path) -> Counter[str]:
     return _judge(columns, text)
 
 
+_KEY_A_LINE = re.compile(r"^(# )?(\w+)\.column = (.*)\n((?:(?:# )?\2\.\w+ = .*\n?)*)", re.MULTILINE)
+"""A signal whose keys are on a line each."""
+
+
+def _on_one_line(match: re.Match[str]) -> str:
+    more = "".join(f", {line.partition('.')[2]}" for line in match[4].splitlines())
+    return f"{match[1] or ''}{match[2]} = {{ column = {match[3]}{more} }}\n"
+
+
 def _judge(columns: list[Named], text: str) -> Counter[str]:
+    text = _KEY_A_LINE.sub(_on_one_line, text)
     asked = [
         line.replace('"choose"', unit.replace(" with", ","))
         for units, line in re.findall(r"^# Choose the unit: (.*)\.\n(.*)", text, re.MULTILINE)
