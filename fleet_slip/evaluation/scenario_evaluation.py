@@ -2,13 +2,15 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib.metadata import version as package_version
 from typing import Any
 
 import numpy as np
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.evaluation.combined import lateral_mps2
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     EvaluatedDrive,
@@ -16,22 +18,31 @@ from fleet_slip.evaluation.evaluator import (
     pooled_statistics,
 )
 from fleet_slip.evaluation.filters import (
+    GROUP,
     EstimatorBank,
+    FilterEstimate,
     TrainedModels,
     TuningDrives,
+    drive_signals,
     filter_bank,
     train_models,
 )
+from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.evaluation.test_drives import (
     TestDrive,
     blind_scenarios,
     find_stretches,
     simulate_drives,
 )
+from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.score import calibrated_cars
+from fleet_slip.regression.combination import Combination, PairedEstimates, fit_combination
 from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
+from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -51,7 +62,88 @@ def train_competitors(
     )
     drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     car = load_scenario("nominal", warehouse.configs).car
-    return trained, bank | filter_bank(drives, car, executor)
+    bank |= filter_bank(drives, car, executor)
+    return trained, bank | combination_bank(drives, car, one_car, bank)
+
+
+# Line and filter together, where the paper has its Kalman filter: without and with satellite
+# navigation. The filters are those of the class of cars, tuned on training drives of the line.
+
+COMBINATIONS = {"combination": "ekf_class_tuned", "combination_gps": "kalman_tuned"}
+"""Filter of each combination with the evaluated model."""
+
+
+@dataclass(frozen=True)
+class CombinedTestEstimate:
+    """A published model and a filter, combined."""
+
+    line: Estimator[TestDrive]
+    filter: Estimator[TestDrive]
+    combination: Combination
+
+    def __call__(self, drive: TestDrive) -> FloatArray:
+        """Return the estimate at each tick; the line's where the filter has none."""
+        line, signals = self.line(drive), drive_signals(drive)
+        filtered = self.filter(drive)
+        lateral = lateral_mps2(LabelledDrive(drive.name, signals, line))
+        combined = self.combination(line, filtered, lateral)
+        return np.where(np.isnan(filtered), line, combined)
+
+
+def combination_bank(
+    drives: TuningDrives, car: VehicleParameters, version: ModelVersion, bank: EstimatorBank
+) -> EstimatorBank:
+    """Return the combinations of a model with filters that could be tuned, anchored at the model.
+
+    On drives unlike the training drives, such as icy ones, the filter of a class is far less
+    accurate than the model of a fleet; so the combination adds to the model a bounded share of the
+    difference.
+    """
+    combined: EstimatorBank = {}
+    for name, filter_name in COMBINATIONS.items():
+        filtered, about = bank[filter_name]
+        if not isinstance(filtered, FilterEstimate) or not about["tuned_on"]:
+            continue
+        pairs = _paired_estimates(drives, car, version, filtered)
+        if not len(pairs):
+            continue
+        combination = fit_combination(pairs, "line_by_lateral")
+        line, _ = bank[version.reference]
+        combined[name] = (
+            CombinedTestEstimate(line, filtered, combination),
+            {
+                "kind": "combination",
+                "group": GROUP,
+                "gps": about["gps"],
+                "told": "class",
+                "of": [version.reference, filter_name],
+                "combination": asdict(combination),
+                "tuned_on": about["tuned_on"],
+            },
+        )
+    return combined
+
+
+def _paired_estimates(
+    drives: TuningDrives, car: VehicleParameters, version: ModelVersion, filtered: FilterEstimate
+) -> PairedEstimates:
+    """Return the estimates of a model and a filter on the tuning drives, each drive a group."""
+    predictor = Predictor.from_manifest(version.catalog.signals, version.manifest)
+    warehouse = drives.warehouse
+    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
+    query = "SELECT * FROM log_counts WHERE drive_id = $drive ORDER BY tick LIMIT $rows"
+    parts = []
+    with open_views(warehouse, "SELECT 1 FROM log_counts") as database:
+        for number, drive in enumerate(drives.drives):
+            given = {"drive": drive.drive_id, "rows": len(drive.signals)}
+            rows = database.sql(query, params=given).to_arrow_table()
+            numbers = cars.get(rows["vehicle_id"][0].as_py())
+            line = predictor(counts_of(rows, predictor.plan, None, numbers))
+            angle = filtered.filter.estimate(drive.signals, drive.car or car, filtered.parameters)
+            group = np.full(len(line), float(number))
+            pair = PairedEstimates(line, angle, drive.sideslip_rad, lateral_mps2(drive), group)
+            parts.append(pair.where(np.isfinite(line + angle + drive.sideslip_rad)))
+    return PairedEstimates.concatenate(parts)
 
 
 def evaluate_scenarios(
@@ -65,7 +157,9 @@ def evaluate_scenarios(
     (first, *fleet_models), bank = train_competitors(warehouse, one_car, fleets, executor)
     estimators = {name: estimator for name, (estimator, _) in bank.items()}
     runs = evaluate(simulate_drives(warehouse.catalog.signals, scenarios), estimators)
-    gps = {name for name, (_, about) in bank.items() if about.get("gps")}
+    not_ranked = {
+        name for name, (_, about) in bank.items() if about.get("gps") or name in COMBINATIONS
+    }
     return {
         "format": 1,
         "package_version": package_version("fleet-slip"),
@@ -78,7 +172,7 @@ def evaluate_scenarios(
             for fleet in fleet_models
             for row in compare_models(runs, first.table_one, fleet.table_one)
         ],
-        "ranking": rank(runs, first.version.reference, gps),
+        "ranking": rank(runs, first.version.reference, not_ranked),
     }
 
 
@@ -194,9 +288,9 @@ CLOSE = 1.25
 
 
 def rank(
-    runs: Sequence[EvaluatedDrive[TestDrive]], estimator: str, gps: Collection[str]
+    runs: Sequence[EvaluatedDrive[TestDrive]], estimator: str, excluded: Collection[str]
 ) -> dict[str, Any]:
-    """Rank an estimator on every drive against all that use no GPS; it wins a tie.
+    """Rank an estimator on every drive against all but `excluded`; it wins a tie.
 
     Returns the section of a document. Drives that differ in satellite navigation alone count once:
     `same_as` names the first.
@@ -204,7 +298,7 @@ def rank(
     standings = [
         {
             "scenario": run.name,
-            **_standing(run, estimator, gps),
+            **_standing(run, estimator, excluded),
             "same_as": _same_as(run.drive.scenario, runs[:number]),
         }
         for number, run in enumerate(runs)
@@ -223,13 +317,13 @@ def rank(
 
 
 def _standing(
-    run: EvaluatedDrive[TestDrive], estimator: str, gps: Collection[str]
+    run: EvaluatedDrive[TestDrive], estimator: str, excluded: Collection[str]
 ) -> dict[str, Any]:
     """Return the best estimator of a drive (None without competitors), and this one's verdict."""
     errors = {
         name: statistics.rmse_deg
         for name, statistics in run.statistics.items()
-        if name not in gps
+        if name not in excluded
         and statistics.rmse_deg is not None
         and statistics.coverage >= MIN_COVERAGE
     }

@@ -31,6 +31,7 @@ from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visibl
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
+from fleet_slip.regression.combination import Combination
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.storage.documents import DocumentFolder, Inventory
@@ -57,6 +58,24 @@ def test_evaluating_again_changes_nothing(root: Path, evaluated: Path, again: An
     assert again["number"] == 1
     before, after = (Warehouse(LocalFolder(one)).logs.snapshot() for one in (evaluated, root))
     assert after.version == before.version
+
+
+def test_the_model_is_shown_together_with_filters_without_and_with_gps(again: Any) -> None:
+    estimators = again["estimators"]
+    pairs = {"combination": "ekf_class_tuned", "combination_gps": "kalman_tuned"}
+    for name, filter_name in pairs.items():
+        assert estimators[name]["of"] == ["smoke@1", filter_name]
+        combination = Combination(**estimators[name]["combination"])
+        assert combination.anchor == "line"
+        for scenario in again["scenarios"]:
+            errors = {n: scenario["results"][n] for n in (name, "smoke@1", filter_name)}
+            assert errors[name]["coverage"] >= errors["smoke@1"]["coverage"]
+            bound = errors["smoke@1"]["error_max_deg"]
+            limit_deg = 3 * np.degrees(max(combination.std_rad))
+            if errors["smoke@1"]["coverage"] == 1:
+                assert errors[name]["error_max_deg"] <= bound + limit_deg
+    standings = again["ranking"]["standings"]
+    assert not {standing["winner"] for standing in standings} & {*pairs}, "a part of them competes"
 
 
 def test_an_evaluation_of_another_process_is_not_stored_twice(
@@ -246,7 +265,7 @@ def run(
 
 
 def standing(one: EvaluatedDrive[TestDrive], estimator: str = "ours") -> dict[str, Any]:
-    (found,) = rank([one], estimator, gps=())["standings"]
+    (found,) = rank([one], estimator, excluded=())["standings"]
     return dict(found)
 
 
@@ -259,7 +278,7 @@ def test_the_smallest_error_wins() -> None:
 
 
 def test_satellite_navigation_does_not_compete() -> None:
-    found = rank([run(ours=0.3, kalman=0.1, ekf=0.4)], "ours", gps={"kalman"})
+    found = rank([run(ours=0.3, kalman=0.1, ekf=0.4)], "ours", excluded={"kalman"})
     assert found["won"] == 1
 
 
@@ -276,7 +295,7 @@ def test_drives_that_differ_in_satellite_navigation_alone_count_once() -> None:
     found = rank(
         [run(load_scenario(name, SHIPPED_CONFIGS), ours=0.1, ekf=0.2) for name in names],
         "ours",
-        gps=(),
+        excluded=(),
     )
     same = [one["same_as"] for one in found["standings"]]
     assert same == [None, "gps_clear", "gps_clear", None, "gps_clear", None]
@@ -289,7 +308,7 @@ def test_wins_and_close_losses_are_counted_apart() -> None:
         run(nominal.model_copy(update={"seed": seed}), ours=error, ekf=0.2)
         for seed, error in enumerate((0.1, 0.2, 0.24, 0.26))
     ]
-    found = rank(runs, "ours", gps=())
+    found = rank(runs, "ours", excluded=())
     assert (found["won"], found["close"]) == (2, 1), "a tie is won, 1.2 is close and 1.3 is not"
     assert [one["won"] for one in found["standings"]] == [True, True, False, False]
 
@@ -300,7 +319,7 @@ def test_the_table_keeps_its_numbers_whole(
 ) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", str(columns))
-    print_parts([_ranking_table(rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", gps=()))])
+    print_parts([_ranking_table(rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", excluded=()))])
     printed = Text.from_ansi(capsys.readouterr().out).plain
     assert "ours/3 is model 3 of Table I" in " ".join(printed.split())
     table = printed[printed.index("scenario") :]
