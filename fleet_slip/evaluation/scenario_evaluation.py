@@ -38,7 +38,7 @@ from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import calibrated_cars
-from fleet_slip.regression.combination import Combination, PairedEstimates, fit_combination
+from fleet_slip.regression.combination import EstimateCombination, PairedEstimates, fit_combination
 from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -79,7 +79,7 @@ class CombinedTestEstimate:
 
     line: Estimator[TestDrive]
     filter: Estimator[TestDrive]
-    combination: Combination
+    combination: EstimateCombination
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick; the line's where the filter has none."""

@@ -31,7 +31,7 @@ from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visibl
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
-from fleet_slip.regression.combination import Combination
+from fleet_slip.regression.combination import EstimateCombination
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.storage.documents import DocumentFolder, Inventory
@@ -65,7 +65,7 @@ def test_the_model_is_shown_together_with_filters_without_and_with_gps(again: An
     pairs = {"combination": "ekf_class_tuned", "combination_gps": "kalman_tuned"}
     for name, filter_name in pairs.items():
         assert estimators[name]["of"] == ["smoke@1", filter_name]
-        combination = Combination(**estimators[name]["combination"])
+        combination = EstimateCombination(**estimators[name]["combination"])
         assert combination.anchor == "line"
         for scenario in again["scenarios"]:
             errors = {n: scenario["results"][n] for n in (name, "smoke@1", filter_name)}
