@@ -1,6 +1,5 @@
 """The warehouse of one data root: which tables it holds and how they are encoded."""
 
-import ctypes
 import json
 import os
 from dataclasses import dataclass, field, replace
@@ -82,6 +81,8 @@ class ConnectionCache:
             return None
         if process == os.getpid():
             return connection
+        import ctypes  # slow
+
         # Inherited by a fork, without its threads: to destroy it would crash the process.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection.database))
         return None
