@@ -255,7 +255,8 @@ def _latest(
 MAX_OPEN_VALUES = 2**23
 """Maximum values of open drives in memory, 64 MiB; the others are in a temporary file.
 
-A drive of 87 minutes at 100 Hz with 14 signals fits: drives that stand together are not spilled.
+A drive of 87 minutes at 100 Hz with 14 signals fits: drives whose rows are together are not
+spilled. Of hundreds of open drives it is a quarter, as each takes memory of its own.
 """
 MANY_SEGMENTS = 64
 """Segments that end at once, for which blocks are joined: each is one piece then."""
@@ -372,7 +373,7 @@ class OpenDrives:
         for bundle, segments in sorted(bundles.items()):
             for piece in self._spool.take(("bundle", bundle)):
                 self.add(pl.read_ipc_stream(piece))
-                if self._values > MAX_OPEN_VALUES:
+                if self._values > MAX_OPEN_VALUES // 4:
                     self._spill_rows(bundled=False)
             if self._blocks:  # a piece has a segment in several places
                 self._blocks = [pl.concat(self._blocks).sort("segment", maintain_order=True)]
@@ -380,9 +381,12 @@ class OpenDrives:
 
     def spill(self) -> None:
         """Spill the rows if they are many. Raises `InputError` if the disk is full."""
-        if self._values > MAX_OPEN_VALUES:
-            segments = pl.concat([rows["segment"] for rows in self._blocks]).n_unique()
-            self._bundled |= segments > MAX_SINGLE_PIECES
+        if self._values <= MAX_OPEN_VALUES // 4:
+            return
+        segments = pl.concat([rows["segment"] for rows in self._blocks])
+        if np.ptp(segments.to_numpy()) >= MAX_SINGLE_PIECES:
+            self._bundled |= segments.n_unique() > MAX_SINGLE_PIECES
+        if self._bundled or self._values > MAX_OPEN_VALUES:
             self._spill_rows(bundled=self._bundled)
 
     def _spill_rows(self, *, bundled: bool) -> None:
