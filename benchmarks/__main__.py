@@ -32,6 +32,7 @@ COMMANDS = (
     "simulator",
     "simulator_profile",
     "pipeline",
+    "ingest --rows 1000000 --formats parquet,csv",
     "cluster",
     "crash --kills 30",
 )

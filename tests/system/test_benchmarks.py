@@ -99,6 +99,19 @@ def test_a_benchmark_runs_with_tiny_sizes(name: str, tiny_root: Path, tmp_path: 
     assert checkout() == before
 
 
+@pytest.mark.long
+@pytest.mark.timeout(DEADLINE_S)
+def test_an_ingest_takes_no_more_of_polars_than_recorded() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.ingest", "--check"],
+        cwd=HERE,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
 def checkout() -> dict[Path, int]:
     """Return when each file was written that a benchmark might take for its own."""
     files = (
