@@ -59,11 +59,7 @@ def connect(
 
 
 def open_views(
-    warehouse: Warehouse,
-    query: str | None,
-    threads: int | None = None,
-    *,
-    unlocked: bool = False,
+    warehouse: Warehouse, query: str | None, threads: int | None = None, *, unlocked: bool = False
 ) -> duckdb.DuckDBPyConnection:
     """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
     warehouse.require()

@@ -104,11 +104,7 @@ def _property(
         column["items"] = {"logicalType": logical, "physicalType": element}
     column["description"] = description
     if name in key:
-        column |= {
-            "required": True,
-            "primaryKey": True,
-            "primaryKeyPosition": key.index(name) + 1,
-        }
+        column |= {"required": True, "primaryKey": True, "primaryKeyPosition": key.index(name) + 1}
     if limits:
         column["logicalTypeOptions"] = {"minimum": limits[0], "maximum": limits[1]}
     elif name in _MINIMUM_ZERO:

@@ -333,10 +333,7 @@ def load_retention(path: str | None, configs: Configs) -> Retention:
 
 
 def retain(
-    warehouse: Warehouse,
-    retention: Retention,
-    today: date,
-    progress: Progress = no_progress,
+    warehouse: Warehouse, retention: Retention, today: date, progress: Progress = no_progress
 ) -> RetentionReport:
     """Erase the drives that exceed the retention, then vacuum; `progress` counts files.
 

@@ -280,11 +280,7 @@ def _saturated(table: GramTable, metadata: pa.Table, limits: QualityThresholds) 
 
 
 def _unlike_peers(
-    label: str,
-    table: GramTable,
-    group: BoolArray,
-    in_order: BoolArray,
-    limits: QualityThresholds,
+    label: str, table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
 ) -> dict[int, Fault]:
     """Return the faults of the drives of a group that differ from its others."""
     peers_table = table.take(group)

@@ -268,9 +268,7 @@ class CompactionReport:
 
 
 def compact(
-    warehouse: Warehouse,
-    target_rows: int = TARGET_ROWS,
-    progress: Progress = no_progress,
+    warehouse: Warehouse, target_rows: int = TARGET_ROWS, progress: Progress = no_progress
 ) -> CompactionReport:
     """Compact each day in a commit, then reconcile Gram rows. Raises `ConflictError`."""
     warehouse.require()

@@ -56,15 +56,7 @@ from fleet_slip.warehouse.gram_reader import is_onboard, is_onboard_file, named_
 from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[
-    "file",
-    "drive",
-    "gram",
-    "document",
-    "model",
-    "log",
-    "name",
-    "unreferenced",
-    "backlog",
+    "file", "drive", "gram", "document", "model", "log", "name", "unreferenced", "backlog"
 ]
 
 

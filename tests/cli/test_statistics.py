@@ -148,10 +148,7 @@ def test_features_are_listed(run_command: RunCommand) -> None:
 
 
 @pytest.mark.parametrize(
-    "words",
-    [
-        *(f"select --folds {folds}" for folds in ("1001", "1", "-3", "few")),
-    ],
+    "words", [*(f"select --folds {folds}" for folds in ("1001", "1", "-3", "few"))]
 )
 def test_a_number_of_folds_that_cannot_be_is_named(
     run_command: RunCommand, tmp_path: Path, words: str

@@ -360,10 +360,7 @@ def test_what_was_superseded_is_no_drive(laps: Fleet, tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "second"),
-    [
-        (("compact", "ingest"), "forget"),
-        (("ingest", "gram", "publish", "promote"), "migrate"),
-    ],
+    [(("compact", "ingest"), "forget"), (("ingest", "gram", "publish", "promote"), "migrate")],
 )
 def test_commands_that_meet_at_any_point_lose_and_double_nothing(
     first: tuple[str, ...], second: str

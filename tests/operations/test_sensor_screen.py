@@ -82,10 +82,7 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     assert (
         fleet.evaluation.score("m").drives,
         fleet.evaluation.score("m", include_faulty=True).drives_left_out,
-    ) == (
-        4,
-        4,
-    )
+    ) == (4, 4)
     evaluated = run_command("evaluate", "m", "--cohort", "true")
     assert evaluated.exit_code == 0 and "2 drives of 6 left out" in evaluated.stderr
     assert "true: 4 drives, held out whole" in evaluated.stdout

@@ -326,10 +326,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 @JOBS
 @pytest.mark.parametrize("moment", ["find_gram_files", "by_sql", "stored_grams", "wide_grams"])
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
-    job: Callable[[Warehouse], Any],
-    moment: str,
-    three: Warehouse,
-    meanwhile: Callable[..., None],
+    job: Callable[[Warehouse], Any], moment: str, three: Warehouse, meanwhile: Callable[..., None]
 ) -> None:
     meanwhile(check, moment, lambda: job(three))
     assert check_grams(three, 3).drives >= 2
@@ -338,10 +335,7 @@ def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
 @JOBS
 @pytest.mark.parametrize("moment", ["verify_files", "verify_rows", "verify_grams"])
 def test_a_verification_beside_a_job_that_takes_files_away_finds_no_damage(
-    job: Callable[[Warehouse], Any],
-    moment: str,
-    three: Warehouse,
-    meanwhile: Callable[..., None],
+    job: Callable[[Warehouse], Any], moment: str, three: Warehouse, meanwhile: Callable[..., None]
 ) -> None:
     meanwhile(verification, moment, lambda: job(three))
     assert not verify(three, full=True).damage
