@@ -72,8 +72,8 @@ def print_answer(answer: Answer | Sequence[Answer], json: bool, **options: Any) 
     if json:
         print_json(answer)
     else:
-        print_parts(part for each in answers for part in each.parts(**options))
-    for problem in (each.problem for each in answers):
+        print_parts(part for answer in answers for part in answer.parts(**options))
+    for problem in (answer.problem for answer in answers):
         if problem:
             raise problem
 

@@ -116,8 +116,8 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
         yield Remark(examined)
     is_time = content["parts_of"] == "time"
     held_out, unit = ("in quarters of their time", "quarter") if is_time else ("whole", "drive")
-    told = dict.fromkeys(row["told"] for row in content["estimators"].values())
-    sources = dict(zip(told, ascii_lowercase, strict=False))
+    labels = dict.fromkeys(row["told"] for row in content["estimators"].values())
+    sources = dict(zip(labels, ascii_lowercase, strict=False))
     kinds = ", ".join(f"{kind['name']} ({len(kind['drives'])})" for kind in content["kinds"])
     yield TextTable(
         f"{drives}, held out {held_out}, in {content['parts']} folds",

@@ -9,6 +9,7 @@ PACKAGE = Path(fleet_slip.__file__).parent
 
 READERS = {
     "cli/app.py": "the folder for fonts, which matplotlib needs before it is imported",
+    "cli/main.py": "the plugins of pydantic, before it is imported",
     "cli/output.py": "TERM, CI",
     "warehouse/warehouse.py": "open_warehouse: the data root and the folder of configs",
     "resources.py": "the system's folder for caches, needed when a module is imported",

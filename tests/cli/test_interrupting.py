@@ -226,7 +226,7 @@ def test_help_groups_the_commands_and_begins_with_nine() -> None:
     places = [text.index(f"\n{group}:\n") for group in GROUPS]
     assert places == sorted(places)
     assert len(GROUPS["Start here"].split()) == 9
-    assert len(COMMANDS) <= 36
+    assert len(COMMANDS) <= 37
     assert "\n  diagnose   Fit a model's signals" in text
     assert "Without logs: fleet-slip demo\n" in text
     assert max(map(len, text.splitlines())) <= 80
