@@ -16,7 +16,7 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
-from fleet_slip.quality.drive_signals import DriveBatches
+from fleet_slip.quality.drive_signals import DriveBatches, MeanMoments
 from fleet_slip.quality.peers import MAD_TO_STD, QualityThresholds, solve
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.resources import read_sql
@@ -53,27 +53,25 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
 
 def _gains(drives: DriveBatches, label: int) -> FloatArray | None:
     """Return the gain of each drive's label on the common relation; None without one."""
-    blocks = [label_blocks(batch.covariances(), label) for batch in drives]
-    inputs = sum(block[0].sum(axis=0) for block in blocks)
-    with_label = np.concatenate([block[1] for block in blocks])
-    variance = float(sum(block[2].sum() for block in blocks))
-    starts = [np.ones(len(drives)), _leading_signs(inputs, with_label)]
-    fits = [_fit_signs(drives, label, inputs, with_label, start) for start in starts]
+    inputs, with_label, variances = _label_moments(drives, label)
+    starts = [np.ones(len(drives)), _leading_signs(inputs.sum(axis=0), with_label)]
+    fits = [_fit_signs(inputs, with_label, start) for start in starts]
     explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in fits]
     signs, _, gains = fits[int(np.argmax(explained))]
-    if not max(explained) > MIN_EXPLAINED * variance:
+    if not max(explained) > MIN_EXPLAINED * float(variances.sum()):
         return None
     majority = np.sign(signs.sum()) or signs[0]
     return np.asarray(gains * majority)
 
 
 def _fit_signs(
-    drives: DriveBatches, label: int, inputs: FloatArray, with_label: FloatArray, signs: FloatArray
+    inputs: FloatArray, with_label: FloatArray, signs: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return signs that agree with the relation fitted with them, the relation, and the gains."""
+    total = inputs.sum(axis=0)
     for _ in range(ROUNDS):
-        weights = solve(inputs, signs @ with_label)
-        gains = np.concatenate([_gain(b.covariances(), label, weights) for b in drives])
+        weights = solve(total, signs @ with_label)
+        gains = with_label @ weights / _predicted(inputs, weights)
         agreeing = np.where(gains < 0, -1.0, 1.0)
         if (agreeing == signs).all():
             break
@@ -81,18 +79,17 @@ def _fit_signs(
     return signs, weights, gains
 
 
-def label_blocks(covariances: FloatArray, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the covariances of the inputs, theirs with the label, and the label's variances."""
-    inputs_at = np.delete(np.arange(covariances.shape[1]), label)
-    inputs = covariances[:, inputs_at[:, None], inputs_at]
-    return inputs, covariances[:, inputs_at, label], covariances[:, label, label]
+def _label_moments(drives: DriveBatches, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return each drive's covariances of inputs, those with the label, and the label's variance."""
+    covariances = drives.evaluate(MeanMoments.covariances)
+    at = np.delete(np.arange(covariances.shape[1]), label)
+    return covariances[:, at[:, None], at], covariances[:, at, label], covariances[:, label, label]
 
 
-def _gain(covariances: FloatArray, label: int, weights: FloatArray) -> FloatArray:
-    inputs, with_label, _ = label_blocks(covariances, label)
-    predicted = np.einsum("i,dij,j->d", weights, inputs, weights)
-    least = np.finfo(np.float64).tiny
-    return np.asarray(with_label @ weights / np.maximum(predicted, least))
+def _predicted(inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the variance of each drive's prediction."""
+    variances = np.einsum("i,dij,j->d", weights, inputs, weights)
+    return np.asarray(np.maximum(variances, np.finfo(np.float64).tiny))
 
 
 def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
@@ -156,15 +153,13 @@ def find_odd_days(
 
 def _figures(drives: DriveBatches, label: int) -> FloatArray | None:
     """Return offset and gain of each drive's label; None if the others hardly explain labels."""
-    blocks = [label_blocks(batch.covariances(), label) for batch in drives]
-    inputs, with_label = (np.concatenate([block[at] for block in blocks]) for at in (0, 1))
+    inputs, with_label, variances = _label_moments(drives, label)
     weights = solve(inputs.sum(axis=0), with_label.sum(axis=0))
-    explained = with_label @ weights
-    predicted, least = np.einsum("i,dij,j->d", weights, inputs, weights), np.finfo(np.float64).tiny
-    variance = predicted * np.concatenate([block[2] for block in blocks])
-    if np.median(explained**2 / np.maximum(variance, least)) < MIN_EXPLAINED:
+    explained, predicted = with_label @ weights, _predicted(inputs, weights)
+    least = np.finfo(np.float64).tiny
+    if np.median(explained**2 / np.maximum(predicted * variances, least)) < MIN_EXPLAINED:
         return None
-    gains = explained / np.maximum(predicted, least)
+    gains = explained / predicted
     means = drives.evaluate(lambda batch: batch.matrices[:, 0, 1:])
     offsets = means[:, label] - np.delete(means, label, axis=1) @ weights
     return np.stack([offsets, np.log(np.maximum(gains, MIN_GAIN))], axis=1)
