@@ -1,7 +1,7 @@
 """Equations of motion of a planar car on four wheels.
 
 The road may slope, its adhesion may vary and wind may blow. Steering may yield, wheels may differ
-and tyres may lag. The textbook's car is the special case without imperfections (`derivative`).
+and tyres may lag. The textbook's car is the special case without imperfections.
 Symbols, sources and limits are in `docs/vehicle.md`; imperfections are in `docs/simulator.md`.
 """
 
@@ -438,17 +438,3 @@ def imperfect_derivative(
         ay,
     )
     return rates, compliance_rates
-
-
-@equation
-def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> Derivative:
-    """Compute the rates of the textbook's car on a flat, even and calm road.
-
-    Parameters and result are as those of `imperfect_derivative`.
-    """
-    rigid, r = Compliance(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0), c.radius
-    ideal = ImperfectionConstants(
-        0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    )
-    rates, _ = imperfect_derivative(x, u, rigid, CALM, brakes, c, ideal)
-    return rates

@@ -7,17 +7,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.compiling import kernel
+from fleet_slip.compiling import equation, kernel
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle import batch_kernel
 from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
 from fleet_slip.vehicle.batch_kernel import CHANNELS
-from fleet_slip.vehicle.dynamics import NO_BRAKES, Derivative, derivative
+from fleet_slip.vehicle.dynamics import (
+    CALM,
+    NO_BRAKES,
+    Compliance,
+    Derivative,
+    Wheels,
+    imperfect_derivative,
+)
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
     Constants,
     Controls,
+    ImperfectionConstants,
     State,
     constants,
     load_vehicle,
@@ -26,6 +34,20 @@ from fleet_slip.vehicle.parameters import (
 SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 CAR = constants(SEDAN, adhesion=1.0)
 NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
+
+
+@equation
+def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> Derivative:
+    """Compute the rates of the textbook's car on a flat, even and calm road.
+
+    Parameters and result are as those of `imperfect_derivative`.
+    """
+    rigid, r = Compliance(x.steering_wheel, 0.0, 0.0, 0.0, 0.0, 0.0), c.radius
+    ideal = ImperfectionConstants(
+        0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    )
+    rates, _ = imperfect_derivative(x, u, rigid, CALM, brakes, c, ideal)
+    return rates
 
 
 @kernel
