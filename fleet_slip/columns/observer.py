@@ -5,8 +5,9 @@ tyres by Fiala under the current loads. Every operation rounds once. Every numbe
 its operands do not bound it, so that `Lowering.ranges` proves that nothing overflows.
 
 A tick without any input changes nothing. A missing measurement does not correct the state, and
-missing inputs keep their value. The filter starts at the first tick that has all inputs, and starts
-again where its velocity differs from the wheels' by more than `RESTART_MPS`.
+missing inputs keep their value. The filter starts at the first tick that has all inputs. It starts
+again where its velocity differs from the wheels' by more than `RESTART_MPS`, or a bias is at its
+limit, so that no fault of a sensor outlasts its end.
 """
 
 import math
@@ -27,8 +28,11 @@ STATE, COVARIANCE, RATIO, GAIN, TRANSITION = 16, 32, 20, 22, 24
 STEP_S = 0.01
 GRAVITY_MPS2 = 9.80665
 
-VX_MPS, VY_MPS, YAW_RAD_S, BIAS_MPS2, ACCELERATION_MPS2 = 128.0, 64.0, 8.0, 4.0, 64.0
+VX_MPS, VY_MPS, YAW_RAD_S, ACCELERATION_MPS2 = 128.0, 64.0, 8.0, 64.0
 """Limits of states and inputs."""
+
+BIAS_MPS2, GYRO_BIAS_RAD_S = 2.0, 0.1
+"""Limits of the biases of accelerometer and gyroscope: beyond them the filter starts again."""
 
 STEER_RAD = 1.0
 VARIANCE = 4.0
@@ -187,7 +191,13 @@ class ObserverLowering:
         counts = [logged[name].present() for name in held]
         arrives = reduce(Number.at_least, counts)
         speed = logged["speed"].orelse(held["speed"])
-        strays = abs(speed - velocity[0]).exceeds(RESTART_MPS)
+        gyro_bias = self._state(GYRO_BIAS_RAD_S)
+        strays = (
+            abs(speed - velocity[0])
+            .exceeds(RESTART_MPS)
+            .at_least(abs(velocity[3]).exceeds(BIAS_MPS2 - 2.0**-STATE))
+            .at_least(abs(gyro_bias).exceeds(GYRO_BIAS_RAD_S - 2.0 ** (1 - STATE)))
+        )
         begins = reduce(Number.at_most, counts).at_most(
             strays.at_least(started.like(1.0) - started)
         )
@@ -197,14 +207,14 @@ class ObserverLowering:
         square = (steer * steer).to(RATIO)
         sine = (steer * _series(square, (1, -1 / 6, 1 / 120, -1 / 5040))).to(RATIO)
         cosine = _series(square, (1, -1 / 2, 1 / 24, -1 / 720, 1 / 40320)).at_least(0.5)
-        rate = self._yaw_rate(logged, acceleration, cosine, begins)
+        rate = self._yaw_rate(logged, gyro_bias, acceleration, cosine, begins)
         if self.observer.axle == "front":
             turned = (sine * rate.times(car.front_axle_m)).to(STATE)
             speed = (speed - turned).over(cosine, STATE).within(VX_MPS)
         road = WheelsOnRoad(sine, cosine, *self._axles(acceleration, now["ay"], begins))
 
         initial = [speed, rate.times(car.rear_axle_m).within(VY_MPS), rate, rate.like(0.0)]
-        variances = (*INITIAL_VARIANCES, car.ay_bias_std_mps2**2)
+        variances = (*INITIAL_VARIANCES, min(car.ay_bias_std_mps2**2, VARIANCE))
         pairs = list(combinations_with_replacement(range(4), 2))
         stored = {pair: self._state(VARIANCE, COVARIANCE) for pair in pairs}
         predicted = self._predict(Gaussian(velocity, stored), acceleration, road)
@@ -263,19 +273,26 @@ class ObserverLowering:
         lagged = self._state(ACCELERATION_MPS2)
         change = (speed - before).times(1 / STEP_S).within(ACCELERATION_MPS2)
         zero = lagged.like(0.0)
-        new = choose(begins, zero, lagged + (change - lagged).times(LAG_SHARE))
+        following = (lagged + (change - lagged).times(LAG_SHARE)).within(ACCELERATION_MPS2)
+        new = choose(begins, zero, following)
         self._keep([(lagged, new)])
         return new
 
     def _yaw_rate(
-        self, logged: Mapping[str, Number], ax: Number, cosine: Number, begins: Number
+        self,
+        logged: Mapping[str, Number],
+        bias: Number,
+        ax: Number,
+        cosine: Number,
+        begins: Number,
     ) -> Number:
         """Return the filtered yaw rate: state [r, bias of the gyroscope]."""
         car = self.car
-        means = [self._state(YAW_RAD_S), self._state(YAW_RAD_S)]
+        means = [self._state(YAW_RAD_S), bias]
         pairs = [(0, 0), (0, 1), (1, 1)]
         stored = {pair: self._state(VARIANCE, COVARIANCE) for pair in pairs}
-        first = {(0, 0): INITIAL_YAW_VARIANCE, (0, 1): 0.0, (1, 1): car.gyro_bias_std_rad_s**2}
+        bias_variance = min(car.gyro_bias_std_rad_s**2, VARIANCE)
+        first = {(0, 0): INITIAL_YAW_VARIANCE, (0, 1): 0.0, (1, 1): bias_variance}
         zero = means[0].like(0.0)
         start = Gaussian([zero, zero], {at: stored[at].like(first[at]) for at in pairs})
         x = choose_state(begins, start, Gaussian(means, stored))
@@ -468,7 +485,7 @@ class ObserverLowering:
 
 
 def _bounds(states: int) -> Sequence[float]:
-    return (VX_MPS, VY_MPS, YAW_RAD_S, BIAS_MPS2) if states == 4 else (YAW_RAD_S, YAW_RAD_S)
+    return (VX_MPS, VY_MPS, YAW_RAD_S, BIAS_MPS2) if states == 4 else (YAW_RAD_S, GYRO_BIAS_RAD_S)
 
 
 def _bounded(value: Number, *, diagonal: bool) -> Number:

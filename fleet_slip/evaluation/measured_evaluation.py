@@ -17,6 +17,7 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.combined import combine, training_drives
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     MissingSignalError,
@@ -28,9 +29,6 @@ from fleet_slip.evaluation.evaluator import (
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
-    TUNING_DRIVES,
-    TUNING_S,
-    choose_evenly,
     class_car,
 )
 from fleet_slip.evaluation.held_out import (
@@ -48,6 +46,7 @@ from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
     VehicleMeasures,
     identify,
+    measures_of,
 )
 from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
 from fleet_slip.evaluation.single_track import (
@@ -67,7 +66,6 @@ from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import calibrated_cars, find_training_overlap
 from fleet_slip.models.summary import group_reasons
 from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -93,6 +91,7 @@ def evaluate_measured(
     drives = read_measured_drives(warehouse, cohort)
     car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None, warehouse.configs)
     car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
+    car = car or next(filter(None, map(measures_with_filter, versions)), None)
     competition = Competition.collect(warehouse, versions, predicate, drives, car, executor)
     folds, kinds = folds_of(drives), folds_by_kind(drives)
     fitted = {
@@ -202,6 +201,8 @@ class Competition:
         Measures of the car, to identify it by.
     cars
         Calibration parameters of each car, for calibrated columns.
+    combined
+        Learners that are combined with a filter.
     """
 
     catalog: Catalog
@@ -212,6 +213,7 @@ class Competition:
     measured: VehicleMeasures | None
     cars: CarCounts
     executor: Executor
+    combined: frozenset[str] = frozenset()
     _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
     _failures: dict[str, str] = field(default_factory=dict)
 
@@ -255,11 +257,14 @@ class Competition:
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
             drives = [prepare_drive(drive, measured.vehicle()) for drive in drives]
-        return cls(catalog, drives, published, learners, vehicle, measured, cars, executor)
+        combined = frozenset(v.reference for v in versions if v.manifest.combination)
+        return cls(
+            catalog, drives, published, learners, vehicle, measured, cars, executor, combined
+        )
 
     def fit(self, held_out: Segments) -> FittedFold:
         """Fit, tune and identify without the held-out segments."""
-        drives = self._training_drives(held_out)
+        drives = training_drives(self.drives, held_out)
         identified = self._identify(drives)
         published = {
             name: FittedEstimator("as published", partial(predict_drive, model, self.cars))
@@ -275,14 +280,6 @@ class Competition:
             self._failures["ekf_identified"] = str(error)
             return None
 
-    def _training_drives(self, held_out: Segments) -> list[LabelledDrive]:
-        drives = [drive.without(held_out) for drive in self.drives]
-        drives = [drive for drive in drives if np.isfinite(drive.sideslip_rad).any()]
-        if sum(len(drive.signals) for drive in drives) > TUNING_DRIVES * TUNING_S * SAMPLE_RATE_HZ:
-            rows = TUNING_S * SAMPLE_RATE_HZ
-            drives = [drive.beginning(rows) for drive in choose_evenly(drives, TUNING_DRIVES)]
-        return drives
-
     def _train(
         self, held_out: Segments, identified: IdentifiedVehicle | None
     ) -> dict[str, FittedEstimator]:
@@ -296,7 +293,34 @@ class Competition:
             else:
                 estimate = partial(predict_drive, model, self.cars)
                 fitted[name] = FittedEstimator(source, estimate, columns)
+        for name in self.combined & fitted.keys():
+            if combined := self._combine(name, held_out, identified):
+                fitted |= {f"{name} line": fitted[name], name: combined}
         return fitted
+
+    def _combine(
+        self, name: str, held_out: Segments, identified: IdentifiedVehicle | None
+    ) -> FittedEstimator | None:
+        """Combine a learner with a filter; None if the drives lack what the filter needs."""
+        if self.measured is None or identified is None:
+            return None
+        source, learner = self.learners[name]
+        prior = self._prior(learner, identified)
+        try:
+            combined = combine(
+                learner,
+                self.drives,
+                self.measured,
+                held_out,
+                self.executor,
+                cars=self.cars,
+                identified=identified,
+                prior=prior,
+            )
+        except (DataError, QuestionError) as error:
+            self._failures[name] = str(error)
+            return None
+        return FittedEstimator(f"{source}, with a filter", combined, asdict(combined.choice))
 
     def warn_of_missing(self, excluded: Mapping[str, str], evaluated: Collection[str]) -> None:
         """Warn of models without a fit for some segments, and of estimators without figures.
@@ -359,6 +383,12 @@ class Competition:
                 content = tuned.model_dump(mode="json")
                 fitted[name] = FittedEstimator(f"{source}, tuned on labels", estimate, content)
         return fitted
+
+
+def measures_with_filter(version: ModelVersion) -> VehicleMeasures | None:
+    """Return the measures of the car of a version's filter; None without a filter."""
+    combination = version.manifest.combination
+    return measures_of("car", combination.measures) if combination else None
 
 
 def prior_of(version: ModelVersion) -> Campaign | None:

@@ -27,11 +27,13 @@ DO: dict[str, Any] = {
 def angles(program: Any, facts: Any, numbers: Any, samples: Any) -> list[int | None]:
     angle, past, out = program["angle"], list[Any](), list[int | None]()
     sums: Any = [[0, 0] for _ in program["steps"]]
+    states: Any = {step: 0 for step, (do, *_) in enumerate(program["steps"]) if do == "state"}
     for sample in samples:
         signals = [n if n is not None and s["min"] <= n <= s["max"] else None
                    for n, s in zip(sample, program["signals"], strict=True)]  # fmt: skip
         given = {"signal": signals, "fact": facts, "number": numbers}
         now: list[Any] = []
+        following = dict(states)
         past.append(now)
         for (do, *of), total in zip(program["steps"], sums, strict=True):
             if do in DO:
@@ -39,6 +41,13 @@ def angles(program: Any, facts: Any, numbers: Any, samples: Any) -> list[int | N
                 now.append(None if None in values else DO[do](*values))
             elif do in ("constant", *given):
                 now.append(of[0] if do == "constant" else given[do][of[0]])
+            elif do == "state":
+                now.append(states[len(now)])
+            elif do == "next":
+                following[of[1]] = now[of[0]]
+                now.append(now[of[0]])
+            elif do == "shift":
+                now.append(None if now[of[0]] is None else nearest(now[of[0]], 1 << of[1]))
             elif do == "else":
                 now.append(now[of[0]] if now[of[0]] is not None else now[of[1]])
             else:
@@ -48,6 +57,7 @@ def angles(program: Any, facts: Any, numbers: Any, samples: Any) -> list[int | N
                 if new is not None and do != "ago" and total[1] < of[2]:
                     total[:] = total[0] + new, total[1] + 1
                 now.append(old if do == "ago" else total[do == "values"])
+        states = following
         terms = [(now[t["step"]], int(t["coefficient"])) for t in angle["terms"]]
         if any(n is None for n, _ in terms):
             out.append(None)
