@@ -1,4 +1,4 @@
-"""A filter as a column: the same bits everywhere, near the filter in floating point, and bounded."""
+"""A filter as a column: the same bits everywhere, near the filter in floating point, bounded."""
 
 from collections.abc import Callable, Sequence
 from decimal import Decimal
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Blend, Combination, Definition, Observer
 from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
@@ -141,9 +142,10 @@ def counts_of(labelled: LabelledDrive, observer: Observer) -> DriveCounts:
     return as_counts(SIGNALS, vars(labelled.signals), names, {})
 
 
-def estimate(observer: Observer, counts: DriveCounts) -> np.ndarray:
+def estimate(observer: Observer, counts: DriveCounts) -> FloatArray:
     plan = ColumnPlan.from_definitions(["angle"], {}, {"angle": filtered(observer)})
-    return compute_columns(plan, counts)[0] / 2**16
+    angle_rad: FloatArray = compute_columns(plan, counts)[0] / 2**16
+    return angle_rad
 
 
 @pytest.mark.parametrize("name", ["rear", "front"])
@@ -254,49 +256,49 @@ def test_no_number_overflows_in_any_car() -> None:
                 assert -limit <= ranges[value][0] <= ranges[value][1] <= limit
 
 
-Fault = Callable[[dict[str, np.ndarray], slice], None]
+Fault = Callable[[dict[str, FloatArray], slice], None]
 
 
-def _missing_wheels(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _missing_wheels(signals: dict[str, FloatArray], rows: slice) -> None:
     for name, values in signals.items():
         if name.startswith("wheel"):
             values[rows] = np.nan
 
 
-def _nothing(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _nothing(signals: dict[str, FloatArray], rows: slice) -> None:
     for values in signals.values():
         values[rows] = np.nan
 
 
-def _frozen_yaw_rate(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _frozen_yaw_rate(signals: dict[str, FloatArray], rows: slice) -> None:
     signals["yaw_rate_rad_s"][rows] = signals["yaw_rate_rad_s"][rows.start]
 
 
-def _standstill(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _standstill(signals: dict[str, FloatArray], rows: slice) -> None:
     for name, values in signals.items():
         if not name.startswith("steer"):
             values[rows] = 0.0
 
 
-def _reverse(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _reverse(signals: dict[str, FloatArray], rows: slice) -> None:
     for name, values in signals.items():
         if name.startswith("wheel"):
             values[rows] = -5.0
 
 
-def _spin(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _spin(signals: dict[str, FloatArray], rows: slice) -> None:
     signals["yaw_rate_rad_s"][rows] = 3.0
     signals["ay_mps2"][rows] = -4.0
     signals["wheel_rl_rad_s"][rows] = 0.0
 
 
-def _ice(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _ice(signals: dict[str, FloatArray], rows: slice) -> None:
     signals["ay_mps2"][rows] *= 0.1
     signals["yaw_rate_rad_s"][rows] *= 0.2
     signals["wheel_rl_rad_s"][rows] *= 1.7
 
 
-def _noise(signals: dict[str, np.ndarray], rows: slice) -> None:
+def _noise(signals: dict[str, FloatArray], rows: slice) -> None:
     random = np.random.default_rng(7)
     for values in signals.values():
         values[rows] = random.uniform(-1, 1, len(values[rows])) * 200
