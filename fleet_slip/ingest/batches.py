@@ -16,7 +16,7 @@ from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.file_groups import open_log, seconds_of
 from fleet_slip.ingest.formats.reading import file_errors
-from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Budget
+from fleet_slip.ingest.formats.source import BASE, EARLIEST_S, OWN_TIME, Budget
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
 from fleet_slip.ingest.mapping import Mapping
 
@@ -51,7 +51,9 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
             ]
         held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
         signals = {signal.column for signal in mapping.signals.values()}
-        for rows in merge_bases([*map(metered, bases)], OWN_TIME, held, split_gap_s, signals):
+        for rows in merge_bases(
+            [*map(metered, bases)], OWN_TIME, held, split_gap_s, signals, log=log
+        ):
             yield from rows.iter_slices(BATCH_ROWS)
 
 
@@ -123,6 +125,7 @@ def merge_bases(
     held: Sequence[str],
     split_gap_s: float,
     signals: Collection[str],
+    log: Path | None = None,
 ) -> Iterator[pl.DataFrame]:
     """Yield the rows of all bases, window by window in the order of time, with `BASE` as a number.
 
@@ -130,7 +133,7 @@ def merge_bases(
     `DISORDER`, and is sorted at the base's last right time. Every row gets the last value of the
     `held` columns (conditions, names of drives), unless that is older than `split_gap_s`. A base
     without columns of `signals` has no rows of its own. The rows of a single base are yielded
-    unchanged.
+    unchanged. With `log`, bases without a common time raise `InputError`.
     """
     opened = [_PendingBase(base, time, split_gap_s) for base in bases]
     columns = {name: kind for base in opened for name, kind in base.columns.items()}
@@ -139,6 +142,9 @@ def merge_bases(
         yield from (_completed(batch, columns) for batch in filled[0].batches)
         return
     pending = filled
+    starts_s = [base.start_s for base in filled]
+    if log is not None and starts_s and min(starts_s) < EARLIEST_S <= max(starts_s):
+        raise _no_common_time(filled, log)
     for number, base in enumerate(filled):
         base.begin(number, max(WINDOW_ROWS // len(filled), 1))
     columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
@@ -157,6 +163,33 @@ def merge_bases(
         rows = rows.sort(_RIGHT, maintain_order=True)
         rows = rows.with_columns(column.hold(rows) for column in held_columns).drop(_RIGHT)
         yield rows.filter(pl.col(BASE).is_in(with_signals))
+    if log is not None:
+        _require_common_time([filled[number] for number in with_signals], log)
+
+
+_MAX_APART_S = 60.0
+"""Time bases of one recording may begin after others have ended, but not later than that, in s."""
+
+
+def _require_common_time(bases: Sequence["_PendingBase"], log: Path) -> None:
+    """Raise `InputError` if a base shares no time with another one: it has another clock."""
+    for base in bases:
+        distances_s = [
+            max(other.start_s - base.end_s, base.start_s - other.end_s)
+            for other in bases
+            if other is not base
+        ]
+        if distances_s and min(distances_s) > _MAX_APART_S:
+            raise _no_common_time(bases, log)
+
+
+def _no_common_time(bases: Sequence["_PendingBase"], log: Path) -> InputError:
+    """Return the error of time bases of different clocks."""
+    starts = ", ".join(f"{base.example!r} begins at {base.start_s:,.2f} s" for base in bases[:4])
+    return InputError(
+        f"{quote_name(log)}: its signals have no time in common: {starts}. Are their clocks "
+        "different? Record them with one clock, or map the signals of one of them."
+    )
 
 
 def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
@@ -174,6 +207,9 @@ class _PendingBase:
         while not first.height and (following := next(batches, None)) is not None:
             first = following
         self.columns, self.has_rows = dict(first.schema), first.height > 0
+        times_s = first[time].to_numpy() if self.has_rows else np.zeros(0)
+        self.start_s = float(next(iter(times_s[np.isfinite(times_s)]), np.nan))
+        self.example = next((name for name in first.columns if name != time), "")
         self.batches = chain([first], batches)
         self._before_s, self._right_s, self._judged_rows = np.nan, -np.inf, 0
         self._rows = pl.DataFrame()
@@ -223,6 +259,11 @@ class _PendingBase:
         if not self._rows.height:
             self._rows = next(self._slices, self._rows)
         return self._rows.height > 0
+
+    @property
+    def end_s(self) -> float:
+        """The last right time so far."""
+        return float(self._right_s)
 
     @property
     def reached(self) -> float:

@@ -332,7 +332,8 @@ def _time_candidates(
         values = candidate.values
         if group.size == values.size > 0:
             values = values[group == group[0]]
-        words = parts_of(split_unit(candidate.channel.name)[0]) if candidate.is_number else ()
+        name = candidate.channel.title or candidate.channel.name
+        words = parts_of(split_unit(name)[0]) if candidate.is_number else ()
         named = candidate.time_format is not None or not time_words.isdisjoint(words)
         if not named or candidate.channel.name in taken:
             continue

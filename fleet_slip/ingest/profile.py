@@ -246,7 +246,7 @@ def profile_file(file: Path, bus: CanBus | None = None) -> FileProfile:
         for channel in channels:
             with_unit = replace(channel, unit=channel.unit or units.get(channel.name, ""))
             bases[channel.base].append(with_unit)
-        refused: list[str] = []
+        refused = source.unreadable()
         profiles = tuple(
             p
             for channels in bases.values()

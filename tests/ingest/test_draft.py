@@ -346,7 +346,7 @@ def test_a_lone_speed_may_stand_in_for_the_wheels(tmp_path: Path) -> None:
 
 
 def test_a_draft_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
-    name = "a very long name of a recorder's channel and its device, lateral acceleration [m/s^2]"
+    name = "bus_1_message_of_the_inertial_sensor_below_the_seat_on_the_left_side.ay [m/s^2]"
     text = draft_of(tmp_path, **{name: 3, "Car.v [m/s]": 20, "yaw rate with no unit": 1})
     assert [
         line

@@ -18,7 +18,7 @@ import scipy.io
 import scipy.sparse
 from asammdf import MDF, Signal
 
-from fleet_slip.errors import ExtraError
+from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats import matlab, mdf
 from fleet_slip.ingest.formats import source as budget
@@ -443,3 +443,66 @@ def test_a_state_of_mdf_without_a_name_is_missing(tmp_path: Path, default: bytes
     assert set(read_measured(file, own_clock(signals=both)).drives["gear"].to_pylist()) <= {
         5, 6, None,
     }  # fmt: skip
+
+
+def write_structs5(file: Path) -> None:
+    fields = [("Name", "O"), ("Data", "O"), ("Unit", "O")]
+    structs = np.zeros((1, 2), dtype=fields)
+    structs[0, 0] = ("accel x", AX.reshape(1, -1), "m/s2")
+    structs[0, 1] = ("beta", BETA_DEG.reshape(1, -1), "deg")
+    both = np.stack([AX, BETA_DEG])
+    scipy.io.savemat(file, {"rec": {"X": {"Data": TIME_S}, "Y": structs}, "both": both})
+
+
+def write_structs73(file: Path) -> None:
+    with h5py.File(file, "w", userblock_size=512) as root:
+        root["rec/X/Data"] = TIME_S
+        root["#refs#/a"], root["#refs#/b"] = AX.reshape(-1, 1), BETA_DEG.reshape(-1, 1)
+        references = [root["#refs#/a"].ref, root["#refs#/b"].ref]
+        root["rec/Y/Data"] = np.array(references, dtype=h5py.ref_dtype).reshape(-1, 1)
+        root["both"] = np.stack([AX, BETA_DEG]).T
+
+
+@pytest.mark.parametrize("write", [write_structs5, write_structs73])
+def test_arrays_of_structs_and_rows_of_a_matrix(
+    tmp_path: Path, write: Callable[[Path], None]
+) -> None:
+    file = tmp_path / "log.mat"
+    write(file)
+    for ax, beta in (("rec.Y(1).Data", "rec.Y(2).Data"), ("both(1,:)", "both(2,:)")):
+        time = {"column": "rec.X.Data", "unit": "s"}
+        log = read_measured(file, a_mapping(time=time, signals=signals(ax, beta)))
+        assert log.drives["ax"].to_pylist() == AX_COUNTS
+        assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
+    wide = failure(file, a_mapping(time={"column": "rec.X.Data"}, signals=signals("both", "both")))
+    assert "Map one of its signals, such as ['both(1,:)']" in wide
+    if write is write_structs5:
+        guesses = draft_mapping(SIGNALS, file, profile_file(file)).guesses
+        assert guesses["ax"].column == "rec.Y(1).Data"
+        assert guesses["ax"].keys["unit"] == "m/s^2"
+
+
+@pytest.mark.parametrize("kind", ["timetable", "table", "timeseries"])
+def test_an_object_of_matlab_is_named_with_what_to_do(tmp_path: Path, kind: str) -> None:
+    file = tmp_path / "log.mat"
+    with h5py.File(file, "w", userblock_size=512) as root:
+        dataset = root.create_dataset("TT", data=np.ones((1, 6), "u4"))
+        dataset.attrs["MATLAB_class"] = np.bytes_(kind)
+        root["n"] = np.ones((1, 1))
+    mapping = a_mapping(time={"column": "TT.Time"}, signals=signals("TT.ax", "TT.beta"))
+    assert f"is a {kind} of MATLAB" in failure(file, mapping)
+    with pytest.raises(InputError, match=f"is a {kind} of MATLAB.* Save it as a struct"):
+        draft_mapping(SIGNALS, file, profile_file(file))
+
+
+@pytest.mark.parametrize("shift_s", [-7200.0, -START.timestamp() + 5.0])
+def test_groups_of_two_clocks_are_refused(tmp_path: Path, shift_s: float) -> None:
+    late = beta(timestamps=TIME_S + shift_s + START.timestamp())
+    first = a_x(timestamps=TIME_S + START.timestamp())
+    with MDF(version="4.10") as file:
+        file.start_time = datetime(1970, 1, 1, tzinfo=UTC)
+        file.append([first])
+        file.append([late])
+        log = Path(file.save(tmp_path / "log", overwrite=True))
+    message = failure(log, mdf_mapping())
+    assert "its signals have no time in common: 'a_x' begins at 1,717" in message

@@ -112,6 +112,10 @@ class ConfinedSource(Source):
         """Return all that can be read, in the file's order."""
         return [Channel(*map(str, fields)) for fields in self._ask("channels")[0]]
 
+    def unreadable(self) -> list[str]:
+        """Return why parts of the file are not read."""
+        return [str(text) for text in self._ask("unreadable")[0]]
+
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
         """Return the rows of each time base that has one of the columns. Raises `InputError`."""
         return [self._read(number) for number in self._ask("bases", list(columns))[0]]

@@ -170,6 +170,10 @@ class _Reader:
         """Return all that can be read."""
         return [astuple(channel) for channel in self._source.channels()]
 
+    def unreadable(self) -> list[str]:
+        """Return why parts of the file are not read."""
+        return self._source.unreadable()
+
     def bases(self, columns: Sequence[str]) -> list[int]:
         """Return the numbers of time bases, by which their rows are asked for."""
         first = len(self._batches)

@@ -83,6 +83,10 @@ class Source(ABC):
     def channels(self) -> list[Channel]:
         """Return all that can be read, in the file's order."""
 
+    def unreadable(self) -> list[str]:
+        """Return why parts of the file are not read."""
+        return []
+
     @abstractmethod
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
         """Return the rows of each time base that has one of the columns; without a clock of one.

@@ -39,6 +39,7 @@ class _Vector(Matrix):
     """The values of a channel; `base` identifies their times, empty if there are none."""
 
     def __init__(self, channel: Any) -> None:
+        self.title = ""
         self._channel, self._first, self._ahead = channel, 0, np.zeros(0)
         properties, self.shape = channel.properties, (len(channel),)
         self.unit, self.step_s = (
