@@ -36,15 +36,6 @@ def data_needed() -> int:
     return DATA_BYTES + DATA_THREAD_BYTES * len(os.sched_getaffinity(0))
 
 
-def spare_data() -> None:
-    """Prevent Arrow's allocator from reserving 1 GiB under a memory limit.
-
-    Call it before Arrow is imported.
-    """
-    if resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
-        os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")
-
-
 def _cgroup_limits() -> Iterator[int]:
     """Yield the memory limits of this process's control group and its parents."""
     with contextlib.suppress(OSError):

@@ -3,12 +3,13 @@
 import contextlib
 import gc
 import os
+import resource
 import signal
 import sys
 from typing import Any
 
 from fleet_slip.errors import INTERRUPTED, StorageError, is_lack_of_memory
-from fleet_slip.limits import memory_bytes, spare_data
+from fleet_slip.limits import memory_bytes
 
 
 def _leave(_signal: int, _frame: Any) -> None:
@@ -22,11 +23,7 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
     try:
-        spare_data()
-        # Imports make many objects and hardly any garbage: fewer collections save 25 ms.
-        gc.set_threshold(10_000)
-        # Pydantic looks for plugins among all installed packages: 10 ms, and none is used.
-        os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+        _prepare_imports()
         from fleet_slip.cli.app import run_app
     except (ImportError, OSError, MemoryError) as error:
         if not is_lack_of_memory(error):
@@ -35,6 +32,16 @@ def main() -> None:
         _tell(f"error: out of memory before anything was done: {allowed}. Give it more.")
         sys.exit(StorageError.exit_code)
     sys.exit(run_app())
+
+
+def _prepare_imports() -> None:
+    """Set what libraries read when they are imported."""
+    if resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
+        os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")  # 1 GiB that Arrow would reserve
+    # Pydantic looks for plugins among all installed packages: 10 ms, and none is used.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+    # Imports make many objects and hardly any garbage: fewer collections save 25 ms.
+    gc.set_threshold(max(10_000, gc.get_threshold()[0]))
 
 
 def _tell(text: str) -> None:
