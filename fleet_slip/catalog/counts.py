@@ -63,6 +63,15 @@ def as_arrow(numbers: NDArray[Any], absent: BoolArray | None = None) -> pa.Array
     return pa.Array.from_buffers(kind, numbers.size, [valid, pa.py_buffer(numbers)])
 
 
+def as_floats(counts: pa.Array) -> FloatArray:
+    """Return counts as float64, NaN where they are null. Arrow's own conversion loads pandas."""
+    import polars as pl  # noqa: PLC0415 - takes a while
+
+    column = pl.Series(counts)
+    column = column.cast(pl.Float64).fill_null(np.nan) if column.null_count() else column
+    return np.asarray(column.to_numpy(), dtype=np.float64)
+
+
 def digest_counts(
     vehicle_id: str, day: str, ticks: NDArray[np.int32], counts: Mapping[str, pa.Array]
 ) -> str:

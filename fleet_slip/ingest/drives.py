@@ -360,8 +360,10 @@ class OpenDrives:
             height, is_taken = end + 1 - first, np.isin(number[first], segments)
             for head, n in zip(first[is_taken], height[is_taken], strict=True):
                 runs[int(number[head])].append((rows, int(head), int(n)))
-            is_open = pl.Series(np.repeat(~is_taken, height))
-            self.add(rows.filter(is_open) if is_taken.any() else rows)
+            if not is_taken.any():
+                self.add(rows)
+            elif not is_taken.all():
+                self.add(rows.filter(pl.Series(np.repeat(~is_taken, height))))
         return runs
 
     def _unbundled(self) -> Iterator[DriveRows]:

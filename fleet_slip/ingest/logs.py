@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
 from fleet_slip.base import Record, pluralize, quote_name
-from fleet_slip.catalog.counts import as_arrow
+from fleet_slip.catalog.counts import as_arrow, as_floats
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
@@ -501,10 +501,7 @@ def check_longest(
 def signals_of(signals: SignalCatalog, drive: MeasuredDrive, ticks: int) -> Signals:
     """Return the signals of the first ticks of a drive, as `check_plausibility` reads them."""
     number = int(np.searchsorted(drive.ticks, drive.ticks[0] + ticks))
-    counts = {  # by Polars: Arrow's own would load pandas
-        name: pl.Series(values[:number]).cast(pl.Float64).fill_null(float("nan")).to_numpy()
-        for name, values in drive.counts.items()
-    }
+    counts = {name: as_floats(values[:number]) for name, values in drive.counts.items()}
     return to_regular_grid(signals, drive.ticks[:number], counts)
 
 
@@ -629,9 +626,11 @@ def _repeat(values: Sequence[Any], kind: pa.DataType, sizes: Sequence[int]) -> p
     column = pl.Series(values, strict=False)
     if column.null_count() == len(column):
         return pa.nulls(sum(sizes), kind)
-    numbers = column.to_physical().fill_null(0).to_numpy()
-    absent = np.repeat(column.is_null().to_numpy(), sizes) if column.null_count() else None
-    repeated = as_arrow(np.repeat(numbers, sizes), absent)
+    absent = None
+    if column.null_count():
+        absent = np.repeat(column.is_null().to_numpy(), sizes)
+        column = column.fill_null(column.drop_nulls()[0])
+    repeated = as_arrow(np.repeat(column.to_physical().to_numpy(), sizes), absent)
     return repeated.view(column.to_arrow().type).cast(kind)
 
 

@@ -13,12 +13,11 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import polars as pl
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.counts import round_chunks
+from fleet_slip.catalog.counts import as_floats, round_chunks
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.ingest.columns import WHEEL_PREFIX, SignalColumn
 from fleet_slip.ingest.mapping import LabelSensor, Mapping
@@ -345,10 +344,7 @@ def _is_new(course: FloatArray, speed: FloatArray) -> BoolArray:
 
 def physical(signals: SignalCatalog, counts: Named[str, pa.Array], name: str) -> FloatArray:
     """Return a signal in SI units, NaN where there is none."""
-    column = pl.Series(counts[name])
-    if column.null_count():
-        column = column.cast(pl.Float64).fill_null(float("nan"))
-    return np.asarray(column.to_numpy() * float(signals[name].scale))
+    return as_floats(counts[name]) * float(signals[name].scale)
 
 
 def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.Array]:

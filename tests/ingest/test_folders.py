@@ -13,10 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import fleet_slip
+from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import logs
 from fleet_slip.ingest.log_files import find_logs
-from fleet_slip.ingest.logs import write_batch
+from fleet_slip.ingest.logs import ingest_files, write_batch
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Snapshot
@@ -254,3 +255,16 @@ def test_a_data_root_is_no_folder_of_logs(folder: Path, inside: str) -> None:
 def test_logs_of_an_object_store_are_to_be_copied_first() -> None:
     with pytest.raises(InputError, match="aws s3 sync"):
         find_logs(["s3://fleet-logs/inbox"])
+
+
+def test_a_reason_that_several_files_share_is_stated_once(folder: Path) -> None:
+    files = sorted(folder.rglob("*.csv"))
+    for log in files[:2]:
+        log.write_text("t,ay\n0,1\n")
+    warehouse = Warehouse(LocalFolder(folder.parent / "root"))
+    with pytest.raises(InputError) as caught:
+        list(ingest_files(warehouse, files, a_mapping()))
+    message = str(caught.value)
+    assert message.startswith("2 files cannot be used; all others are stored. ")
+    assert f"{quote_name(files[0])}, {quote_name(files[1])}: no column" in message
+    assert message.count("no column") == 1
