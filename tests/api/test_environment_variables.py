@@ -9,12 +9,11 @@ PACKAGE = Path(fleet_slip.__file__).parent
 
 READERS = {
     "cli/app.py": "the folder for fonts, which matplotlib needs before it is imported",
-    "cli/main.py": "the plugins of pydantic, before it is imported",
+    "cli/main.py": "Arrow's allocator and pydantic's plugins, before they are imported",
     "cli/output.py": "TERM, CI",
     "warehouse/warehouse.py": "open_warehouse: the data root and the folder of configs",
     "resources.py": "the system's folder for caches, needed when a module is imported",
     "compiling.py": "numba's folder for caches, needed when a module is imported",
-    "limits.py": "Arrow's allocator, before Arrow is imported",
     "storage/objects.py": "AWS_ALLOW_HTTP, which stands beside the credentials of the libraries",
     "ingest/formats/confined.py": "what a child process inherits",
 }
