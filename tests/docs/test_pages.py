@@ -82,7 +82,7 @@ def test_the_diagram_names_commands_and_folders_that_exist() -> None:
     )
     steps = [(title, subtitle) for fill, title, subtitle in boxes if fill == "#e3ecf7"]
     assert len(steps) > 5
-    commands = {name for group in GROUPS.values() for name in group}
+    commands = {name for group in GROUPS.values() for name in group.split()}
     places = {path.stem for path in PACKAGE.iterdir()}
     for title, subtitle in steps:
         assert set(title.split(", ")) - {"Python"} <= commands
