@@ -17,7 +17,8 @@ from fleet_slip.base import Record, canonical_json, document_of, pluralize, sha2
 from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import TRAINING_DRIVES
-from fleet_slip.errors import DataError, NotComputedError, QuestionError
+from fleet_slip.config import load_toml
+from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import (
     FULL,
     Cohort,
@@ -28,7 +29,6 @@ from fleet_slip.grams.cohort import (
     robust_weights,
 )
 from fleet_slip.grams.folding import FOLD_KEYS, PARTS, Folding
-from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.request import (
     DEFAULT_MODELS,
     GIVEN,
@@ -69,6 +69,8 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.inference import DriveMoments
 from fleet_slip.rendering import Answer, Part
+from fleet_slip.resources import Configs
+from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -271,6 +273,42 @@ def run_plan(
         asked_condition=predicate,
         nested=cross_validate_choice(cohort, plan) if nested and is_measured else None,
     )
+
+
+# The noise of the label, as campaigns state it.
+
+
+def label_noise_deg(warehouse: Warehouse, cohort: Cohort) -> float | None:
+    """Return the standard deviation of the label's noise, of all rows of a cohort together.
+
+    It is part of every cross-validated error. The quantisation step counts as a uniform error.
+    None where no campaign states it in its `[sensors]`.
+    """
+    if not warehouse.logs.snapshot().rows:  # all Gram rows are from messages
+        return None
+    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
+        rows = opened.label_sources(cohort.predicate)
+    stated = [(n, _stated_rad(source, campaign, warehouse.configs)) for source, campaign, n in rows]
+    total = sum(n for n, _ in stated)
+    if not total or any(std is None for _, std in stated):
+        return None
+    variance = sum(n * std**2 for n, std in stated if std is not None) / total
+    signals = warehouse.catalog.signals
+    step = float(signals[signals.label].scale)
+    return math.degrees(math.sqrt(variance + step**2 / 12))
+
+
+def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | None:
+    """Return the noise that a campaign states; None for measured drives and unknown campaigns."""
+    if source != "simulated" or campaign is None:
+        return None
+    try:
+        content = load_toml(configs.find("campaigns", campaign))
+        if "sensors" not in content:
+            content = load_toml(configs.find("campaigns", content["base"]))
+        return float(content["sensors"]["sideslip_std_rad"])
+    except (ConfigError, KeyError):  # its file is not among the configs
+        return None
 
 
 # Nested cross-validation: the figure of a winner is that of the folds that chose it.

@@ -13,8 +13,8 @@ from fleet_slip import open as open_fleet
 from fleet_slip.errors import ConfigError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.diagnose import diagnose
-from fleet_slip.models.label_noise import label_noise_deg
 from fleet_slip.models.publish import manifest_of
+from fleet_slip.models.select import label_noise_deg
 from fleet_slip.regression.inference import ClusterUnit
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
