@@ -86,6 +86,53 @@ REFUSED_ROWS = 2**18
 """Maximum rejected rows in memory; the others are in a temporary file."""
 
 
+class RejectedRows:
+    """The rejected rows of a log, few of them in memory.
+
+    Attributes
+    ----------
+    counts
+        Their number by field and reason.
+    first
+        The one with the least number.
+    """
+
+    def __init__(self) -> None:
+        """Begin without rows."""
+        self.counts = Counter[tuple[str, str]]()
+        self.first: dict[str, Any] | None = None
+        self._rows: list[pl.DataFrame] = []
+        self._spool = Spool()
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Count rows and keep them. Raises `InputError` if the disk is full."""
+        if not rows.height:
+            return
+        for signal, reason, number in rows.group_by("signal", "reason").len().iter_rows():
+            self.counts[signal or "", reason] += number
+        first = rows.row(rows["row"].arg_min() or 0, named=True)
+        self.first = min(self.first or first, first, key=lambda row: row["row"])
+        self._rows.append(rows)
+        if sum(frame.height for frame in self._rows) >= REFUSED_ROWS:
+            content = BytesIO()
+            pl.concat(self._rows).write_ipc_stream(content)
+            self._spool.add("", content.getvalue())
+            self._rows = []
+
+    def by_reason(self) -> dict[str, int]:
+        """Return the number of rows by reason."""
+        reasons = Counter[str]()
+        for (_, reason), number in self.counts.items():
+            reasons[reason] += number
+        return dict(sorted(reasons.items()))
+
+    def frames(self) -> Iterator[pl.DataFrame]:
+        """Yield the rows."""
+        yield from map(pl.read_ipc_stream, self._spool.read(""))
+        if self._rows:
+            yield pl.concat(self._rows)
+
+
 class MeasuredLog:
     """A measured file, open for reading through a mapping.
 
@@ -102,10 +149,7 @@ class MeasuredLog:
         self.checker = RowChecker(file, mapping)
         self.counts = IngestCounts()
         self.longest: MeasuredDrive | None = None
-        self._refused = Counter[tuple[str, str]]()
-        self._refused_rows: list[pl.DataFrame] = []
-        self._spool = Spool()
-        self._first_refused: dict[str, Any] | None = None
+        self._rejected = RejectedRows()
         self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
         self._drives_of_group: Counter[int] = Counter()
@@ -130,7 +174,7 @@ class MeasuredLog:
                 yield from self._ended(cutter, block, intervals_s)
             no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
             yield from self._ended(cutter, no_more, intervals_s, last=True)
-        self.counts.quarantined = dict(sorted(self.counts.quarantined.items()))
+        self.counts.quarantined = self._rejected.by_reason()
         self._require_usable()
 
     def _usual_intervals(
@@ -165,31 +209,14 @@ class MeasuredLog:
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
         rows, misplaced, segments = cutter.cut(block.rows, last=last)
         self._open.add(rows)
-        self._refuse(block.refused)
-        self._refuse(misplaced)
+        self._rejected.add(block.refused)
+        self._rejected.add(misplaced)
         for ended in self._open.take(segments, last=last):
             if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
-                self._refuse(describe_refused(ended.frame, None, "too_short"))
+                self._rejected.add(describe_refused(ended.frame, None, "too_short"))
             else:
                 yield self._drive(ended, intervals_s)
         self._open.spill()
-
-    def _refuse(self, refused: pl.DataFrame) -> None:
-        """Keep refused rows; count them by reason, and by signal where it is that of one."""
-        if not refused.height:
-            return
-        for reason, number in refused["reason"].value_counts().iter_rows():
-            self.counts.quarantined[reason] = self.counts.quarantined.get(reason, 0) + number
-        of_signals = refused.filter(pl.col("signal").is_in(list(self.mapping.signals)))
-        self._refused.update(zip(of_signals["signal"], of_signals["reason"], strict=True))
-        first = refused.row(refused["row"].arg_min() or 0, named=True)
-        self._first_refused = min(self._first_refused or first, first, key=lambda row: row["row"])
-        self._refused_rows.append(refused)
-        if sum(rows.height for rows in self._refused_rows) >= REFUSED_ROWS:
-            content = BytesIO()
-            pl.concat(self._refused_rows).write_ipc_stream(content)
-            self._spool.add("", content.getvalue())
-            self._refused_rows = []
 
     def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
         group = int(next(iter(rows.bases.values()))["group"][0])
@@ -249,7 +276,7 @@ class MeasuredLog:
     def _require_usable(self) -> None:
         """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
         counts, file, name = self.counts, quote_name(self.file), self.mapping.name
-        if not counts.rows_kept and (first := self._first_refused):
+        if not counts.rows_kept and (first := self._rejected.first):
             several = Counter(counts.quarantined)
             reasons = ", ".join(f"{n:,} {reason}" for reason, n in several.most_common())
             example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
@@ -273,40 +300,34 @@ class MeasuredLog:
                 )
 
     def quarantine(self) -> Iterator[pa.Table]:
-        """Yield refused rows as those of the table `quarantine`, once all drives were taken."""
-        for piece in self._spool.read(""):
-            yield self._quarantine_table(pl.read_ipc_stream(piece))
-        if self._refused_rows:
-            yield self._quarantine_table(pl.concat(self._refused_rows))
-
-    def _quarantine_table(self, refused: pl.DataFrame) -> pa.Table:
-        """Return refused rows in the file's order."""
-        bad = refused.sort("row", maintain_order=True)
-        groups = bad["group"].unique().drop_nulls()
-        ids = {group: drive_id(self.prefix, group) for group in groups}
+        """Yield rejected rows as those of the table `quarantine`, once all drives were taken."""
         stated = self.mapping.drive.vehicle_id
         vehicle = stated if isinstance(stated, str) else None
-        metadata = self.checker.keys.metadata
-        vehicles = {str(group): metadata[group].get("vehicle_id", vehicle) for group in groups}
-        frame = bad.select(
-            pl.lit(self.name).alias("file"),
-            "row",
-            pl.col("group").replace_strict(ids, return_dtype=pl.String).alias("drive_id"),
-            pl.col("group")
-            .cast(pl.String)
-            .replace_strict(vehicles, return_dtype=pl.String)
-            .fill_null(pl.lit(vehicle, pl.String))
-            .alias("vehicle_id"),
-            "reason",
-            "signal",
-            "value",
-        )
-        return frame.to_arrow().cast(quarantine_schema())
+        metadata = enumerate(self.checker.keys.metadata)
+        groups = [(g, drive_id(self.prefix, g), m.get("vehicle_id", vehicle)) for g, m in metadata]
+        schema = {"group": pl.Int32, "drive_id": pl.String, "vehicle_id": pl.String}
+        names = pl.DataFrame(groups, schema, orient="row")
+        for rows in self._rejected.frames():
+            ordered = rows.sort("row", maintain_order=True)
+            named = ordered.join(names, on="group", how="left", maintain_order="left")
+            frame = named.select(
+                pl.lit(self.name).alias("file"),
+                "row",
+                "drive_id",
+                pl.col("vehicle_id").fill_null(pl.lit(vehicle, pl.String)),
+                "reason",
+                "signal",
+                "value",
+            )
+            yield frame.to_arrow().cast(quarantine_schema())
 
     def suspicions(self) -> tuple[Fault, ...]:
         """Return the faults of the file as a whole. Call it after `drives` has ended."""
         counts, time = self.counts, self.mapping.time
-        faults = [*find_refusals(self._refused, counts.rows_read, counts.quarantined)]
+        of_signals = {
+            key: n for key, n in self._rejected.counts.items() if key[0] in self.mapping.signals
+        }
+        faults = [*find_refusals(of_signals, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
             faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
         faults += _unmapped_cars(self.file, self.mapping, counts.drives)
