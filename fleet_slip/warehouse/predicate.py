@@ -18,7 +18,7 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.signals import SCENARIO, TRAINING_DRIVES, SignalCatalog
+from fleet_slip.catalog.signals import ALL_DRIVES, SCENARIO, TRAINING_DRIVES, SignalCatalog
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,
@@ -270,7 +270,7 @@ def describe_cohort(cohort: str) -> str:
     Contains the number of excluded drives, not their hashes.
     """
     predicate, excluded = _split_excluded(cohort)
-    if predicate == TRAINING_DRIVES:
+    if predicate in (ALL_DRIVES, TRAINING_DRIVES):
         return excluded
     campaign = _CAMPAIGN.fullmatch(predicate)
     return (f" of {campaign[1]}" if campaign else f" where {predicate}") + excluded

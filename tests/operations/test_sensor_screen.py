@@ -93,7 +93,7 @@ def test_an_evaluation_leaves_out_drives_with_faulty_sensors(
     assert run_command("publish", "m", "--models", "table1").exit_code == 0
     evaluated = run_command("evaluate", "m", "--cohort", "true")
     assert evaluated.exit_code == 0 and "2 drives of 6 left out" in evaluated.stderr
-    assert "4 drives where true, held out whole" in evaluated.stdout
+    assert "4 drives, held out whole" in evaluated.stdout
 
 
 def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
