@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -338,6 +338,8 @@ class NightlyPipeline:
     progress: ShowStep | None = None
     baseline: Baseline = field(init=False)
     steps: list[NightStep] = field(default_factory=list)
+    files_before: set[str] = field(default_factory=set)
+    """Log files that were stored before the night."""
     faults: "tuple[SensorFault, ...]" = ()
     chart: "Chart | None" = None
     drive_counts: dict[tuple[int | None, int | None], int] = field(default_factory=dict)
@@ -347,6 +349,7 @@ class NightlyPipeline:
         start = time.monotonic()
         log = NightlyLog(self.fleet.root, self.training.name)
         self.baseline = log.begin(self.night, self._state())
+        self.files_before = {file.path for file in self.fleet.warehouse.logs.snapshot().files}
         for name, work in {
             "ingest": self._ingest,
             "retain": self._retain,
@@ -530,7 +533,22 @@ class NightlyPipeline:
             "Gram rows verified."
         )
 
+    def _oldest_new_day(self) -> date | None:
+        """Return the day of new drives that exceed the retention, None without such drives."""
+        from fleet_slip.operations.forget import load_retention
+
+        retention = load_retention(self.retention, self.fleet.warehouse.configs)
+        before = date.today() - timedelta(days=retention.drives_days)
+        files = self.fleet.warehouse.logs.snapshot().files
+        days = [f.day for f in files if f.day is not None and f.path not in self.files_before]
+        return min((day for day in days if day < before), default=None)
+
     def _retain(self) -> StepResult:
+        if day := self._oldest_new_day():
+            return "attention", (
+                f"Nothing was forgotten: drives of {day}, which are new, would be at once. Check "
+                "the clock of their logger; if it is right, run: fleet-slip forget --expired"
+            )
         progress = step_progress(self.progress, "retain")
         report = self.fleet.maintenance.apply_retention(self.retention, progress=progress)
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)

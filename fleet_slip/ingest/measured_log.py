@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Named
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from datetime import date, timedelta
 from io import BytesIO
 from itertools import accumulate, chain
 from pathlib import Path
@@ -153,6 +154,9 @@ class MeasuredLog:
         self._samples, self._values = Counter[str](), Counter[str]()
         self._open = OpenDrives()
         self._drives_of_group: Counter[int] = Counter()
+        self._intervals_s: dict[int, float] = {}
+        self._changed = date.fromtimestamp(file.stat().st_mtime)
+        self._implausible_days: list[tuple[date, str]] = []
         self._trips: dict[int, tuple[str, float]] = {}
         """The trip of each group's last drive, and when that ended."""
         self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
@@ -168,6 +172,7 @@ class MeasuredLog:
         grouped = is_grouped(self.file, self.mapping)
         with closing(read_ahead(self.checker.blocks())) as blocks:
             early, intervals_s = self._usual_intervals(blocks)
+            self._intervals_s = intervals_s
             longest_s = MAX_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
             cutter = DriveCutter(self.mapping.time, longest_s, is_grouped=grouped)
             for block in chain(early, blocks):
@@ -254,6 +259,8 @@ class MeasuredLog:
         if drive.metadata["started_at"] is not None:
             car = str(drive.metadata["vehicle_id"])
             self._under_way[car].append((rows.start_s, rows.end_s))
+        if why := implausible_day(drive.metadata["day"], self._changed):
+            self._implausible_days.append((drive.metadata["day"], why))
         self._require_sane_drives()
         return drive
 
@@ -330,10 +337,40 @@ class MeasuredLog:
         faults = [*find_refusals(of_signals, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
             faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
+        rate_khz = 1e-3 / min(self._intervals_s.values(), default=1.0)
+        rate = CHECKS["rate of the samples"]
+        if rate_khz > rate.high:
+            faults.append(rate.fault("time", rate_khz=rate_khz))
+        if days := self._implausible_days:
+            day, why = min(days)
+            faults.append(
+                CHECKS["date of a drive"].fault(
+                    "day", drives=pluralize(len(days), "drive"), day=day, why=why
+                )
+            )
         faults += _unmapped_cars(self.file, self.mapping, counts.drives)
         if time.assumed:
             faults.append(CHECKS["assumed rate"].fault("rate_hz", rate_hz=time.rate_hz))
         return tuple(faults)
+
+
+FIRST_DAY = date(2000, 1, 1)
+ROLLOVER = timedelta(weeks=1024)
+"""After this time the week number of GPS begins anew: a receiver may be that early."""
+
+
+def implausible_day(day: date, changed: date) -> str:
+    """Return why a day cannot be that of a drive, empty for others.
+
+    `changed` is the day on which the file was written.
+    """
+    if day < FIRST_DAY:
+        return f", before {FIRST_DAY}"
+    if day > max(changed, date.today()) + timedelta(days=1):
+        return ", in the future"
+    if abs(changed - day - ROLLOVER) <= timedelta(weeks=4):
+        return ", 1024 weeks before the file was written: the week number of GPS has rolled over"
+    return ""
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.logs import preview_logs
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.measured import a_mapping, csv_text, read_measured, read_text, reasons
 
@@ -167,3 +168,36 @@ def test_times_of_the_day_may_lack_noughts(tmp_path: Path) -> None:
         columns = {"t": times, "ax": [1, 2, 3, 4]}
         log = read_text(tmp_path, csv_text(columns), a_mapping(time=time, signals=AX))
         assert (log.counts.rows_kept, log.counts.drives) == (4, 1)
+
+
+def faults_of(folder: Path, columns: dict[str, Any], mapping: Mapping) -> list[str]:
+    """Return what looks wrong in a CSV file."""
+    (folder / "log.csv").write_text(csv_text(columns))
+    (preview,) = preview_logs([folder / "log.csv"], mapping)
+    assert all(fault.does_harm for fault in preview.suspicions)
+    return [str(fault) for fault in preview.suspicions]
+
+
+def test_an_implausible_rate_is_reported(tmp_path: Path) -> None:
+    columns = {"t": np.arange(3000) / 100, "ax": np.sin(np.arange(3000) / 50)}
+    fast = faults_of(tmp_path, columns, a_mapping(time={"unit": "ms"}, signals=AX))
+    assert fast == ["implausible time? 100.0 kHz. Check the unit of time in the mapping."]
+    assert faults_of(tmp_path, columns, a_mapping(signals=AX)) == []
+
+
+@pytest.mark.parametrize(
+    ("days", "why"),
+    [
+        (-7168, "1024 weeks before the file was written"),
+        (-11_000, "before 2000-01-01"),
+        (40, "in the future"),
+        (-2000, ""),
+    ],
+)
+def test_a_day_that_cannot_be_is_reported(tmp_path: Path, days: int, why: str) -> None:
+    start_s = datetime.now(UTC).timestamp() + 86_400 * days
+    columns = {"t": start_s + np.arange(500) / 100, "ax": np.sin(np.arange(500) / 50)}
+    mapping = a_mapping(time={"epoch": True}, drive={"day": None}, signals=AX)
+    faults = faults_of(tmp_path, columns, mapping)
+    assert len(faults) == bool(why)
+    assert all(f.startswith("implausible day? 1 drive: ") and why in f for f in faults)
