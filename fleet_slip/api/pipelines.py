@@ -191,7 +191,7 @@ class Trained(Answer):
     def training_parts(self, everything: bool) -> Iterator[Part]:
         """Render the result of each step."""
         for gram in self.grams:
-            name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set}"
+            name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set.split('-')[0]}"
             if gram.changed or gram in self.grams[:2]:
                 yield Remark(f"{name}: {pluralize(gram.rows_read, 'row')} read, {gram.total}")
         if self.selection:

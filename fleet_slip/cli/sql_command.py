@@ -159,17 +159,20 @@ def _readable(result: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
 def _draw(result: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
     """Return a result as DuckDB's table of at most this width."""
     result = _readable(result)
-    max_text = width if width == UNLIMITED else _text_width(result, width)
-    with contextlib.redirect_stdout(io.StringIO()) as output:
-        result.show(max_rows=rows, max_width=width, max_col_width=max_text)
-    return output.getvalue().rstrip("\n")
+
+    def draw(max_text: int) -> str:
+        with contextlib.redirect_stdout(io.StringIO()) as output:
+            result.show(max_rows=rows, max_width=width, max_col_width=max_text)
+        return output.getvalue().rstrip("\n")
+
+    table = draw(width)
+    if width < UNLIMITED and "│ … │" in table:  # a wide text leaves no room for other columns
+        table = draw(_text_width(result, width))
+    return table
 
 
 def _text_width(result: duckdb.DuckDBPyRelation, width: int) -> int:
-    """Return the largest width of a column with which all columns fit, or else a narrow one.
-
-    A text of full width leaves no room for other columns, or is left out itself.
-    """
+    """Return the largest width of a column with which all columns fit, or else a narrow one."""
     records = [result.columns, result.types, *result.limit(SAMPLE_ROWS).fetchall()]
     widths = [max(len(str(value)) for value in column) for column in zip(*records, strict=True)]
     fits = (
