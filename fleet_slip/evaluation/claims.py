@@ -19,7 +19,11 @@ from fleet_slip.evaluation.report_data import (
     blocks_won,
     compare_errors,
 )
-from fleet_slip.export.costs import describe_costs
+from fleet_slip.export.costs import (
+    COEFFICIENT_BYTES,
+    describe_costs,
+    dot_product_operations,
+)
 from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
@@ -154,10 +158,11 @@ def many_vehicles(report: ReportContext) -> Finding:
 @claim("Abstract", f"at most {MAX_MULTIPLICATIONS} multiplications an estimate")
 def little_computation(report: ReportContext) -> Finding:
     """The mining is done off line, and an estimate on board takes little computation."""
-    n = report.signals
+    multiplications, additions = dot_product_operations(report.signals)
     return Finding(
-        n <= MAX_MULTIPLICATIONS,
-        f"{n} multiplications and {n} additions, {8 * (n + 1)} bytes of numbers",
+        multiplications <= MAX_MULTIPLICATIONS,
+        f"{multiplications} multiplications and {additions} additions of integers, "
+        f"{COEFFICIENT_BYTES * report.signals} bytes of coefficients",
         "An estimate is one dot product. All training is done off line, from "
         f"{report.data.version.manifest.trained_on.drives} Gram rows.",
     )

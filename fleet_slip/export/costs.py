@@ -94,6 +94,16 @@ def count_costs(program: Program) -> Costs:
     )
 
 
+def dot_product_operations(terms: int) -> tuple[int, int]:
+    """Return the multiplications and additions of a dot product of signals, as `show` counts them.
+
+    A product of a count and a coefficient needs two multiplications of 32 bits.
+    """
+    term = _OPERATIONS["term"]
+    rounding = _OPERATIONS["shift"]["+"] + _OPERATIONS["floor_shift"]["+"]
+    return term["*"] * terms, term["+"] * terms + rounding
+
+
 def describe_costs(version: ModelVersion) -> str:
     """Describe the costs of a version, or the reason why it cannot run on board."""
     try:

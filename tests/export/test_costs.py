@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import RefusedError
-from fleet_slip.export.costs import cost_on_board, costs_content, describe_costs
+from fleet_slip.export.costs import (
+    cost_on_board,
+    costs_content,
+    describe_costs,
+    dot_product_operations,
+)
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import MAX_SUM, OUTPUT_COUNTS, fixed_point
 from fleet_slip.models.registry import ModelVersion
@@ -25,6 +30,12 @@ def test_a_signal_costs_one_term() -> None:
     found = cost_on_board(CATALOG, model_of({"ay": ONE}))
     assert (found.columns, found.coefficient_bytes, found.memory_bytes) == (1, 8, 1)
     assert (found.multiplications, found.additions, found.divisions) == (2, 2 + 2, 0)
+
+
+def test_the_report_counts_a_dot_product_as_show_does() -> None:
+    for columns in ({"ay": ONE}, {"ay": ONE, "ax": ONE, "yaw_rate": ONE}):
+        cost = cost_on_board(CATALOG, model_of(columns))
+        assert dot_product_operations(len(columns)) == (cost.multiplications, cost.additions)
 
 
 def test_windows_of_one_source_share_its_ring_buffer() -> None:

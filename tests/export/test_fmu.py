@@ -217,3 +217,13 @@ def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Pat
         rows = list(csv.DictReader(file))[1:]  # the first is from before the first tick
     angles = [round(float(row["sideslip_rad"]) / scale) for row in rows]
     assert angles == np.floor(predicted / scale + 0.5).astype(int).tolist()
+
+
+def test_the_readme_lists_inputs_in_si_and_says_when_the_output_comes() -> None:
+    version = ModelVersion(1, MANIFEST, "0123" * 16, CATALOG)
+    text = export_files(version, None, "fmu")["sideslip_any_fmu_README.md"].decode()
+    assert "scale" not in text.partition("## Inputs")[2]
+    assert "counts" not in text
+    signal = CATALOG.signals.signals["ay"]
+    assert f"| `{signal.column}` | m/s^2 | -30.000 to 30.000 |" in text
+    assert "from t to t + 0.01 s is the angle of the inputs at t." in text
