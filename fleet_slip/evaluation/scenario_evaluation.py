@@ -135,8 +135,8 @@ def _paired_estimates(
     parts = []
     with open_views(warehouse, "SELECT 1 FROM log_counts") as database:
         for number, drive in enumerate(drives.drives):
-            given = {"drive": drive.drive_id, "rows": len(drive.signals)}
-            rows = database.sql(query, params=given).to_arrow_table()
+            params = {"drive": drive.drive_id, "rows": len(drive.signals)}
+            rows = database.sql(query, params=params).to_arrow_table()
             numbers = cars.get(rows["vehicle_id"][0].as_py())
             line = predictor(counts_of(rows, predictor.plan, None, numbers))
             angle = filtered.filter.estimate(drive.signals, drive.car or car, filtered.parameters)

@@ -77,28 +77,37 @@ def test_what_a_person_mistyped_or_was_refused_is_no_failure_of_the_night(
     assert last["state"] == "done"
 
 
-def test_what_worked_before_and_is_refused_now_is_one(warehouse: Warehouse) -> None:
+@pytest.mark.parametrize(
+    ("failures", "ending"),
+    [
+        (
+            [(RefusedError("the champion is better"), "beta")],
+            "failed with exit code 7: the champion is better",
+        ),
+        (
+            [(StorageError("car.csv: cannot be read"), "car.csv")],
+            "***.csv: cannot be read (***: a name that is not recorded)",
+        ),
+        (
+            [
+                (StorageError("the disk is full"), "beta"),
+                (QuestionError("no such column"), "beta", "--cohort", "typo"),
+            ],
+            "the disk is full",
+        ),
+    ],
+    ids=["refused after a success", "a hidden name", "a typo after a failure"],
+)
+def test_a_failure_is_one_problem(
+    warehouse: Warehouse, failures: list[tuple[FleetSlipError, str]], ending: str
+) -> None:
     path_of(warehouse.root).mkdir()
     with recording(warehouse.root, "publish", ["beta"]):
         pass
-    fail(warehouse, RefusedError("the champion is better"), "beta")
+    for failure in failures:
+        fail(warehouse, *failure)
     (problem,) = status_of(warehouse).problems
-    assert problem.endswith("failed with exit code 7: the champion is better")
-
-
-def test_a_name_that_is_not_recorded_is_explained(warehouse: Warehouse) -> None:
-    path_of(warehouse.root).mkdir()
-    fail(warehouse, StorageError("car.csv: cannot be read"), "car.csv")
-    (problem,) = status_of(warehouse).problems
-    assert problem.endswith("***.csv: cannot be read (***: a name that is not recorded)")
-
-
-def test_a_typo_after_a_failure_does_not_hide_it(warehouse: Warehouse) -> None:
-    path_of(warehouse.root).mkdir()
-    fail(warehouse, StorageError("the disk is full"), "beta")
-    fail(warehouse, QuestionError("no such column"), "beta", "--cohort", "typo")
-    (problem,) = status_of(warehouse).problems
-    assert problem.endswith("the disk is full")
+    assert problem.endswith(ending)
 
 
 def test_a_killed_run_is_known(warehouse: Warehouse) -> None:
