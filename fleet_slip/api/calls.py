@@ -51,8 +51,10 @@ class CarMeasures(TypedDict, total=False):
 def load_measures(vehicle: str, configs: "Configs") -> CarMeasures:
     """Read the measured data of a car: a vehicle of the configs, or a TOML file of measures.
 
-    Raises `ConfigError`.
+    "none" is no car. Raises `ConfigError`.
     """
+    if vehicle == "none":
+        return CarMeasures()
     from fleet_slip.config import load_config, load_toml
     from fleet_slip.ingest.mapping import MeasuredVehicle
 

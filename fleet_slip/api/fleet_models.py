@@ -99,7 +99,7 @@ class FleetModels:
         with_filter
             Measured data of the car: mass and axle distances at least. The model is combined with
             an extended Kalman filter in the car, which is identified from the drives, where that
-            is better in cross-validation. Default: as the champion.
+            is better in cross-validation. Empty: without a filter. Default: as the champion.
 
         Raises
         ------
@@ -147,8 +147,10 @@ class FleetModels:
         """Combine a model with a filter in the car of the measures, else in the champion's car."""
         champion = self.registry.champion(manifest.name)
         previous = champion.manifest.combination if champion else None
-        numbers = {**measures} if measures else dict(previous.measures) if previous else None
-        if numbers is None:
+        numbers: dict[str, object] = dict(previous.measures) if previous else {}
+        if measures is not None:
+            numbers = {**measures}
+        if not numbers:
             return manifest
         from fleet_slip.api.calls import open_workers
         from fleet_slip.evaluation.filter_column import with_filter

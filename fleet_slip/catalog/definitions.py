@@ -126,8 +126,9 @@ LineId = Annotated[str, StringConstraints(pattern=r"^([0-9a-f]{12})?$")]
 
 _LEFT_OUT = Field(exclude_if=lambda value: value is None)
 
-Positive = Annotated[FiniteFloat, Field(gt=0)]
-NotNegativeFloat = Annotated[FiniteFloat, Field(ge=0)]
+Positive = Annotated[FiniteFloat, Field(ge=1e-9, le=1e9)]
+NotNegativeFloat = Annotated[FiniteFloat, Field(ge=0, le=1e9)]
+"""Numbers of a car: bounded, as a definition may come from anywhere."""
 
 
 class AttributeFactor(Config):
@@ -316,9 +317,9 @@ class ObserverInput(Config):
     """
 
     of: tuple["Definition", ...] = Field(min_length=1, max_length=2)
-    scale: FiniteFloat
+    scale: Annotated[FiniteFloat, Field(ge=-1e6, le=1e6)]
     adds: bool = True
-    offset: FiniteFloat = 0.0
+    offset: Annotated[FiniteFloat, Field(ge=-100, le=100)] = 0.0
 
 
 class ObserverCar(Config):

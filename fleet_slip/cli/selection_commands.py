@@ -108,7 +108,7 @@ def publish(
         Option(
             help="Combine the model with a Kalman filter in this car, identified from the drives: "
             "a vehicle of configs/vehicles, or a TOML file with mass_kg, front_axle_m and "
-            "rear_axle_m. Default: the champion's."
+            "rear_axle_m; none for no filter. Default: the champion's."
         ),
     ] = None,
     force: Annotated[

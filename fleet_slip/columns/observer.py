@@ -124,8 +124,8 @@ class Number:
         )
 
     def times(self, factor: float, bits: int | None = None) -> "Number":
-        """Multiply by a constant of 20 significant bits and round once."""
-        exponent = 20 - math.frexp(factor)[1]
+        """Multiply by a constant of 20 significant bits, or 2⁻⁴⁰, and round once."""
+        exponent = min(20 - math.frexp(factor)[1], 40)
         constant = Number(self.low, self.low.constant(round(factor * 2.0**exponent)), exponent)
         return (self * constant).to(self.bits if bits is None else bits)
 

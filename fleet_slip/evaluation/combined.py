@@ -87,25 +87,28 @@ def training_drives(drives: Sequence[HeldOutDrive], held_out: Segments) -> list[
     return training
 
 
-def inner_groups(drives: Sequence[HeldOutDrive], held_out: Segments) -> list[Segments]:
+def inner_groups(
+    drives: Sequence[HeldOutDrive], held_out: Segments
+) -> tuple[list[Segments], list[Segments]]:
     """Divide the training segments into groups of trips, and into kinds of driving.
 
-    A single trip is divided into quarters of time.
+    A single trip is divided into quarters of time. A kind that is a group of trips is left out.
     """
     training = frozenset((d.name, q) for d in drives for q in range(QUARTERS)) - held_out
     trips = {drive.name: drive.trip for drive in drives}
     names = list(dict.fromkeys(trips[name] for name in trips if (name, 0) in training))
     has_whole_drives = len(training) == QUARTERS * len({name for name, _ in training})
-    if not has_whole_drives or len(names) < 2:
+    if has_whole_drives and len(names) > 1:
+        count = min(len(names), MAX_GROUPS)
+        groups = [
+            frozenset(part for part in training if names.index(trips[part[0]]) % count == group)
+            for group in range(count)
+        ]
+    else:
         quarters = sorted({quarter for _, quarter in training})
-        return [frozenset(part for part in training if part[1] == q) for q in quarters]
-    count = min(len(names), MAX_GROUPS)
-    groups = [
-        frozenset(part for part in training if names.index(trips[part[0]]) % count == group)
-        for group in range(count)
-    ]
+        groups = [frozenset(part for part in training if part[1] == q) for q in quarters]
     kinds = folds_by_kind([drive for drive in drives if (drive.name, 0) in training])
-    return list(dict.fromkeys([*groups, *kinds.values()]))
+    return groups, [kind for kind in kinds.values() if has_whole_drives and kind not in groups]
 
 
 def combine(
@@ -126,17 +129,25 @@ def combine(
     """
     identified = identified or identify(measures, training_drives(drives, held_out), executor)
     _, line = learner.train(held_out, prior)
-    groups = inner_groups(drives, held_out)
-    parts: list[PairedEstimates] = []
-    for number, group in enumerate(groups):
+    groups, kinds = inner_groups(drives, held_out)
+    parts: list[list[PairedEstimates]] = []
+    for number, group in enumerate([*groups, *kinds]):
         without = held_out | group
         training = training_drives(drives, without)
         vehicle = identify(measures, training, executor, start=identified)
         _, model = learner.train(without, prior)
-        parts += _paired(drives, group, number, vehicle, partial(predict_drive, model, cars))
-    if not parts:
+        estimate = partial(predict_drive, model, cars)
+        parts.append(list(_paired(drives, group, number, vehicle, estimate)))
+    pairs, pairs_of_kinds = (
+        [part for group in selected for part in group]
+        for selected in (parts[: len(groups)], parts[len(groups) :])
+    )
+    if not pairs:
         raise DataError("no inner group has rows with a label and both estimates.")
-    choice = choose_combination(PairedEstimates.concatenate(parts))
+    choice = choose_combination(
+        PairedEstimates.concatenate(pairs),
+        PairedEstimates.concatenate(pairs_of_kinds) if pairs_of_kinds else None,
+    )
     return CombinedEstimate(choice, line, identified, cars)
 
 

@@ -36,6 +36,9 @@ RIDGE = 0.3
 STD_ROWS = 0.1
 """Weight, of a total of 1, with which the σ of a knot tends to that of all rows."""
 
+MIN_GROUPS = 4
+"""With fewer groups of drives the safest method is taken."""
+
 Anchor = Literal["line", "filter"]
 Method = Literal["line", "filter", "constant", "by_lateral", "line_by_lateral"]
 
@@ -206,7 +209,7 @@ class CombinationChoice:
     worst_rmse_rad
         Of each method, the RMSE of its worst group.
     groups
-        Number of groups.
+        Number of groups, of drives and of kinds.
     """
 
     method: Method
@@ -216,48 +219,61 @@ class CombinationChoice:
     groups: int
 
 
-def choose_combination(pairs: PairedEstimates) -> CombinationChoice:
+def choose_combination(
+    pairs: PairedEstimates, kinds: PairedEstimates | None = None
+) -> CombinationChoice:
     """Choose the combination by the mean and the worst group.
 
     The numbers that a group is judged by come from the other groups. The criterion is the mean of
-    two mean squares: of all groups, and of the worst. A method replaces a safer one only if its
-    root is lower by more than a factor 1 + 1/√n, for n groups.
+    two mean squares: of all groups, and of the worst. A method replaces the safest only if the root
+    of its criterion is lower by more than a factor 1 + 1/√n, for n groups, of which there are at
+    least `MIN_GROUPS`.
 
     Parameters
     ----------
     pairs
-        Cross-validated estimates of at least one group.
+        Cross-validated estimates of at least one group of drives.
+    kinds
+        Those of kinds of driving. They judge the methods. They do not determine the numbers: a line
+        that fails on another kind of driving would dominate all squares.
 
     Returns
     -------
     CombinationChoice
     """
-    groups = pairs.groups
-    squares = {method: _group_squares(pairs, method) for method in METHODS}
-    criterion = {m: (squares[m].mean() + squares[m].max()) / 2 for m in METHODS}
-    chosen: Method = METHODS[0]
-    guard = 1 + 1 / math.sqrt(len(groups))
-    for method in sorted(METHODS[1:], key=lambda name: criterion[name]):
-        if math.sqrt(criterion[method]) * guard < math.sqrt(criterion[METHODS[0]]):
-            chosen = method
-            break
+    squares = {method: _group_squares(pairs, kinds, method) for method in METHODS}
+    criterion = {m: math.sqrt((squares[m].mean() + squares[m].max()) / 2) for m in METHODS}
+    groups, safest = len(pairs.groups), METHODS[0]
+    best = min(METHODS, key=lambda method: criterion[method])
+    is_clear = criterion[best] * (1 + 1 / math.sqrt(groups)) < criterion[safest]
+    chosen: Method = best if is_clear and groups >= MIN_GROUPS else safest
     return CombinationChoice(
         chosen,
         fit_combination(pairs, chosen),
         {m: math.sqrt(squares[m].mean()) for m in METHODS},
         {m: math.sqrt(squares[m].max()) for m in METHODS},
-        len(groups),
+        len(squares[safest]),
     )
 
 
-def _group_squares(pairs: PairedEstimates, method: Method) -> FloatArray:
+def _group_squares(
+    pairs: PairedEstimates, kinds: PairedEstimates | None, method: Method
+) -> FloatArray:
     """Return the mean squared error of each group, with numbers from the other groups."""
     squares = []
     for group in pairs.groups:
         held_out = pairs.group == group
         training = pairs.where(~held_out)
         combination = fit_combination(training if len(training) else pairs, method)
-        rows = pairs.where(held_out)
-        error = combination(rows.line, rows.filter, rows.lateral_mps2) - rows.label
-        squares.append(float(np.mean(error**2)))
+        squares.append(_mean_square(combination, pairs.where(held_out)))
+    if kinds is not None:
+        combination = fit_combination(pairs, method)
+        squares += [
+            _mean_square(combination, kinds.where(kinds.group == kind)) for kind in kinds.groups
+        ]
     return np.array(squares)
+
+
+def _mean_square(combination: EstimateCombination, rows: PairedEstimates) -> float:
+    error = combination(rows.line, rows.filter, rows.lateral_mps2) - rows.label
+    return float(np.mean(error**2))

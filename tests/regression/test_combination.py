@@ -135,3 +135,12 @@ def test_a_much_better_estimate_is_chosen_alone() -> None:
 def test_equal_estimates_are_the_filter() -> None:
     label = np.arange(4.0)
     assert fit_combination(pairs_of(label, label, label, np.zeros(4)), "constant").std_rad == (0.0,)
+
+
+def test_a_line_that_fails_on_another_kind_judges_and_does_not_weigh() -> None:
+    pairs, kinds = random_pairs(5, 0.1, 0.1), random_pairs(6, 30.0, 0.1, groups=1)
+    alone, judged = choose_combination(pairs), choose_combination(pairs, kinds)
+    assert judged.combination.std_rad[0] < 1
+    assert judged.worst_rmse_rad["line"] > 10 > alone.worst_rmse_rad["line"]
+    assert judged.method != "line"
+    assert judged.groups == alone.groups + 1
