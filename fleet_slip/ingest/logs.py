@@ -595,17 +595,16 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
     sizes = [drive.ticks.size for drive in drives]
     repeat = cache(partial(_repeat, sizes=sizes))  # many columns are the same for all drives
-    columns, signal_catalog = {}, mapping.signal_catalog
-    for name, kind in zip(
-        signal_catalog.log_schema.names, signal_catalog.log_schema.types, strict=True
-    ):
+    columns, signals, measured = {}, mapping.signal_catalog, set(mapping.signal_names)
+    for column in signals.log_schema:
+        name, kind = column.name, column.type
         if name == "tick":
             columns[name] = pa.chunked_array([as_arrow(drive.ticks) for drive in drives], kind)
-        elif name in mapping.signal_names:
+        elif name in measured:
             columns[name] = pa.chunked_array([drive.counts[name] for drive in drives])
-        elif name in signal_catalog.extras:
+        elif name in signals.extras:
             continue
-        elif name in signal_catalog.signals:
+        elif name in signals.signals:
             columns[name] = pa.nulls(sum(sizes), kind)
         else:
             values = tuple(drive.metadata.get(name) for drive in drives)
