@@ -469,8 +469,8 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
     return Preview(str(log), stream.counts, suspicions, tuple(ranges)), stream.longest
 
 
-CHECKED_TICKS, MIN_CHECKED_TICKS = 100_000, 6_000
-"""Ticks that are checked in a batch of files, 17 minutes, and in each file, a minute."""
+CHECKED_TICKS, MIN_CHECKED_TICKS = 60_000, 6_000
+"""Ticks that are checked in a batch of files, ten minutes, and in each file, a minute."""
 
 
 def check_longest(
