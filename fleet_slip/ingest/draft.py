@@ -218,7 +218,7 @@ def _signals(draft: Draft) -> str:
                 lines += comment(f"Choose the unit: {_choices(guess)}.")
             lines += _lines(name, guess, draft.guesses)
             if name == COURSE:
-                lines += comment("antenna_x_m and antenna_y_m of the course: to be filled in")
+                lines += comment("antenna_x_m and antenna_y_m: to be filled in")
     for name, guess in draft.questions.items():
         doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
         lines += comment(f"Doubtful: {name}: {doubts}")

@@ -74,7 +74,36 @@ def check_plausibility(
         # A biased label is on one side, too.
         label = label if any(fault.kind == "biased" for fault in label) else one_sided[-1:]
     faults += label
+    faults = _with_axes(faults, signals, catalog.label)
     return [*faults, *islice(check_course(_without(sound, faults)), 1)]
+
+
+_STEERING = ("steering_wheel", "steer", "steer_fl", "steer_fr")
+_WHEEL_PAIRS = ({"wheel_fl", "wheel_fr"}, {"wheel_rl", "wheel_rr"})
+
+
+def _with_axes(faults: list[Fault], signals: Signals, label: str) -> list[Fault]:
+    """Return one fault for axes that point down, in place of one for each signal.
+
+    Then ay and yaw rate are reversed together. With the steering they outvote the wheels, whose
+    columns seem to be swapped at both axles.
+    """
+    reversed_ = {f.signals[0] for f in faults if f.kind == "reversed" and len(f.signals) == 1}
+    pairs = [f for f in faults if f.kind == "swapped" and set(f.signals) in _WHEEL_PAIRS]
+    steering = {name for name in _STEERING if name in signals}
+    if len(pairs) == len(_WHEEL_PAIRS) and not reversed_ & {"ay", "yaw_rate", *steering}:
+        axes = {"ay", "yaw_rate", *steering, label, "vy"} & set(signals)
+        names = axes - ({label, "vy"} if label in reversed_ else set())
+        replaced = {name for pair in pairs for name in pair.signals} | {label}
+        witnesses = "the wheels, unless left and right are swapped at both axles"
+    elif {"ay", "yaw_rate"} <= reversed_:
+        names = reversed_ & {"ay", "yaw_rate", *steering, label}
+        replaced, witnesses = names, "the other signs of turning"
+    else:
+        return faults
+    remaining = [fault for fault in faults if not set(fault.signals) <= replaced]
+    ordered = [name for name in signals if name in names]
+    return [CHECKS["axes of the car"].fault(*ordered, witnesses=witnesses), *remaining]
 
 
 def _without(signals: Signals, faults: Sequence[Fault]) -> Signals:
