@@ -160,11 +160,11 @@ def standings(data: ReportData) -> ReportTable:
         "Every estimator on every test drive: root mean square error in degrees",
         ["test drive", *names],
         rows,
-        note="Green: the smallest of the row. Of all estimators without GPS, "
-        f"{ranking['estimator']} has the smallest error on {ranking['won']} of "
-        f"{ranking['drives']} drives, and at most {ranking['close_ratio']} times the smallest on "
-        f"{ranking['close']} more. Drives that differ only in GPS count once. An estimator with a "
-        "percentage covers this share of the drive, and does not compete.",
+        lead=f"Of all estimators without GPS, `{ranking['estimator']}` has the smallest error on "
+        f"{ranking['won']} of {ranking['drives']} drives, and at most {ranking['close_ratio']} "
+        f"times the smallest on {ranking['close']} more.",
+        note="Green: the smallest of the row. Drives that differ only in GPS count once. An "
+        "estimator with a percentage covers this share of the drive, and does not compete.",
     )
 
 
@@ -211,6 +211,7 @@ def render(data: ReportData, pictures: Sequence[Drawn]) -> str:
         further=[*measured_drives(data), standings(data)],
         tiles=_tiles(data, counted),
         claims=claims,
+        present={"table-1", "table-2", *(drawn.picture.key for drawn in pictures)},
         tally={status: counted[status] for status in Status},
         measured=MEASURED in data.trained.selection.cohort.drives["source"].to_pylist(),
         missing=[name for name in data.shipped if name not in data.evaluated.scenarios],

@@ -1,12 +1,13 @@
 """Components of HTML pages: formatted numbers, tables, templates."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from fleet_slip.pages.drawing import PALETTE
 
@@ -53,6 +54,27 @@ def join_words(words: list[str]) -> str:
     return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
+_CODE = re.compile(r"`([^`]+)`")
+_PLACE = re.compile(r"(Figure|Table) (\d|II?\b)")
+_TABLES = {"I": "1", "II": "2"}
+
+
+def rich_text(text: str, present: Collection[str] = ()) -> Markup:
+    """Return a text as HTML: code in backticks, and links to the figures and tables of the page.
+
+    `present` are the keys of figures and tables on the page, such as figure-1a and table-1.
+    """
+
+    def link(match: re.Match[str]) -> str:
+        kind, place = match[1].lower(), match[2]
+        key = f"{kind}-{_TABLES.get(place, place)}"
+        key = next((name for name in (key, f"{key}a") if name in present), "")
+        return f'<a href="#{key}">{match[0]}</a>' if key else match[0]
+
+    marked = _CODE.sub(r"<code>\1</code>", str(escape(text)))
+    return Markup(_PLACE.sub(link, marked))  # noqa: S704 - the text is escaped
+
+
 class Cell(str):
     """A table cell, marked as good or as a miss."""
 
@@ -69,6 +91,8 @@ class ReportTable:
     rows: Sequence[Sequence[str]]
     text_columns: int = 1
     note: str = ""
+    lead: str = ""
+    """Sentence before the table."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +115,7 @@ def fill_in(template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["rich"] = rich_text
     page = environment.get_template(template).render(
         css=Markup((TEMPLATES / "report.css").read_text(encoding="utf-8")),  # noqa: S704
         palette={name.replace("_", "-"): tone for name, tone in PALETTE.items()},

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from fleet_slip.pages.drawing import PALETTE, Picture, colour, draw, inline
-from fleet_slip.pages.page import degrees, join_words, number, percent, scientific
+from fleet_slip.pages.page import degrees, join_words, number, percent, rich_text, scientific
 
 
 def test_numbers_read_well() -> None:
@@ -78,3 +78,12 @@ def test_references_follow_their_names() -> None:
     assert 'href="#one-p1"' in found
     assert "url(#one-p1)" in found
     assert "max-width: 96px" in found
+
+
+def test_texts_of_a_page_are_escaped_with_code_and_links() -> None:
+    present = {"figure-1a", "table-2"}
+    assert rich_text("III.A, Figure 1", present) == 'III.A, <a href="#figure-1a">Figure 1</a>'
+    assert rich_text("Table II and Table I", present) == (
+        '<a href="#table-2">Table II</a> and Table I'
+    )
+    assert rich_text("`a < b` <i>", present) == "<code>a &lt; b</code> &lt;i&gt;"
