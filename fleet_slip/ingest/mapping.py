@@ -2,7 +2,8 @@
 
 import os
 import re
-from collections.abc import Container, Iterable
+from collections.abc import Container, Iterable, Iterator
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -32,6 +33,7 @@ from fleet_slip.config import (
 )
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
+    CHOOSE,
     WHEEL_PREFIX,
     OffsetM,
     RowCondition,
@@ -294,6 +296,13 @@ class Mapping(Config):
             raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
         return where
 
+    @model_validator(mode="before")
+    @classmethod
+    def _is_filled_in(cls, content: Any) -> Any:
+        if len(missing := list(_missing_keys(content))) > 1:
+            raise ValueError(f"to be filled in: {', '.join(missing)}")
+        return content
+
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Mapping":
         self._signal_catalog = signals_of(info)
@@ -416,6 +425,22 @@ class Mapping(Config):
     def canonical_json(self) -> str:
         """Return JSON of the mapping that does not depend on the layout of its TOML file."""
         return canonical_ascii(self.model_dump(mode="json", exclude={"vehicle"}))
+
+
+def _missing_keys(content: Any) -> Iterator[str]:
+    """Yield the keys that a draft leaves open: metadata of drives, and units."""
+    sections = content if isinstance(content, dict) else {}
+    drive, time = sections.get("drive", {}), sections.get("time", {})
+    if isinstance(drive, dict):
+        with suppress(ValidationError):
+            is_dated = TimeBase.model_validate(time).is_dated
+            if drive.get("day") is None and not is_dated:
+                yield "drive.day"
+        yield from (f"drive.{k}" for k in ("vehicle_id", "vehicle_model") if k not in drive)
+    signals = sections.get("signals", {})
+    for name, signal in signals.items() if isinstance(signals, dict) else ():
+        if isinstance(signal, dict) and signal.get("unit") == CHOOSE:
+            yield f"the unit of signals.{name} ({signal.get('column')})"
 
 
 def is_number(text: str) -> bool:

@@ -451,3 +451,19 @@ def test_a_unit_with_two_readings_is_refused_with_both(unit: str) -> None:
     with pytest.raises(ValueError, match=r"ambiguous unit .*: write 'deg.*' for degrees"):
         conversion_factor(unit, si_unit)
     assert conversion_factor("gon", "rad") == pytest.approx(np.pi / 200)
+
+
+def test_all_keys_that_a_draft_leaves_open_are_named_at_once(tmp_path: Path) -> None:
+    text = """name = "draft"
+time = { column = "t", unit = "s" }
+signals.ax = { column = "a", unit = "choose" }
+signals.ay = { column = "b", unit = "choose" }
+[drive]
+"""
+    (tmp_path / "draft.toml").write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_mapping(str(tmp_path / "draft.toml"), CATALOG)
+    assert (
+        "to be filled in: drive.day, drive.vehicle_id, drive.vehicle_model, the unit of signals.ax "
+        "(a), the unit of signals.ay (b)"
+    ) in str(caught.value)

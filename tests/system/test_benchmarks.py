@@ -30,6 +30,7 @@ TINY = {
     "ingest": "--rows 2000,4000",
     "ingest_folder": "--files 3 --rows 100",
     "measured_page": "--check",
+    "message_lake": "--sessions 2 --messages 4",
     "on_board": "{root} smoke --seconds 0.01",
     "peers": "--root {root} --campaign smoke --only fleet_slip duckdb scikit-learn",
     "pipeline": "--root {root} --campaign smoke --threads 1 --gram-rows 200",
