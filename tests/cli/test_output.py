@@ -315,6 +315,12 @@ def test_the_winner_stands_first(smoke_root: Path, shown: Shown) -> None:
     assert names == [*"12345", lines[0].removeprefix("winner: ").partition(".")[0]]
 
 
+def test_publish_suggests_no_option_of_select(smoke_root: Path) -> None:
+    done = run_on(smoke_root, "publish", "smoke", "--dry-run")
+    assert " of 43 models\n" in done.stdout
+    assert "--all" not in done.stdout
+
+
 def test_a_typo_in_a_condition_names_the_nearest_column_that_may_be_used(smoke_root: Path) -> None:
     done = run_on(smoke_root, "select", "--cohort", "speed_facto > 1")
     assert done.exit_code == 5
