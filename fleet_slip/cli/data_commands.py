@@ -221,6 +221,9 @@ def suggest(
         Path | None, Option(help="File to write the draft to, instead of stdout.")
     ] = None,
     can: Annotated[Path | None, Option(help="Database of a CAN trace: DBC, KCD or SYM.")] = None,
+    plot: Annotated[
+        Path | None, Option(help="Page to write, .html: the mapped signals in SI units.")
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
@@ -232,7 +235,8 @@ def suggest(
     """
     if output is not None and output.exists():
         raise UsageError(f"{output} exists. Choose another name, or remove it.")
-    draft, text = _draft(fleet_of(context).warehouse.catalog.signals, file, can)
+    catalog = fleet_of(context).warehouse.catalog.signals
+    draft, text = _draft(catalog, file, can)
     signals = {guess.profile.channel.name: name for name, guess in draft.guesses.items()}
     channels = [
         {
@@ -254,6 +258,10 @@ def suggest(
         row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
         title = f"{file}: {len(channels)} channels"
         print_parts([TextTable(title, header, channels, row, text_columns=3)])
+    if plot is not None:
+        from fleet_slip.ingest.signal_page import write_signal_page
+
+        write_text(plot, write_signal_page(catalog, draft), ": the mapped signals")
     if output is not None:
         write_text(output, text, ": a draft of a mapping")
     elif not json:
