@@ -194,8 +194,8 @@ def test_messages_of_another_encoding_are_refused(tmp_path: Path, kind: int) -> 
     ("attributes", "told"),
     [
         ({"scale_factor": 0.05}, "scale_factor"),
-        ({"MATLAB_class": b"string"}, "no column"),
-        ({"MATLAB_class": b"datetime"}, "no column"),
+        ({"MATLAB_class": b"string"}, "is a string of MATLAB"),
+        ({"MATLAB_class": b"datetime"}, "is a datetime of MATLAB"),
         ({"MATLAB_class": b"double", "MATLAB_empty": 1}, "no column"),
         ({"MATLAB_class": b"int16"}, ""),
         ({"MATLAB_class": b"logical"}, ""),
