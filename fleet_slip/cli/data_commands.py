@@ -1,6 +1,7 @@
 """Commands for data and columns: simulate, ingest, mapping, gram, features."""
 
 import logging
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -263,7 +264,7 @@ def suggest(
 
         write_text(plot, write_signal_page(catalog, draft), ": the mapped signals")
     if output is not None:
-        write_text(output, text, ": a draft of a mapping")
+        write_text(output, _ask_for_open(draft, text), ": a draft of a mapping")
     elif not json:
         print_text("\n" + text)
 
@@ -277,6 +278,21 @@ def list_mappings(context: Context, json: opt.Json = False) -> None:
     configs = fleet_of(context).warehouse.configs
     files = {name: str(configs.find("mappings", name)) for name in configs.names("mappings")}
     print_table(files, json, TextTable("", "mapping|file", files.items(), text_columns=2))
+
+
+def _ask_for_open(draft: "Draft", text: str) -> str:
+    """Return a draft with the answers to what it leaves open, asked for on a terminal."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return text
+
+    from fleet_slip.ingest.draft import answer_key, open_keys
+
+    say("The draft leaves some keys open; an empty answer leaves a key so.")
+    for key, units in open_keys(draft, text).items():
+        choices = f" in {' or '.join(units)}" if units else ""
+        answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
+        text = answer_key(text, key, answer.strip())
+    return text
 
 
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
