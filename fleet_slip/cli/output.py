@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from fleet_slip.base import document_of
-from fleet_slip.errors import hide_passwords, printable
+from fleet_slip.errors import StorageError, hide_passwords, printable
 from fleet_slip.rendering import FILE_WIDTH, Answer, Part, Remark, TextTable, wrap_lines
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.storage.storage_errors import storage_errors
@@ -88,6 +88,8 @@ def print_table(content: Any, json: bool, *tables: TextTable) -> None:
 
 def write_text(file: Path, text: str, remark: str = "") -> None:
     """Write a file, and print a remark on it. Raises `StorageError`."""
+    if not file.parent.is_dir():
+        raise StorageError(f"{file}: no such folder. Create it, or choose another path.")
     with storage_errors(file):
         file.write_text(text, encoding="utf-8")
     if remark:

@@ -12,7 +12,7 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize, require_extra
 from fleet_slip.columns.drive_columns import Workspace
-from fleet_slip.errors import AlarmError, DataError, UsageError
+from fleet_slip.errors import AlarmError, DataError, InputError, UsageError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.ingest.logs import log_table
@@ -143,15 +143,22 @@ def predict_logs(
         raise UsageError(f"{output}: choose a name in {', '.join(FORMATS)}.")
     if output.exists() and not replace:
         raise UsageError(f"{output} exists. Choose another name, or replace it: --replace")
+    logs = list({log.resolve(): log for log in logs}.values())
+    if output.resolve() in {
+        file.resolve() for log in logs for file in getattr(log, "files", [log])
+    }:
+        raise UsageError(f"{output} is one of the logs. Choose another name.")
     predictor = Predictor.from_manifest(version.catalog.signals, version.manifest)
     missing = [name for name in predictor.plan.signals if name not in mapping.signal_names]
     if missing:
         raise DataError(
             f"{version.reference} needs {', '.join(missing)}, which the mapping {mapping.name} "
-            "lacks. Map them, or publish a model without them: fleet-slip publish NAME --models"
+            "lacks. Map them, or publish a model without them: fleet-slip publish NAME --models "
+            "LIST"
         )
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     drives: list[PredictedDrive] = []
+    log_of_drive: dict[str, Path] = {}
     rejected, suspicions, alarms = 0, list[str](), list[str]()
     workspace = Workspace(predictor.plan)
     for log in logs:
@@ -160,7 +167,14 @@ def predict_logs(
                 rows = log_table([drive], mapping)
                 label_rad, slow = label_of(mapping.signal_catalog, rows)
                 reference = np.where(slow, np.nan, label_rad)
-                drives.append(_predict_drive(rows, reference, predictor, workspace, cars))
+                prediction = _predict_drive(rows, reference, predictor, workspace, cars)
+                if prediction.drive_id in log_of_drive:
+                    raise InputError(
+                        f"{log}: the drive {prediction.drive_id} is also in "
+                        f"{log_of_drive[prediction.drive_id]}. Leave out one of them."
+                    )
+                log_of_drive[prediction.drive_id] = log
+                drives.append(prediction)
             faults = stream.suspicions()
         rejected += sum(stream.counts.quarantined.values())
         suspicions += [f"{log}: {fault}" for fault in faults]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from fleet_slip.base import require_extra
-from fleet_slip.errors import INTERRUPTED, hide_passwords
+from fleet_slip.errors import INTERRUPTED, UsageError, hide_passwords
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.runs import LOGGER, Run
 
@@ -54,6 +54,8 @@ def emit_lineage(
 
     Raises
     ------
+    UsageError
+        If the target is not a URL of http or https, and no file that can be created.
     ExtraError
         If openlineage-python is not installed.
     """
@@ -126,15 +128,26 @@ def emit_lineage(
 
 
 def _emitter(target: str) -> Callable[[Any], object]:
-    """Return the function that sends an event to a file or a URL."""
-    url = urlsplit(target)
-    if url.scheme not in ("http", "https"):
+    """Return the function that sends an event to a file or a URL. Raises `UsageError`."""
+    if "://" not in target:
+        if Path(target).is_dir() or not Path(target).parent.is_dir():
+            raise UsageError(f"--lineage {target}: name a file in a folder that exists.")
         from openlineage.client.transport.file import (  # noqa: PLC0415 - an extra
             FileConfig,
             FileTransport,
         )
 
         return FileTransport(FileConfig(log_file_path=target, append=True)).emit
+    url = urlsplit(target)
+    try:
+        valid = url.scheme in ("http", "https") and bool(url.hostname) and url.port != 0
+    except ValueError:  # a port that is no number of a port
+        valid = False
+    if not valid:
+        raise UsageError(
+            f"--lineage {hide_passwords(target, to_end=True)}: not a URL of a server. Name a file, "
+            "or a URL such as http://HOST:PORT."
+        )
     from openlineage.client.transport.http import HttpConfig, HttpTransport  # noqa: PLC0415
 
     options: dict[str, Any] = {"timeout": TIMEOUT_S, "retry": {"total": 0}}

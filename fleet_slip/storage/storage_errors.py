@@ -127,15 +127,16 @@ def _reason(error: OSError) -> str:
     advice = {
         errno.ENOSPC: "the disk is full. Free some space and run the same command again.",
         errno.EDQUOT: "the disk quota is used up. Free some space and run the command again.",
-        errno.EACCES: "permission denied. Check the owner of the data root, or choose another.",
-        errno.EPERM: "not permitted. Check the owner of the data root, or choose another.",
-        errno.EROFS: "the file system is read-only. Choose a writable data root.",
-        errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another data root.",
+        errno.EACCES: "permission denied. Check the owner of the folder, or choose another.",
+        errno.EPERM: "not permitted. Check the owner of the folder, or choose another.",
+        errno.EROFS: "the file system is read-only. Choose a writable folder.",
+        errno.EISDIR: "a folder, not a file. Name a file.",
+        errno.ENOTDIR: "a part of the path is a file, not a folder. Choose another path.",
         errno.EMFILE: "this process may have no more files open. Raise the limit: ulimit -n 1024",
         errno.EEXIST: "a file, or a link to nothing, is where a folder must be. Choose another "
-        "data root.",
-        errno.ELOOP: "the path is a loop of links. Choose another data root.",
-        errno.ENAMETOOLONG: "the path is too long. Choose another data root.",
+        "path.",
+        errno.ELOOP: "the path is a loop of links. Choose another path.",
+        errno.ENAMETOOLONG: "the path is too long. Choose another path.",
         errno.EIO: "the disk cannot be read or written (I/O error). Have it examined, then restore "
         "what is damaged from a backup: fleet-slip verify",
     }

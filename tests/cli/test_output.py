@@ -82,6 +82,9 @@ def test_where_nothing_can_be_written_is_said(
     file = tmp_path / "missing" / "drives.csv"
     absent = run_command("sql", QUERY, "--output", str(file), root=smoke_root)
     assert (absent.exit_code, "No such file" in absent.stderr) == (6, True)
+    for path, problem in ((file, "no such folder. Create it"), (tmp_path, "a folder, not a file")):
+        contract = run_command("contract", "--output", str(path), root=smoke_root)
+        assert contract.exit_code == 6 and problem in contract.stderr
 
 
 def test_statements_on_stdin_are_answered_one_after_the_other(

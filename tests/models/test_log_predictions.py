@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import DataError
+from fleet_slip.errors import DataError, InputError
 from tests.support.commands import done_on, run_on
 from tests.support.measured import OWN_MAPPING, csv_text, ingest_own, own_columns
 
@@ -103,4 +103,20 @@ def test_what_cannot_be_predicted_is_refused_and_writes_nothing(own: Path, tmp_p
     words = ["predict", "own", str(empty), "--mapping", str(own / "own.toml")]
     none = run_on(own / "data", *words, "--output", str(output))
     assert none.exit_code == DataError.exit_code and "no row of the logs has all of" in none.stderr
+    assert not output.exists()
+
+
+def test_no_log_is_overwritten_and_no_drive_is_predicted_twice(own: Path, tmp_path: Path) -> None:
+    log = (own / "log.csv").read_text()
+    refused = run_on(own / "data", *predict(own, own / "log.csv", "--replace"))
+    assert refused.exit_code == 2 and "log.csv is one of the logs" in refused.stderr
+    assert (own / "log.csv").read_text() == log
+    output = tmp_path / "beta.csv"
+    done_on(own / "data", *predict(own, output, own / "log.csv"))
+    assert len(pl.read_csv(output)) == 1000, "a log that is named twice counts once"
+    output.unlink()
+    copy = tmp_path / "log.csv"
+    copy.write_text(log)
+    repeated = run_on(own / "data", *predict(own, output, copy))
+    assert repeated.exit_code == InputError.exit_code and "is also in" in repeated.stderr
     assert not output.exists()

@@ -98,3 +98,14 @@ def test_a_run_goes_on_without_the_server_and_warns(
     assert done.exit_code == 0
     assert done.stderr.count("cannot be sent to http://***@127.0.0.1:9") == 2
     assert "secret" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    "target", ["absent/events.jsonl", ".", "http://", "ftp://host/x", "http://h:99999"]
+)
+def test_a_target_that_cannot_be_is_refused_before_the_run(
+    run_command: RunCommand, smoke_copy: Path, target: str
+) -> None:
+    refused = run_command("--lineage", target, "gram")
+    assert refused.exit_code == 2
+    assert f"--lineage {target}: " in refused.stderr

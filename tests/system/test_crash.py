@@ -116,7 +116,7 @@ def test_a_read_only_root_is_told_and_can_be_queried(
     for command in (["simulate", "waterford", "--days", "1"], ["publish", "other"]):
         refused = run_command(*command, root=root)
         assert refused.exit_code == 6
-        assert "read-only. Choose a writable data root" in refused.stderr
+        assert "read-only. Choose a writable folder" in refused.stderr
     assert run_command("select", "--json", root=root).exit_code == 0
     assert run_command(*JOB, "--json", root=root).json["changed"] is False
 
