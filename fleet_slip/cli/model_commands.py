@@ -8,6 +8,7 @@ from typer import Argument, Context, Option
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say
+from fleet_slip.errors import UsageError
 from fleet_slip.rendering import TextTable
 
 
@@ -130,7 +131,8 @@ def diff(context: Context, first: opt.Version, second: opt.Version, json: opt.Js
 def export(
     context: Context,
     to: Annotated[
-        Literal["json", "c", "sql", "dbc", "onnx", "fmu"], Option(help="Target of the export.")
+        Literal["json", "c", "sql", "dbc", "onnx", "fmu", "mlflow"],
+        Option(help="Target of the export; mlflow registers the version in the server of --uri."),
     ],
     model: opt.Model = None,
     output: Annotated[
@@ -139,13 +141,25 @@ def export(
     with_gram: Annotated[
         bool, Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,
+    uri: Annotated[str | None, Option(help="With mlflow: URI of the server.")] = None,
     json: opt.Json = False,
 ) -> None:
-    """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors.
+    """Export a version as C, SQL, ONNX, FMU, DBC or JSON, with test vectors, or to MLflow.
 
     Example: fleet-slip export waterford --to c --output export
     """
-    files = fleet_of(context).models.export(model, to, output, with_gram=with_gram)
+    models = fleet_of(context).models
+    if (to == "mlflow") != (uri is not None):
+        raise UsageError("--to mlflow and --uri need each other: --to mlflow --uri URI.")
+    if uri is not None:
+        version = models.get(model)
+        number = models.log_to_mlflow(version, uri)
+        if json:
+            print_json({"model": version.manifest.name, "mlflow_version": number})
+        else:
+            say(f"in MLflow: {version.manifest.name}, version {number}")
+        return
+    files = models.export(model, to, output, with_gram=with_gram)
     if json:
         print_json({"files": [str(path) for path in files]})
         return

@@ -120,9 +120,6 @@ def publish(
     dry_run: Annotated[
         bool, Option("--dry-run", help="Print what would be published; publish nothing.")
     ] = False,
-    mlflow: Annotated[
-        str | None, Option(help="URI of an MLflow server to register the version in, too.")
-    ] = None,
     json: opt.Json = False,
 ) -> None:
     """Select from a model list and publish the winner as a model's next version, its champion.
@@ -161,10 +158,6 @@ def publish(
     else:
         print_parts(selection.parts())
         print_parts(answer.parts())
-    if mlflow and isinstance(answer, Publication):
-        number = fleet.models.log_to_mlflow(answer.version, mlflow)
-        if not json:
-            say(f"in MLflow: {name}, version {number}")
     if answer.problem:
         raise answer.problem
 

@@ -89,7 +89,7 @@ def require_answer(uri: str, reference: str, timeout_s: float = ANSWER_S) -> Non
 
 def _rejected(reference: str, reason: str) -> StorageError:
     return StorageError(
-        f"{reference} is published here, but MLflow rejected it: {reason} Publish it again when "
+        f"{reference} is published here, but MLflow rejected it: {reason} Export it again when "
         "the server answers."
     )
 

@@ -121,9 +121,10 @@ def test_a_version_is_registered_once_and_loads_back(
     root = tmp_path / "data"
     shutil.copytree(smoke_root, root)
     programs = folder_of_mlflow()
-    publish = [programs / "fleet-slip", "--root", root, "publish", "logged", "--mlflow", server]
+    command = [programs / "fleet-slip", "--root", root]
+    run(*command, "publish", "logged")
     for _ in range(2):
-        done = run(*publish)
+        done = run(*command, "export", "logged", "--to", "mlflow", "--uri", server)
         assert "in MLflow: logged, version 1" in done.stderr
     drive = "smoke-2024-05-01-0003"
     done = run(programs / "python", "-c", LOAD, server, root, drive)
@@ -141,10 +142,18 @@ def test_a_version_is_registered_once_and_loads_back(
 def test_a_server_that_does_not_answer_is_said(smoke_root: Path, tmp_path: Path) -> None:
     root = tmp_path / "data"
     shutil.copytree(smoke_root, root)
-    publish = [folder_of_mlflow() / "fleet-slip", "--root", root, "publish", "logged", "--mlflow"]
-    done = run(*publish, "http://127.0.0.1:9", code=6)
-    assert "logged@1 is published here, but MLflow rejected it" in done.stderr
-    done = run(*publish, "http://me:secret@127.0.0.1:9", code=2)
+    export = [
+        folder_of_mlflow() / "fleet-slip",
+        "--root",
+        root,
+        "export",
+        "smoke",
+        "--to",
+        "mlflow",
+    ]
+    done = run(*export, "--uri", "http://127.0.0.1:9", code=6)
+    assert "smoke@1 is published here, but MLflow rejected it" in done.stderr
+    done = run(*export, "--uri", "http://me:secret@127.0.0.1:9", code=2)
     assert "contains a name or password" in done.stderr
 
 
