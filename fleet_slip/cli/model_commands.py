@@ -149,9 +149,7 @@ def export(
     Example: fleet-slip export waterford --to c --output export
     """
     models = fleet_of(context).models
-    if (to == "mlflow") != (uri is not None):
-        raise UsageError("--to mlflow and --uri need each other: --to mlflow --uri URI.")
-    if uri is not None:
+    if to == "mlflow" and uri is not None:
         version = models.get(model)
         number = models.log_to_mlflow(version, uri)
         if json:
@@ -159,6 +157,8 @@ def export(
         else:
             say(f"in MLflow: {version.manifest.name}, version {number}")
         return
+    if to == "mlflow" or uri is not None:
+        raise UsageError("--to mlflow and --uri need each other: --to mlflow --uri URI.")
     files = models.export(model, to, output, with_gram=with_gram)
     if json:
         print_json({"files": [str(path) for path in files]})
