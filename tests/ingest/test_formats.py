@@ -290,6 +290,18 @@ def test_the_folders_of_a_hive_partitioned_dataset_are_columns(tmp_path: Path) -
     assert read_measured(other / "part-0.parquet", mapping).digest != log.digest
 
 
+@pytest.mark.parametrize("null", ["vehicle_id", "day"])
+def test_a_null_partition_is_no_car_and_no_day(tmp_path: Path, null: str) -> None:
+    texts = {"vehicle_id": "A", "day": "2024-05-31", null: "__HIVE_DEFAULT_PARTITION__"}
+    folder = tmp_path.joinpath(*(f"{key}={text}" for key, text in texts.items()))
+    folder.mkdir(parents=True)
+    pq.write_table(a_table(), folder / "part-0.parquet")
+    mapping = a_mapping(drive={key: {"column": key} for key in texts})
+    refusal = failure(folder / "part-0.parquet", mapping)
+    assert "rows is usable" in refusal
+    assert f"first: {null} = None in row" in refusal
+
+
 @pytest.mark.parametrize("magic", [b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!\x1a\x07"])
 def test_an_archive_is_to_be_unpacked(tmp_path: Path, magic: bytes) -> None:
     file = tmp_path / "log.mf4"

@@ -34,7 +34,10 @@ _END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
 
 
 class ParquetSource(FormatSource):
-    """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text."""
+    """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text.
+
+    The null partition of Hive is a missing value.
+    """
 
     has_clock = False
 
@@ -51,11 +54,11 @@ class ParquetSource(FormatSource):
         readable = [f.name for f in self._schema if is_readable(f.type)]
         return [Channel(name) for name in (*readable, *self._keys)]
 
-    def find(self, column: str) -> tuple[str, str | None]:
-        """Return the text of a folder's key, or None. Raises `InputError`."""
+    def find(self, column: str) -> tuple[str, pl.Expr | None]:
+        """Return the text of a folder's key as a literal, or None. Raises `InputError`."""
         find_column(self._file, [*self._schema.names, *self._keys], column)
         if column in self._keys:
-            return "", self._keys[column]
+            return "", pl.lit(self._keys[column], pl.String).alias(column)
         kind = self._schema.field(column).type
         if not is_readable(kind):  # before anything is decoded: one list can be all of a file
             raise InputError(
@@ -68,9 +71,7 @@ class ParquetSource(FormatSource):
     def read(self, _base: str, texts_of_folders: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield rows. Raises `InputError`."""
         inside = [name for name, text in texts_of_folders.items() if text is None]
-        keys = [
-            pl.lit(text).alias(name) for name, text in texts_of_folders.items() if text is not None
-        ]
+        keys = [text for text in texts_of_folders.values() if text is not None]
         texts = [name for name in inside if _is_text(self._schema.field(name).type)]
         # Buffered before, the bytes of the whole file would stay in memory until its end; and
         # without a buffer those of each column of a row group, of which a file may have only one.
@@ -94,10 +95,15 @@ def open_parquet(budget: Budget) -> Iterator[ParquetSource]:
         yield ParquetSource(stream, budget)
 
 
-def partition_keys(file: Path) -> dict[str, str]:
-    """Return the keys of the folders above a file, written as by Hive: `key=value`."""
+NULL_PARTITION = "__HIVE_DEFAULT_PARTITION__"
+"""The text of a folder's key for rows without a value, as Hive, Spark and Polars write it."""
+
+
+def partition_keys(file: Path) -> dict[str, str | None]:
+    """Return the keys of the folders above a file, `key=value`; None for a null partition."""
     named = (part.partition("=") for part in file.parts[:-1])
-    return {key: unquote(text) for key, equals, text in named if key and equals}
+    keys = {key: unquote(text) for key, equals, text in named if key and equals}
+    return {key: None if text == NULL_PARTITION else text for key, text in keys.items()}
 
 
 def read_footer(stream: pa.NativeFile, file: Path) -> list[RowGroup]:
