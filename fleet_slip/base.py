@@ -141,7 +141,7 @@ def require_extra(extra: str, purpose: str) -> Iterator[None]:
 
 
 def install_command(extra: str) -> str:
-    """Return the sentence that says how to install an extra."""
+    """Return a sentence with the commands that install an extra."""
     return f'Run: pip install "fleet-slip[{extra}]", or start by: uvx "fleet-slip[{extra}]" …'
 
 
@@ -200,7 +200,7 @@ def pluralize(number: int, noun: str) -> str:
 
 
 def quote_argument(text: str) -> str:
-    """Return an argument of a command line in double quotes, if a shell keeps it as it is there."""
+    """Quote an argument of a command line, by double quotes unless a shell would change it."""
     return shlex.quote(text) if set(text) & set('"$`\\!') else f'"{text}"'
 
 

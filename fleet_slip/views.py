@@ -108,7 +108,7 @@ class Session:
     unlocked: bool = False
 
     def sql(self, query: str) -> duckdb.DuckDBPyRelation:
-        """Return the answer as a relation; what is made of it keeps the connection open."""
+        """Return the answer as a relation; relations derived from it keep the connection open."""
         text = query if self.unlocked else one_query(self.database, query)
         with database_errors("the query"):
             relation: duckdb.DuckDBPyRelation | None = self.database.sql(text)
@@ -123,7 +123,7 @@ class Session:
     def compute(self, query: str, work: Callable[[duckdb.DuckDBPyRelation], Result]) -> Result:
         """Do work with the answer to a query; Ctrl-C ends it within a second.
 
-        Raises `StorageError` if a file that was read is not what its checksum says.
+        Raises `StorageError` if a file does not match its checksum.
         """
 
         def answer() -> Result:

@@ -112,7 +112,7 @@ class Training:
             return None
         if self.vehicle and not (manifest.combination and manifest.combination.is_of(self.vehicle)):
             return None
-        return Publication(champion, False, "The champion was made from the same data and list.")
+        return Publication(champion, False, "The champion was trained with the same data and list.")
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, whose drives are checked already."""
@@ -280,7 +280,7 @@ class LearnReport(Trained):
         return next((AlarmError(alarm) for alarm in alarms), None)
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
-        """Render the result of each step, and what was assumed."""
+        """Render the result of each step, and the assumptions."""
         suspicions: dict[tuple[str, tuple[str, ...]], str] = {}
         for log in self.ingested:
             for fault in log.suspicions:
@@ -296,7 +296,7 @@ class LearnReport(Trained):
         else:
             yield self.nothing_done(self.model)
         if self.assumed:
-            yield Remark(f"assumed, since {self.mapping} does not say otherwise:")
+            yield Remark(f"assumptions, since {self.mapping} has no other values:")
             yield from (Remark(f"  {value}") for value in self.assumed)
 
 
@@ -546,7 +546,7 @@ class NightlyPipeline:
     def _retain(self) -> StepResult:
         if day := self._oldest_new_day():
             return "attention", (
-                f"Nothing was forgotten: drives of {day}, which are new, would be at once. Check "
+                f"Nothing was erased: new drives of {day} already exceed the retention. Check "
                 "the clock of their logger; if it is right, run: fleet-slip forget --expired"
             )
         progress = step_progress(self.progress, "retain")

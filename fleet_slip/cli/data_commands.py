@@ -154,7 +154,7 @@ def ingest(
 
 
 def warn_of_passed_over(files: Sequence[str]) -> None:
-    """Print how many files of folders are no logs by their suffix, and some names."""
+    """Print the number of files of folders that are not logs, and some names."""
     from fleet_slip.ingest.log_files import find_logs
 
     if passed_over := find_logs(files).describe_passed_over():
@@ -217,7 +217,7 @@ def mapping() -> None:
 @mapping_app.command()
 def suggest(
     context: Context,
-    file: Annotated[str, Argument(help="A measured log.")],
+    file: Annotated[str, Argument(help="A measured log, or the folder of a lake of CAN messages.")],
     output: Annotated[
         Path | None, Option(help="File to write the draft to, instead of stdout.")
     ] = None,
@@ -281,13 +281,13 @@ def list_mappings(context: Context, json: opt.Json = False) -> None:
 
 
 def _ask_for_open(draft: "Draft", text: str) -> str:
-    """Return a draft with the answers to what it leaves open, asked for on a terminal."""
+    """Ask for the open keys of a draft on a terminal; return the draft with the answers."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return text
 
     from fleet_slip.ingest.draft import answer_key, open_keys
 
-    say("The draft leaves some keys open; an empty answer leaves a key so.")
+    say("Some keys of the draft are open. An empty answer leaves a key open.")
     for key, units in open_keys(draft, text).items():
         choices = f" in {' or '.join(units)}" if units else ""
         answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
@@ -308,7 +308,7 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draf
     groups = [log for log in logs if isinstance(log, FileGroup)]
     if len(logs) > 1 and len(groups) < len(logs):
         raise UsageError(f"{file}: {len(logs):,} logs. Give one of them.")
-    # Of the sessions of a lake the first with all messages.
+    # The first session of a lake that has all messages.
     log = max(groups, key=lambda group: len(group.members)) if groups else logs[0]
     draft = draft_mapping(signals, log, profile_file(log, bus))
     return draft, write_draft(draft, name_of(Path(file).stem))

@@ -47,7 +47,7 @@ def recorded(command: Callable[P, None]) -> Callable[P, None]:
 def _lineage(
     context: Context, warehouse: "Warehouse", current_run: Run, options: dict[str, object]
 ) -> AbstractContextManager[None]:
-    """Return what emits the events of a run, if --lineage names a file or a URL."""
+    """Return the emitter of lineage events, if --lineage names a file or a URL."""
     target = context.find_root().params.get("lineage")
     if not target:
         return nullcontext()

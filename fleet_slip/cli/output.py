@@ -1,7 +1,7 @@
 """Output of commands: JSON for machines, texts and tables for people, remarks on stderr.
 
-The standard streams may be closed, full, or a pipe without a reader. None of these stops a job: its
-work is done, and the exit code reports what could not be printed.
+The standard streams may be closed, full, or a pipe without a reader. None of these stops a job: it
+completes its work, and the exit code reports a failed output.
 """
 
 import io
@@ -152,7 +152,7 @@ def progress_of_steps() -> Iterator[Callable[[str, int, int | None], None]]:
 
 
 class _Lasting(io.FileIO):
-    """A stream that goes on where a write fails, and remembers why it did."""
+    """A stream that continues after a failed write, and stores the reason."""
 
     error: OSError | None = None
 
@@ -172,9 +172,9 @@ class Streams:
     def __init__(self) -> None:
         """Take the place of Python's streams.
 
-        A closed descriptor is opened first, or else the next file that anybody opens takes its
-        number, and what is printed goes there. It is opened for reading, as gnulib's stdopen()
-        does, so that writing fails.
+        A closed descriptor is opened first; otherwise the next opened file gets its number, and
+        receives the output. It is opened for reading, as by stdopen() of gnulib, so that writing
+        fails.
         """
         for descriptor in range(3):
             try:
@@ -213,7 +213,7 @@ _drawn_on: "list[Console]" = []
 
 
 def stderr() -> "Console":
-    """Return a console for progress and remarks: that on which a bar is drawn, if there is one."""
+    """Return the console for progress and remarks: the one with a progress bar, if any."""
     if _drawn_on:
         return _drawn_on[-1]
     from rich.console import Console
@@ -223,7 +223,7 @@ def stderr() -> "Console":
 
 @contextmanager
 def drawing_on(console: "Console") -> Iterator[None]:
-    """Print remarks above what is drawn on a console, not into it."""
+    """Print remarks above the progress bar of a console."""
     _drawn_on.append(console)
     try:
         yield

@@ -60,11 +60,11 @@ def demo(
             f"model   {model.reference}: {len(model.manifest.terms)} inputs, held-out RMSE "
             f"{validation.rmse_deg:.3f} deg",
             f"in C    {c_file}, integer arithmetic, {c_file.stat().st_size:,} bytes",
-            f"report  {page}: a drive the model has not seen, with its true and estimated angle",
+            f"report  {page}: a drive outside the training set, with its true and estimated angle",
         ]
     )
     if not report.changed:
-        say("nothing was new: the demo was run before.")
+        say("nothing to do: the demo was run before.")
     say(f"done in {time.monotonic() - start:.0f} s; next:")
     say(f"  {begin} show demo")
     say(f'  {begin} sql "SELECT drive_id, rows, speed_factor FROM drives"')

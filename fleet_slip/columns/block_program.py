@@ -61,7 +61,7 @@ OPERATION, OUT, A, B, C, D = 0, 1, 2, 3, 4, 5
 """Columns of a step: the operation, and the places of what it writes and reads."""
 
 ADVANCE = 5
-"""Offset from the column of a place to its flag: whether it advances with the rows of a drive."""
+"""Offset from the column of a place to its flag, true if it advances with the rows of a drive."""
 
 SLOT, KIND, TICKS, NUMBER = 11, 12, 13, 14
 """Further columns of a step: what is summed up, a kind of window, its ticks, and a constant, or how

@@ -90,7 +90,7 @@ class Number:
         return Number(self.low, self.low.do(operation, self.step, *steps), self.bits)
 
     def like(self, value: "Number | float") -> "Number":
-        """Return a constant with the same bits; a number as it is."""
+        """Return a constant with the same bits; return a number unchanged."""
         if isinstance(value, Number):
             if value.bits != self.bits:
                 raise ValueError(f"{value.bits} and {self.bits} bits")
@@ -246,7 +246,7 @@ class ObserverLowering:
         self._next += pairs
 
     def _inputs(self) -> dict[str, Number]:
-        """Return the logged inputs in SI units by name; missing where they are."""
+        """Return the logged inputs in SI units by name; missing where the signals are missing."""
         observer = self.observer
         inputs = {
             "ay": observer.ay,
@@ -448,7 +448,7 @@ class ObserverLowering:
     ) -> "Gaussian":
         """Measurement update by a row H, K = P Hᵀ / (H P Hᵀ + R), where there is a measurement.
 
-        None in the row stands for 1.
+        None in the row means 1.
         """
         n = len(x.mean)
 

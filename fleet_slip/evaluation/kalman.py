@@ -162,7 +162,7 @@ def estimate_yaw_rate(
 ) -> FloatArray:
     """Estimate yaw rate and bias of the gyroscope in rad/s at every row, shape (2, rows).
 
-    Gaps are bridged. Where one speed stands in for both wheels, only standstill is a measurement.
+    Gaps are bridged. Where one speed replaces both wheel speeds, only standstill is a measurement.
     """
     axle = undriven_axle(drive, car)
     rolling = drive.ax_mps2 > BRAKING_MPS2

@@ -127,7 +127,7 @@ class AxleSpeeds:
 
     @property
     def is_one_speed(self) -> bool:
-        """True if one speed of the car stands in for both wheels, which never differ."""
+        """True if one speed of the car replaces both wheel speeds, which never differ."""
         return np.array_equal(self.left_mps, self.right_mps, equal_nan=True)
 
     @property

@@ -38,7 +38,7 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
 
 RAW = "raw "
 Faults: TypeAlias = dict[str, pl.Expr]
-"""Whether a row has a fault, by reason. Of several faults the first one is reported."""
+"""Boolean expressions, true for rows with a fault, by reason. The first fault is reported."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def _time_faults(name: str, text: pl.Expr, is_outside: pl.Expr | None = None) ->
 
 
 MAX_WHOLE = 2.0**53
-"""From here on neighbouring whole numbers are the same float."""
+"""From this number on, neighbouring whole numbers are the same float."""
 
 
 def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
@@ -152,7 +152,7 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
 
 
 def _later(schema: pl.Schema) -> pl.Expr | None:
-    """Return where an hour that comes twice is the second one."""
+    """Return the rows of the second of two equal hours."""
     return pl.col(RAW + LATER) if RAW + LATER in schema else None
 
 
@@ -180,7 +180,7 @@ def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
 
 
 def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
-    """Return dates as text; of digits alone with the noughts that a number lacks."""
+    """Return dates as text; dates of digits alone get the leading zeros that a number lacks."""
     text = as_text(find_held(date.column, schema), schema, mapping)
     digits = _FIRST_DAY.strftime(date.format)
     return text.str.zfill(len(digits)) if digits.isdigit() else text
@@ -405,7 +405,7 @@ class RowChecker:
 
 
 def _without_nan(batch: pl.DataFrame) -> pl.DataFrame:
-    """Return a batch with null for NaN, which is no value either."""
+    """Return a batch with null in place of NaN."""
     names = [name for name, kind in batch.schema.items() if kind == pl.Float64]
     if not names:
         return batch

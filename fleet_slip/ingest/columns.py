@@ -400,9 +400,9 @@ _DIGITS_ALONE = "%H%M%S"
 
 
 def as_clock_s(text: pl.Expr, clock_format: str) -> pl.Expr:
-    """Return times of the day in s, null where texts are none.
+    """Return times of the day in s, null for other texts.
 
-    Digits alone may lack the noughts of the hour: 91430.5 is 09:14:30.5.
+    The hour of digits alone may lack its leading zeros: 91430.5 is 09:14:30.5.
     """
     if clock_format.startswith(_DIGITS_ALONE):
         digits = text.str.extract(r"^(\d*)", 1).str.len_chars()

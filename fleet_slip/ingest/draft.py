@@ -102,13 +102,13 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
             f"derives it from motion: course = {{ column = {_value(name)}, "
             f"unit = {_value(unit)}, clockwise_from_north = true, antenna_x_m = ..., "
             "antenna_y_m = ... }, "
-            "with satellite_speed beside it. A heading says nothing of side-slip."
+            "with satellite_speed beside it. A heading contains no side-slip."
         )
     speeds = [guesses[name] for name in ("vehicle_speed", "vx") if name in guesses]
     if speeds and not any(name.startswith("wheel_") for name in guesses):
         keys = {"column": speeds[0].column, **speeds[0].keys, "radius_m": RADIUS_M}
         yield (
-            "no wheel speeds: a speed of the car may stand in for all four, from which curvature "
+            "no wheel speeds: a speed of the car may replace all four, from which curvature "
             f"and yaw rate times speed follow: wheel_fl = {_value(keys)}, and wheel_fr, wheel_rl, "
             "wheel_rr alike. On a simulator it halved the error."
         )
@@ -152,7 +152,7 @@ _HEAD = """\
 
 
 _COLUMNS = 80
-"""Columns of a terminal: a longer line would be broken there, and a copy be no TOML."""
+"""Width of a terminal, which breaks longer lines, so that a copy is not valid TOML."""
 
 
 def comment(text: str) -> list[str]:
@@ -265,7 +265,7 @@ def _value(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-# Questions for what a draft leaves open.
+# Questions for the open keys of a draft.
 
 
 def open_keys(draft: Draft, text: str) -> dict[str, list[str]]:

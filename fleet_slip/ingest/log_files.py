@@ -48,8 +48,8 @@ class LogFiles(list[Path]):
         more = " …" if len(self.passed_over) > 3 else ""
         files = pluralize(len(self.passed_over), "file")
         return (
-            f"{files} passed over, whose suffix is not that of a log: {names}{more}. Rename what "
-            "is a log, or name it."
+            f"{files} passed over, without the suffix of a log: {names}{more}. Rename a log, or "
+            "give its path."
         )
 
 
@@ -79,7 +79,7 @@ def find_logs(paths: Iterable[Path | str], mapping: Mapping | None = None) -> Lo
 def _group_by_patterns(
     files: Iterable[Path], patterns: Sequence[FilePattern], passed_over: list[Path]
 ) -> list[Path]:
-    """Return a log for each drive of which there are all files; others are passed over."""
+    """Return a log for each drive with all files; pass over the others."""
     members: dict[Path, dict[str, tuple[Path, ...]]] = defaultdict(dict)
     for file in files:
         for pattern in patterns:

@@ -621,7 +621,7 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
 
 
 def _repeat(values: Sequence[Any], kind: pa.DataType, sizes: Sequence[int]) -> pa.Array:
-    """Return each value so many times. Not by `pa.array`, which imports pandas if installed."""
+    """Repeat each value by its size. Not by `pa.array`, which imports pandas if installed."""
     column = pl.Series(values, strict=False)
     if column.null_count() == len(column):
         return pa.nulls(sum(sizes), kind)

@@ -274,7 +274,7 @@ class Mapping(Config):
     """Texts that mean "no value", in addition to the empty one; `nan` includes NaN."""
     csv: CsvFormat = CsvFormat()
     file: tuple[FilePattern, ...] = added(())
-    """Patterns of the files of which each drive has several."""
+    """Patterns of the files of a drive, if it has several."""
     can: CanBus | None = added(None)
     time: TimeBase
     drive: DriveMetadata
@@ -402,7 +402,7 @@ class Mapping(Config):
 
     @property
     def member_times(self) -> dict[str, TimeBase]:
-        """The times of each file of several that belong together, by name."""
+        """The times of each of several files of a drive, by name."""
         return {file.name: file.time for file in self.file if file.time is not None}
 
     @property
@@ -494,8 +494,8 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
             (mapping.front_wheels, "both front wheels steer alike (steer_fl, steer_fr)"),
             (
                 not wheels and any(name in signals for name in OWN_SPEEDS),
-                "no wheel speeds, so that curvature is left out; a speed of the car may stand in "
-                "for them (docs/real-data.md)",
+                "no wheel speeds, so that curvature is left out; a speed of the car may replace "
+                "them (docs/real-data.md)",
             ),
         )
         if assumed

@@ -257,7 +257,7 @@ class Duplicates(NamedTuple):
     Attributes
     ----------
     same
-        Sources with its fingerprints, whether their rows still exist or not.
+        Sources with its fingerprints, also those whose rows were removed.
     replaced
         The sources that it replaces.
     drives

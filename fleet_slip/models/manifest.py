@@ -330,17 +330,18 @@ class CombinedWithFilter(Config):
     def __str__(self) -> str:
         """Return which estimate is used where, as a sentence."""
         if self.reason:
-            return f"The line alone: {self.reason}"
+            return f"The linear model alone: {self.reason}"
         figures = ", ".join(
             f"{name.replace('_', ' ')} {deg:.3f}" for name, deg in self.rmse_deg.items()
         )
         compared = f" RMSE in {self.groups} inner groups: {figures} deg."
         blend = self._content
         if not isinstance(blend, Blend):
-            return f"The line alone: the filter does not improve it.{compared}"
+            return f"The linear model alone: the filter does not improve it.{compared}"
         if blend.line is None:
             return (
-                f"The filter in the identified car alone: the line does not improve it.{compared}"
+                "The filter in the identified car alone: the linear model does not improve "
+                f"it.{compared}"
             )
         shares = " to ".join(
             dict.fromkeys(
@@ -355,9 +356,9 @@ class CombinedWithFilter(Config):
         )
         where = "" if blend.lateral is None else ", by lateral acceleration"
         start = (
-            f"The filter in the identified car, plus {shares} of the difference to the line"
+            f"The filter in the identified car, plus {shares} of the difference to the linear model"
             if blend.anchor == "filter"
-            else f"The line, of whose difference to the filter {shares} remains"
+            else f"The linear model, keeping {shares} of its difference to the filter"
         )
         return f"{start}, clipped at {limits} deg{where}.{compared}"
 

@@ -321,7 +321,7 @@ GROUPED = 8
 """Up to `MAX_HELD_OUT` trips are held out one by one; more are dealt into this number of groups."""
 
 MAX_NESTED_DRIVES = 500
-"""Maximum number of drives for which a choice is repeated; of more the optimism is small."""
+"""Maximum number of drives for which a choice is repeated; beyond it the optimism is small."""
 
 
 @dataclass(frozen=True)
@@ -707,7 +707,7 @@ real cars a good prior costs at most a twentieth (docs/measured.md)."""
 
 
 def keeps_prior(with_prior: float, without: float, drives: int) -> bool:
-    """Return True if the RMSE of a model with a prior allows to keep the prior.
+    """Return True if the RMSE of a model with a prior allows keeping the prior.
 
     It may exceed the RMSE without by `MAX_PRIOR_COST`, or 1/n for more drives n: held-out drives
     are like the training drives, and flatter a selection.

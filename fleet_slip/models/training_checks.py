@@ -30,8 +30,8 @@ from fleet_slip.warehouse.warehouse import Warehouse
 MAX_DRIVES = 5
 """Drives to inspect, each of a different vehicle where possible."""
 WRONG_MAPPING = ("late", "magnitude", "reversed", "scaled", "swapped")
-"""Kinds of faults of the mapping: in most drives of a first champion nothing shows what is right,
-and later models may use the signal."""
+"""Kinds of faults of the mapping. If most drives of a first champion have one, no drive shows the
+correct value, and later models may use the signal."""
 MIN_NEW_DRIVES = 3
 """Fewest new drives to judge beside a champion: one alone may be odd."""
 

@@ -1,8 +1,8 @@
 """The checks for faulty sensors and labels, of `checks.toml`, and the faults that they report.
 
 `ingest` runs the checks of a log and of the rows of its drives. `quality`, `publish` and `nightly`
-run those of the rows of some drives, and of the Gram rows of all. A threshold stands in the table
-alone: the check that uses it reads it there, its message shows it, and docs/quality.md lists it.
+run those of the rows of some drives, and of the Gram rows of all. Only the table contains
+thresholds: the checks read them there, messages show them, and docs/quality.md lists them.
 """
 
 import tomllib
@@ -64,7 +64,7 @@ class Check:
     kind
         Of the faults that it reports.
     scope
-        What it compares: rows of a log, signals of a drive, a drive with its peers, or the label.
+        Compared data: rows of a log, signals of a drive, a drive with its peers, or the label.
     reads
         A log while it is read, rows of a drive, or Gram rows of all drives.
     message

@@ -364,7 +364,7 @@ class Inspection:
         return faults
 
     def is_systematic(self, fault: Fault) -> bool:
-        """Return True if most drives have this fault: no drive shows what is right."""
+        """Return True if most drives have this fault, so that no drive shows the correct value."""
         drives = self.by_fault().get((fault.kind, fault.signals), [])
         return 2 * len(drives) > len(self.drives)
 

@@ -46,7 +46,7 @@ def test_it_publishes_and_says_what_it_assumed_and_what_comes_next(
     for said in (
         "ingested 6 drives, 3,000 rows",
         "published golf@1. It is the first version.",
-        "assumed, since own does not say otherwise:\n  side-slip sensor at the centre of gravity",
+        "assumptions, since own has no other values:\n  side-slip sensor at the centre of gravity",
     ):
         assert said in first.stderr
     _, _, lines = first.stderr.partition("next:\n")

@@ -341,7 +341,7 @@ def test_names_of_the_vehicle_signal_specification_have_its_units(
 def test_a_lone_speed_may_stand_in_for_the_wheels(tmp_path: Path) -> None:
     text = draft_of(tmp_path, **{"Car.ay [m/s^2]": 3, "Car.v [m/s]": 20})
     assert 'vehicle_speed = { column = "Car.v [m/s]", unit = "m/s" }' in text
-    assert "no wheel speeds: a speed of the car may stand in for all four" in text
+    assert "no wheel speeds: a speed of the car may replace all four" in text
     wheels = {f"wheel_{corner} [rad/s]": 60 for corner in ("fl", "fr", "rl", "rr")}
     assert "no wheel speeds" not in draft_of(tmp_path, **{"Car.v [m/s]": 20, **wheels})
 

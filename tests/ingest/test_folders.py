@@ -90,7 +90,7 @@ def test_a_log_is_known_by_its_first_bytes_and_other_files_are_named(folder: Pat
     printed = run_on(root, "ingest", folder, "--mapping", mapping)
     assert printed.exit_code == 0
     assert "6 new files" in printed.stderr
-    assert "2 files passed over, whose suffix is not that of a log: " in printed.stderr
+    assert "2 files passed over, without the suffix of a log: " in printed.stderr
     assert "notes.txt" in printed.stderr
 
 

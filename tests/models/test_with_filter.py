@@ -76,7 +76,10 @@ def test_without_a_signal_of_the_filter_the_line_stays_with_the_reason(
     combination = fleet_slip.open(tmp_path / "data").models.get("own").manifest.combination
     assert combination is not None
     assert (combination.method, combination.term) == ("line", None)
-    assert "The line alone: the drive has no" in done_on(tmp_path / "data", "show", "own").stdout
+    assert (
+        "The linear model alone: the drive has no"
+        in done_on(tmp_path / "data", "show", "own").stdout
+    )
 
 
 def test_measures_of_a_mapping_train_with_a_filter_and_change_no_drive(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ CUT = "the file ends within this line"
 FEWER = "fewer fields than names"
 """Its value for a line of a format in which no field can be empty."""
 _FIRST_ROWS = 100
-"""Rows of which one must have as many fields as there are names."""
+"""Number of first rows; one of them must have as many fields as the header has names."""
 
 
 class CsvSource(FormatSource):

@@ -178,7 +178,7 @@ _NO_STATE = re.compile(
     r"|unknown|default|nicht.?verf|ung(ue|ü)ltig|fehler|signal_?ung",
     re.IGNORECASE,
 )
-"""How databases call the values that stand for a missing one."""
+"""Names in databases of values that mean a missing value."""
 
 
 def names_states(texts: Iterable[str]) -> bool:
@@ -187,7 +187,7 @@ def names_states(texts: Iterable[str]) -> bool:
 
 
 def is_missing_state(text: str) -> bool:
-    """Return True for a name that stands for a missing value."""
+    """Return True for a name that means a missing value."""
     return _NO_STATE.match(text.strip()) is not None
 
 
