@@ -169,12 +169,13 @@ class FleetCohort:
             model = registry.only(", or signals")
         version = model if isinstance(model, ModelVersion) else registry.resolve(model)
         manifest = version.manifest
-        return diagnose(
+        diagnosis = diagnose(
             self._load(self.warehouse.catalog.name_of(manifest.trained_on.feature_set)),
             manifest.signals,
             cluster=cluster,
             intercept=not manifest.through_origin,
         )
+        return replace(diagnosis, remark=manifest.line_remark)
 
     def _load(self, feature_set: str) -> "Cohort":
         from fleet_slip.grams.cohort import load_cohort

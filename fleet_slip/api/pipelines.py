@@ -501,6 +501,7 @@ class NightlyPipeline:
         new_days = [day for day in self.chart.days if not day.training]
         drives = self.chart.drives_left_out
         left_out = f" {pluralize(drives, 'drive')} without a log left out." if drives else ""
+        left_out += f" {self.chart.remark}" if self.chart.remark else ""
         summary = f"{champion} on {pluralize(len(new_days), 'new day')}: "
         if self.chart.alarms:
             return "attention", f"{summary}beyond its limits on {self.chart.alarm}.{left_out}"

@@ -99,6 +99,8 @@ class Comparison:
         RMSE gap of the challenger to each incumbent.
     unseen
         True if no incumbent was trained on these rows.
+    of_lines
+        True if a version has a filter, which is not compared.
     """
 
     by: FoldKey
@@ -106,6 +108,7 @@ class Comparison:
     incumbents: tuple[CrossValidation, ...]
     gaps: tuple[RmseGap, ...]
     unseen: bool = False
+    of_lines: bool = False
 
     @property
     def better(self) -> tuple[CrossValidation, ...]:
@@ -142,6 +145,7 @@ class Comparison:
             for incumbent, gap in zip(self.incumbents, self.gaps, strict=True)
         )
         return (
+            f"{'the line alone, since Gram rows contain no filter: ' if self.of_lines else ''}"
             f"on the same {pluralize(challenger.rows, 'row')} of "
             f"{pluralize(self.challenger.drives, 'drive')}"
             f"{' that are new to both' if self.unseen else ''}, held out "
@@ -493,6 +497,8 @@ def review_challenger(
         comparison = compare(selection, incumbents)
         if comparison.better:
             comparison = compare_unseen(registry, selection, incumbents) or comparison
+        manifests = [manifest, *(version.manifest for version in incumbents)]
+        comparison = replace(comparison, of_lines=any(m.line_remark for m in manifests))
     except (DataError, QuestionError) as error:
         feature_set, _, _ = champion.manifest.trained_on.feature_set.partition("-")
         problems.append(

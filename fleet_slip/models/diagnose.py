@@ -41,6 +41,8 @@ class Diagnosis(Answer):
         Of the inputs and the intercept, by name.
     weighed
         The drives that `robust` of a selection would count less, by name.
+    remark
+        That the filter of a model is not examined; empty without a filter.
     """
 
     DOCUMENT = (
@@ -48,7 +50,7 @@ class Diagnosis(Answer):
         "effective_rows=evidence.rows design_effect=evidence.design_effect "
         "r_squared=fitted.r_squared residual_std=naive.residual_std condition_number "
         "variance_inflation=inflation by_rows=naive.estimates by_clusters=robust.estimates "
-        "drives_weighed=weighted?"
+        "drives_weighed=weighted? remark?"
     )
 
     fitted: Fit = field(repr=False)  # holds a Gram matrix and long fractions
@@ -61,6 +63,7 @@ class Diagnosis(Answer):
     evidence: Evidence
     units: Mapping[str, str]
     weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
+    remark: str = ""
 
     @property
     def clusters(self) -> int:
@@ -95,6 +98,8 @@ class Diagnosis(Answer):
                 "not at 100 Hz, and are far too small."
             )
         yield from outlier_remarks(self.weighted)
+        if self.remark:
+            yield Remark(self.remark)
 
 
 def diagnose(

@@ -283,6 +283,12 @@ class SelectedBy(Config):
     ] = None
 
 
+LINE_ALONE = (
+    "The figures are of the line alone, without the filter, which Gram rows do not contain. "
+    "score and evaluate examine both together."
+)
+
+
 class CombinedWithFilter(Config):
     """Combination of the line, the terms of a manifest, with a filter in the identified car.
 
@@ -466,6 +472,12 @@ class Manifest(Config):
         return tuple(term.signal for term in self.terms)
 
     @property
+    def line_remark(self) -> str:
+        """A sentence for what Gram rows tell of a version with a filter; empty without one."""
+        has_filter = self.combination is not None and self.combination.term is not None
+        return LINE_ALONE if has_filter else ""
+
+    @property
     def estimate(self) -> "Manifest":
         """The manifest whose terms are the whole estimate: the combination is a term."""
         if self.combination is None or self.combination.term is None:
@@ -550,7 +562,7 @@ class Manifest(Config):
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
         properties = {
             "correlation": correlation,
-            "RMSE": f"{figures.rmse_deg:.4f} deg",
+            "RMSE": f"{figures.rmse_deg:.4f} deg{', of the line alone' * bool(self.line_remark)}",
             "label noise": figures.label_noise_text,
             "error std": f"{figures.error_std_deg:.4f} deg",
             "error mean": f"{figures.error_mean_deg:+.4f} deg",

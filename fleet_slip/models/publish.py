@@ -558,7 +558,8 @@ def _decide(
         reason = f"The champion stays: it is significantly better. {review.reason}"
         return _Decision(reason, champion)
     best = None if review.problems else review.best
-    return _Decision(review.reason, None, candidate or held is not None, held, best)
+    reason = f"{review.reason} {manifest.combination or ''}".rstrip()
+    return _Decision(reason, None, candidate or held is not None, held, best)
 
 
 _VERBS = {"rollback": "rolled back to", "pin": "pinned"}

@@ -208,7 +208,8 @@ class ModelVersion(Answer):
         manifest = self.manifest
         label, origin = manifest.label, manifest.through_origin
         yield (
-            f"{self.reference}: {label.column} = {'' if origin else 'intercept + '}"
+            f"{self.reference}: {'line' if manifest.line_remark else label.column} = "
+            f"{'' if origin else 'intercept + '}"
             f"sum of coefficient * signal{', through the origin' if origin else ''}"
         )
         properties = manifest.properties(on_board)

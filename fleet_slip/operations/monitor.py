@@ -26,7 +26,7 @@ from fleet_slip.regression.folds import error_sums, least_squares
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import student_t_quantile
 from fleet_slip.regression.least_squares import LinearModel
-from fleet_slip.rendering import Answer, Part, TextTable
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -89,7 +89,11 @@ class Chart(Answer):
     drives_left_out
         Drives of the cohort without Gram rows of the model's feature set, since
         their cars sent no log.
+    remark
+        That the model's filter is not charted; empty without a filter.
     """
+
+    DOCUMENT = "model cohort days mean_limits std_limits feature_set drives_left_out remark?"
 
     model: str
     cohort: str
@@ -98,6 +102,7 @@ class Chart(Answer):
     std_limits: Limits
     feature_set: str = PLAIN
     drives_left_out: int = 0
+    remark: str = ""
 
     @property
     def alarms(self) -> tuple[Day, ...]:
@@ -117,6 +122,8 @@ class Chart(Answer):
             text_columns=2,
         )
         yield from remark_left_out(self.drives_left_out, self.feature_set)
+        if self.remark:
+            yield Remark(self.remark)
 
     @property
     def alarm(self) -> str:
@@ -168,7 +175,16 @@ def monitor(
     mean = Limits.from_values([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
     std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
     judged = tuple(day if day.training else _judged(day, mean, std) for day in charted)
-    return Chart(version.reference, predicate.text, judged, mean, std, feature_set, sums.left_out)
+    return Chart(
+        version.reference,
+        predicate.text,
+        judged,
+        mean,
+        std,
+        feature_set,
+        sums.left_out,
+        manifest.line_remark,
+    )
 
 
 def _models(

@@ -14,6 +14,7 @@ from fleet_slip.evaluation.held_out import QUARTERS, Segments
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.models.manifest import LINE_ALONE
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.combination import (
     CombinationChoice,
@@ -24,6 +25,15 @@ from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 from tests.support.measured import OWN_MAPPING, ingest_own
 from tests.support.reported import answer
+
+SHORT_LIST = """description = "One model"
+[folds]
+by = "drive"
+count = 3
+[[model]]
+name = "1"
+signals = ["ay", "yaw_rate"]
+"""
 
 CAR = "mass_kg = 1480\nfront_axle_m = 1.11\nrear_axle_m = 1.67\n"
 
@@ -52,6 +62,7 @@ def test_a_version_with_a_filter_is_used_as_any_other(
         smoke_copy, "publish", "both", "--models", "table1", "--with-filter", car, "--force"
     )
     assert "published both@1" in published.stderr
+    assert "inner groups" in published.stderr, "which estimate is used where"
     version: ModelVersion = fleet_slip.open(smoke_copy).models.get("both")
     combination = version.manifest.combination
     assert combination is not None
@@ -59,11 +70,26 @@ def test_a_version_with_a_filter_is_used_as_any_other(
     assert combination.measures["mass_kg"] == 1480
     shown = done_on(smoke_copy, "show", "both").stdout
     assert "with filter" in shown
+    assert "both@1: line = intercept" in shown
+    assert "deg, of the line alone" in shown
+    assert LINE_ALONE in done_on(smoke_copy, "diagnose", "both").stderr
     assert "inner groups" in shown
     assert answer(smoke_copy, "score", "both")["rmse_deg"] < 1
     done_on(smoke_copy, "export", "both", "--to", "c", "--output", tmp_path / "c")
     assert answer(smoke_copy, "publish", "both")["new"] is False, "it is trained as it was"
     done_on(smoke_copy, "publish", "line", "--models", "table1", "--force")
+    assert LINE_ALONE not in done_on(smoke_copy, "diagnose", "line").stderr
+    (tmp_path / "short.toml").write_text(SHORT_LIST)
+    again: list[str | Path] = [
+        "publish",
+        "both",
+        "--models",
+        tmp_path / "short.toml",
+        "--dry-run",
+        "--force",
+    ]
+    reviewed = " ".join(done_on(smoke_copy, *again).stderr.split())
+    assert "the line alone, since Gram rows contain no filter: on the same" in reviewed
     facts = answer(smoke_copy, "diff", "both", "line")["facts"]
     assert facts["combination.method"] == {"one": combination.method, "other": None}
 
