@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _prepare_imports() -> None:
-    """Set what libraries read when they are imported."""
+    """Set the variables that libraries read when they are imported."""
     if resource.getrlimit(resource.RLIMIT_DATA)[0] != resource.RLIM_INFINITY:
         os.environ.setdefault("MIMALLOC_ARENA_EAGER_COMMIT", "0")  # 1 GiB that Arrow would reserve
     # Pydantic looks for plugins among all installed packages: 10 ms, and none is used.

@@ -172,7 +172,7 @@ def _draw(result: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
 
 
 def _text_width(result: duckdb.DuckDBPyRelation, width: int) -> int:
-    """Return the largest width of a column with which all columns fit, or else a narrow one."""
+    """Return the largest column width with which all columns fit, otherwise a narrow width."""
     records = [result.columns, result.types, *result.limit(SAMPLE_ROWS).fetchall()]
     widths = [max(len(str(value)) for value in column) for column in zip(*records, strict=True)]
     fits = (

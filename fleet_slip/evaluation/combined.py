@@ -1,4 +1,4 @@
-"""Line and filter together: a combination whose weights are cross-validated in inner groups.
+"""Combination of line and filter, whose weights are cross-validated in inner groups.
 
 In every inner group of drives the car is identified, and the line chosen and fitted, without the
 group. So the weights come from estimates that have not seen the labels.

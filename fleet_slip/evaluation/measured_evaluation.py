@@ -301,7 +301,7 @@ class Competition:
     def _combine(
         self, name: str, held_out: Segments, identified: IdentifiedVehicle | None
     ) -> FittedEstimator | None:
-        """Combine a learner with a filter; None if the drives lack what the filter needs."""
+        """Combine a learner with a filter; None if the drives lack a signal of the filter."""
         if self.measured is None or identified is None:
             return None
         source, learner = self.learners[name]

@@ -384,7 +384,7 @@ class Fixes:
 
 
 def _find_fixes(drive: DriveCounts, ticks: IntArray, delay_ticks: int) -> tuple[IntArray, IntArray]:
-    """Return the rows that the fixes are of, `delay_ticks` before they arrive, and the course."""
+    """Return the rows of the fixes, `delay_ticks` before they arrive, and the course."""
     fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
     rows = np.searchsorted(ticks, ticks[fixed] - delay_ticks)
     exists = ticks[np.minimum(rows, len(ticks) - 1)] == ticks[fixed] - delay_ticks
@@ -415,7 +415,7 @@ def _twice_turned(
 def _sideslip_change(
     units: CourseUnits, course: IntArray, turned: IntArray, by_delay: IntArray
 ) -> tuple[IntArray, BoolArray]:
-    """Return the change of the side-slip angle in counts of the label, and the plausible ones."""
+    """Return the changes of the side-slip angle in counts of the label, and the plausible ones."""
     change = units.turn * course - 2 * HALF_TURN * turned + by_delay
     full_turn = 2 * HALF_TURN * units.turn
     change -= full_turn * _divide_rounded(change, full_turn)

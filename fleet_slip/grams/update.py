@@ -60,7 +60,7 @@ class GramReport(Answer):
 
     @property
     def total(self) -> str:
-        """Return the number of Gram rows in the table, with what it counts."""
+        """Return the number of Gram rows in the table, with its scope."""
         return f"{pluralize(self.gram_rows, 'Gram row')} of all drives and feature sets"
 
     @property

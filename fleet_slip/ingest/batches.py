@@ -168,7 +168,7 @@ def merge_bases(
 
 
 _MAX_APART_S = 60.0
-"""Time bases of one recording may begin after others have ended, but not later than that, in s."""
+"""Longest time in s between the end of a time base and the start of another in one recording."""
 
 
 def _require_common_time(bases: Sequence["_PendingBase"], log: Path) -> None:

@@ -91,7 +91,7 @@ _GROUPED = r"^[+-]?[1-9]\d{0,2}(\.\d{3})+(,\d*)?$"
 
 
 def parse_numbers(text: pl.Expr, *, decimal_comma: bool) -> pl.Expr:
-    """Return texts as float64, null for others.
+    """Return texts as float64, null for texts that are not numbers.
 
     With a decimal comma a point groups digits: 1.320 is 1320, and 0.5 is no number.
     """
@@ -344,7 +344,7 @@ class TimeBase(Config):
         return self.format if self.date is None else f"{self.date.format} {self.format}"
 
     def in_s(self, raw: pl.Expr, kind: pl.DataType, *, decimal_comma: bool = False) -> pl.Expr:
-        """Return times in s, since 1970 if they have a date; null for an empty one, NaN for none.
+        """Return times in s, since 1970 if they have a date; null for empty, NaN for invalid texts.
 
         Raises `ValueError` for a column of another type.
         """

@@ -241,7 +241,7 @@ def _choices(guess: Guess) -> str:
 
 
 def _lines(name: str, guess: Guess, guesses: dict[str, Guess]) -> list[str]:
-    """Return the keys of a signal: on a line, or on one each where that is too long."""
+    """Return the keys of a signal on one line, or on a line each if one is too long."""
     keys = signal_keys(guess)
     if guess.component:
         east = guesses[SATELLITE_SPEED].column

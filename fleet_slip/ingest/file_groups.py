@@ -47,7 +47,7 @@ class FileGroup(PosixPath):
         return group
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return what a copy in another process is made of."""
+        """Return the arguments that rebuild this in another process."""
         return FileGroup.create, (Path(self), self.members)
 
     @property
@@ -125,7 +125,7 @@ def _by_message(splits: list[_Split]) -> dict[str, tuple[Path, ...]]:
 
 
 def seconds_of(column: pl.Series, time: TimeBase, formats: FileFormats) -> pl.Series:
-    """Return times in s, NaN where a text is none. Raises `ValueError` for another type."""
+    """Return times in s, NaN for other texts. Raises `ValueError` for another type."""
     return column.to_frame().select(
         time.in_s(pl.col(column.name), column.dtype, decimal_comma=formats.csv.decimal_comma)
     )[column.name]
@@ -159,7 +159,7 @@ class GroupSource(Source):
         ]
 
     def _time_column(self, member: str) -> str | None:
-        """Return the column of a member's times, None if the file has a clock or none is found."""
+        """Return the column of a member's times; None if the file has a clock or no such column."""
         if member in self._times:
             return self._times[member].column
         names = [channel.name for channel in self._channels_of(member)]

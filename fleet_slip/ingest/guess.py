@@ -200,7 +200,7 @@ _VSS = re.compile(r"([^./]+/)?Vehicle(\.[A-Z]\w*)+$|([^./]+/)?Vehicle(_[A-Z][A-Z
 
 
 def _unit_of(profile: Profile) -> str | None:
-    """Return the unit that the file, or the name of a column, states; None without a known one."""
+    """Return the unit from the file or the name of a column; None without a known unit."""
     name, in_brackets = split_unit(profile.channel.name)
     return unit_called(profile.channel.unit.strip() or in_brackets) or unit_behind(name)
 
@@ -380,7 +380,7 @@ def guess_rasters(
 
 
 def _is_raster(values: FloatArray, main: FloatArray) -> bool:
-    """Return True if times are those of other samples: of another number, or shifted by a step."""
+    """Return True if times belong to other samples: in another number, or shifted by a step."""
     step, main_step = np.median(np.diff(values)), np.median(np.diff(main))
     if values.size != main.size:
         return bool(step <= 1e4 * main_step)

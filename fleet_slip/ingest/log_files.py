@@ -25,7 +25,7 @@ _COMPANIONS = (
     ".toml", ".dbc", ".kcd", ".sym", ".arxml", ".a2l", ".md", ".json", ".yaml", ".yml", ".pdf",
     ".png", ".jpg", ".py", ".sh", ".tdms_index",
 )  # fmt: skip
-"""Suffixes of files that lie beside logs and are none."""
+"""Suffixes of files beside logs that are not logs."""
 _BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
 """First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
 

@@ -356,11 +356,11 @@ class MeasuredLog:
 
 FIRST_DAY = date(2000, 1, 1)
 ROLLOVER = timedelta(weeks=1024)
-"""After this time the week number of GPS begins anew: a receiver may be that early."""
+"""Period after which the week number of GPS restarts: a receiver may be that early."""
 
 
 def implausible_day(day: date, changed: date) -> str:
-    """Return why a day cannot be that of a drive, empty for others.
+    """Return the reason why a day is implausible for a drive, empty for plausible days.
 
     `changed` is the day on which the file was written.
     """

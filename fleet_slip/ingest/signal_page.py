@@ -13,7 +13,7 @@ from fleet_slip.pages.drawing import WIDTH_IN, Picture, colour, draw
 from fleet_slip.pages.page import fill_in
 
 MAX_POINTS = 2000
-"""Points of a curve; of more the least and the largest of equal parts are drawn."""
+"""Maximum points of a curve. Of longer signals the extremes of equal parts are drawn."""
 _PANEL_IN = 1.1
 
 
@@ -61,7 +61,7 @@ def in_si(catalog: SignalCatalog, name: str, guess: Guess) -> FloatArray:
 
 
 def thinned(values: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Return times in s and values; of many the least and the largest of equal parts."""
+    """Return times in s and values; of many values the extremes of equal parts."""
     time_s = np.arange(values.size) / rate_hz
     size = 2 * values.size // MAX_POINTS
     if size < 2:

@@ -71,7 +71,7 @@ def _root_mean_square(values: FloatArray) -> float | None:
 
 @dataclass(frozen=True)
 class Predictions(Answer):
-    """The predictions of log files, and what looks wrong in the files."""
+    """The predictions of log files, and the faults of the files."""
 
     DOCUMENT = "model output drives rows rows_estimated rmse_deg rows_quarantined suspicions"
 

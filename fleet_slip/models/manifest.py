@@ -554,7 +554,7 @@ class Manifest(Config):
         return next(filter(None, digests), None)
 
     def properties(self, on_board: str = "") -> dict[str, str]:
-        """Return what `show` displays, by name; `on_board` are the costs in a car."""
+        """Return the content of `show` by name; `on_board` are the costs in a car."""
         from fleet_slip.warehouse.predicate import describe_cohort  # noqa: PLC0415 - SQL
 
         figures, trained = self.cross_validation, self.trained_on

@@ -314,14 +314,14 @@ def _stated_rad(source: str, campaign: str | None, configs: Configs) -> float | 
 # Nested cross-validation: the figure of a winner is that of the folds that chose it.
 
 MIN_DRIVES = 3
-"""Minimum number of trips to hold out whole trips; of fewer, parts of the time are held out."""
+"""Minimum number of trips to hold out whole trips; with fewer, parts of the time are held out."""
 
 MAX_HELD_OUT = 10
 GROUPED = 8
 """Up to `MAX_HELD_OUT` trips are held out one by one; more are dealt into this number of groups."""
 
 MAX_NESTED_DRIVES = 500
-"""Maximum number of drives for which a choice is repeated; beyond it the optimism is small."""
+"""Maximum number of drives for which a choice is repeated; beyond it, the optimism is small."""
 
 
 @dataclass(frozen=True)

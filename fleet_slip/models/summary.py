@@ -125,7 +125,7 @@ def group_skipped(skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
 
 
 def _shortened(predicate: str, everything: bool, hint: str) -> str:
-    """Return a cohort for display, of a long one its beginning."""
+    """Return a cohort for display; a long predicate is cut."""
     text = describe_cohort(predicate)
     if everything:
         return text and f" where {predicate}"

@@ -87,13 +87,13 @@ MAX_ANGLE_ERROR_DEG = 0.15
 """Error of the label that an unknown or remaining delay may cause: as much as the intercept has
 from the mounting of reference sensors (`calibration.intercept`)."""
 USUAL_YAW_RATE_RAD_S = 0.25
-"""Of cars without moments of the course."""
+"""Standard deviation of the yaw rate of cars without moments of the course."""
 MAX_CARS, MAX_FAULTS = 5, 3
 """Cars and faults in a message."""
 
 
 def require_sound_course(warehouse: Warehouse, manifest: Manifest) -> None:
-    """Raise `RefusedError` unless the course is in time, and that of a car.
+    """Raise `RefusedError` for a course that is late, or implausible for a car.
 
     A course that is late by d shifts the label by d times the yaw rate.
     """

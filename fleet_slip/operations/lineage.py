@@ -105,9 +105,9 @@ def emit_lineage(
         )
         try:
             emit(event)
-        except Exception as failure:  # of any transport: the run goes on
+        except Exception as failure:  # of any transport: the run continues
             LOGGER.warning(
-                "lineage: the event %s cannot be sent to %s: %s. The run goes on.",
+                "lineage: the event %s cannot be sent to %s: %s. The run continues.",
                 *(state.value, hide_passwords(target, to_end=True), failure),
             )
 

@@ -263,7 +263,7 @@ def _turns_at(speed: FloatArray, signals: Signals, moving: BoolArray) -> bool:
 def _compared(
     signals: Signals, speed: FloatArray, moving: BoolArray
 ) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
-    """Yield signals, what predicts the first, its ratio to that, and their correlation."""
+    """Yield signals, the predictor of the first, its ratio to that, and their correlation."""
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
@@ -332,7 +332,7 @@ _LONGEST = """
 
 @dataclass(frozen=True)
 class InspectedDrive:
-    """A drive whose rows were checked, and its faults that do harm."""
+    """A drive whose rows were checked, and its harmful faults."""
 
     drive_id: str
     vehicle_id: str

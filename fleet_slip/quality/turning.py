@@ -234,7 +234,7 @@ def _are_equal(moments: MeanMoments, a: str, b: str) -> bool:
 
 
 def _without_equal_wheels(witnesses: MeanMoments) -> FloatArray:
-    """Return correlations that are zero of wheels whose difference is too small for the turns."""
+    """Return correlations, zero for wheels whose difference is too small for the turns."""
     names, correlations = witnesses.signals, witnesses.correlations()
     if "yaw_rate" not in names:
         return correlations

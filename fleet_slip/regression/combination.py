@@ -37,7 +37,7 @@ STD_ROWS = 0.1
 """Weight, of a total of 1, with which the σ of a knot tends to that of all rows."""
 
 MIN_GROUPS = 4
-"""With fewer groups of drives the safest method is taken."""
+"""Minimum number of groups of drives to replace the safest method."""
 
 Anchor = Literal["line", "filter"]
 Method = Literal["line", "filter", "constant", "by_lateral", "line_by_lateral"]

@@ -485,7 +485,7 @@ def _values(
         names = [choices.get(v) if s else None for v, s in zip(raw.tolist(), sent, strict=True)]
         return pl.Series(names, dtype=pl.String)
     absent = [v for v, text in choices.items() if not is_state or is_missing_state(text)]
-    if is_state and raw.size:  # a value without a name is none
+    if is_state and raw.size:  # a value without a name is missing
         absent += list(set(np.unique(raw).tolist()) - set(choices))
     return pl.Series(physical(signal, raw)).set(pl.Series(~sent | np.isin(raw, absent)), None)
 

@@ -69,7 +69,7 @@ CUT = "the file ends within this line"
 """Its value for a last line that is cut: without a line break, with fewer fields than others."""
 
 FEWER = "fewer fields than names"
-"""Its value for a line of a format in which no field can be empty."""
+"""Value of `EXTRA_FIELDS` for a line with too few fields, in formats without empty fields."""
 _FIRST_ROWS = 100
 """Number of first rows; one of them must have as many fields as the header has names."""
 
@@ -103,7 +103,7 @@ class CsvSource(FormatSource):
         return "", find_column(self._file, [channel.name for channel in self._header], column)
 
     def _cleaned(self, block: bytes, _start: int) -> bytes:
-        """Return a block whose lines from a position on have separators as a CSV file has."""
+        """Return a block with the separators of CSV in its lines from a position on."""
         return block
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
@@ -176,7 +176,7 @@ class CsvSource(FormatSource):
     def _parse_lines(
         self, block: bytes, width: int, places: dict[str, int], numbers: set[str]
     ) -> pl.DataFrame:
-        """Parse lines behind one of padding; `numbers` loses columns that are not only numbers."""
+        """Parse lines after one of padding; remove columns with other values from `numbers`."""
         # Reading on over bad numbers is reading on over bad quotes. Beside a decimal comma a point
         # groups digits, but Polars reads it as one.
         grouped = self.csv_format.decimal_comma and b"." in block
@@ -238,7 +238,7 @@ _WITH_KEYS = re.compile(r'"?([^"|]+)"?\|"?([^"|]*)"?(\|[-+.\d]*){1,3}')
 
 
 def described(fields: Sequence[str]) -> list[Channel]:
-    """Return the columns of a header; those of one name have their number behind an @."""
+    """Return the columns of a header; equal names are numbered, as NAME@NUMBER."""
     keys = [_WITH_KEYS.fullmatch(field.strip()) for field in fields]
     names = [key[1] if key else name.strip() for key, name in zip(keys, fields, strict=True)]
     several = {name for name, count in Counter(names).items() if name and count > 1}
@@ -247,7 +247,7 @@ def described(fields: Sequence[str]) -> list[Channel]:
 
 
 _NUMBER = re.compile(r"[-+\d.,eE ]*")
-"""A name that may as well be a value of a row."""
+"""A name that may also be a value of a row."""
 
 
 def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:

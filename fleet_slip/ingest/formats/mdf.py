@@ -155,7 +155,7 @@ class MdfSource(FormatSource):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
 
     def __init__(self, mdf: Any, budget: Budget, formats: FileFormats) -> None:
-        """Take a file opened by asammdf, and what the mapping states of it."""
+        """Take a file opened by asammdf, and its format in the mapping."""
         self._file, self._mdf = budget.file, mdf
         self._start_s = _start_s(mdf.header, formats.zone)
         self._numbers_alone = formats.plain_numbers.columns

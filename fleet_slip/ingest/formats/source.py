@@ -182,7 +182,7 @@ _NO_STATE = re.compile(
 
 
 def names_states(texts: Iterable[str]) -> bool:
-    """Return True if names are those of states, such as P, R, N, D, and not of missing values."""
+    """Return True if names are states, such as P, R, N, D, and not missing values."""
     return sum(not _NO_STATE.match(text.strip()) for text in texts) > 1
 
 
