@@ -23,7 +23,7 @@ TICKS_PER_S = round(1 / float(SAMPLE_TIME_S))
 MIN_TICKS = 200
 """Fewest ticks of a fit: 2 s."""
 MIN_CORRELATION = 0.6
-"""Minimum correlation to compare the sizes of two signals; 0.9 in a sound drive on winding roads."""
+"""Minimum correlation to compare the sizes of two signals; 0.9 in a sound drive on bends."""
 MOVING_MPS = 2.0
 """Below, satellite and optical sensors measure no angle, and receivers freeze the course."""
 RADIUS_M, TRACK_M = 0.31, 1.55
