@@ -553,7 +553,10 @@ class NightlyPipeline:
         progress = step_progress(self.progress, "retain")
         report = self.fleet.maintenance.apply_retention(self.retention, progress=progress)
         forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
-        return "done", (
+        summary = (
             f"{pluralize(forgotten, 'drive')} before {report.before} forgotten, "
             f"{pluralize(removed, 'old file')} removed."
         )
+        if problem := report.problem:
+            return "attention", f"{summary} {str(problem)[0].upper()}{str(problem)[1:]}"
+        return "done", summary

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Named
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from datetime import date, timedelta
+from datetime import date
 from io import BytesIO
 from itertools import accumulate, chain
 from pathlib import Path
@@ -44,7 +44,7 @@ from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.vocabulary import is_called, vocabulary
-from fleet_slip.quality.checks import CHECKS, Check, Fault
+from fleet_slip.quality.checks import CHECKS, Check, Fault, implausible_day
 from fleet_slip.warehouse.warehouse import quarantine_schema
 
 MAX_DRIVES = 10_000
@@ -352,25 +352,6 @@ class MeasuredLog:
         if time.assumed:
             faults.append(CHECKS["assumed rate"].fault("rate_hz", rate_hz=time.rate_hz))
         return tuple(faults)
-
-
-FIRST_DAY = date(2000, 1, 1)
-ROLLOVER = timedelta(weeks=1024)
-"""Period after which the week number of GPS restarts: a receiver may be that early."""
-
-
-def implausible_day(day: date, changed: date) -> str:
-    """Return the reason why a day is implausible for a drive, empty for plausible days.
-
-    `changed` is the day on which the file was written.
-    """
-    if day < FIRST_DAY:
-        return f", before {FIRST_DAY}"
-    if day > max(changed, date.today()) + timedelta(days=1):
-        return ", in the future"
-    if abs(changed - day - ROLLOVER) <= timedelta(weeks=4):
-        return ", 1024 weeks before the file was written: the week number of GPS has rolled over"
-    return ""
 
 
 @contextmanager

@@ -120,7 +120,9 @@ _OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
 def rows_of(rows: pa.Table, subject: ErasureSubject) -> pa.ChunkedArray:
     """Return which rows of `logs` or `grams` are of a subject."""
     if subject.kind == "before":
-        return pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+        is_before = pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+        kept_days = pa.array(sorted(subject.kept_days), pa.date32())
+        return pc.and_not(is_before, pc.is_in(rows["day"], kept_days))
     names = rows[subject.column].cast(pa.string())
     return pc.is_in(names, pa.array(subject.select(names.unique().to_pylist()), pa.string()))
 

@@ -22,6 +22,7 @@ from fleet_slip.arrays import Hashes
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import (
+    AlarmError,
     ConfigError,
     FleetSlipError,
     PendingError,
@@ -55,6 +56,7 @@ from fleet_slip.operations.rewriting import (
     rewrite,
     write_remaining_rows,
 )
+from fleet_slip.quality.checks import implausible_day
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
@@ -121,6 +123,9 @@ class ForgetReport(Answer):
                 f"{', '.join(self.pending[:PENDING_SHOWN])}. {advice}"
             )
 
+
+DAYS_SHOWN = 3
+"""Maximum number of implausible days named in the error; --json lists all."""
 
 RUN = "the run "
 _NO_RUN = (
@@ -312,6 +317,22 @@ class RetentionReport(Answer):
     before: date
     forgotten: ForgetReport
     vacuumed: VacuumReport
+    implausible_days: tuple[str, ...] = ()
+    """Days that cannot be those of drives, with the reason: their drives are kept."""
+
+    @property
+    def problem(self) -> AlarmError | None:
+        """The drives that are kept because their day is implausible."""
+        if not self.implausible_days:
+            return None
+        shown = "; ".join(self.implausible_days[:DAYS_SHOWN])
+        more = len(self.implausible_days) - DAYS_SHOWN
+        return AlarmError(
+            f"drives of implausible days were not erased by age: {shown}"
+            f"{f'; {more} more' if more > 0 else ''}. Erase them with fleet-slip forget --drive "
+            "DRIVE, or set the clock of their logger, correct the day in the mapping and ingest "
+            "them again."
+        )
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: the erased drives and the removed files."""
@@ -322,7 +343,8 @@ class RetentionReport(Answer):
                 "the next forget --expired"
             )
         else:
-            yield Remark(f"no drive is older than {self.before}")
+            kept = " with a plausible day" if self.implausible_days else ""
+            yield Remark(f"no drive{kept} is older than {self.before}")
         yield self.vacuumed.remark
 
 
@@ -337,7 +359,8 @@ def retain(
 ) -> RetentionReport:
     """Erase the drives that exceed the retention, then vacuum; `progress` counts files.
 
-    Raises `RefusedError` if no drive would remain, or if drives would be erased by a clock that is
+    Keeps and reports drives of implausible days: no such day is a reason to erase. Raises
+    `RefusedError` if no drive would remain, or if drives would be erased by a clock that is
     further from the latest drive than plausible: it may be ahead.
     """
     warehouse.require()
@@ -345,9 +368,9 @@ def retain(
         before = today - timedelta(days=retention.drives_days)
     except OverflowError:
         raise ConfigError(f"drives_days = {retention.drives_days}: too long ago.") from None
-    days = [file.day for file in warehouse.logs.snapshot().files if file.day is not None]
-    for file in filter(is_onboard_file, warehouse.grams.snapshot().files):
-        days += pc.min_max(warehouse.grams.read(file.path, ["day"])["day"]).as_py().values()
+    all_days = _days_of_drives(warehouse, today)
+    implausible = {day: why for day, why in all_days.items() if why}
+    days = all_days.keys() - implausible.keys()
     if days and max(days) < before:
         raise RefusedError(
             f"{warehouse.root}: its latest drive is of {max(days)} and all before {before} would "
@@ -361,9 +384,26 @@ def retain(
             f"clock that is ahead would erase too many drives, so none before {before} was erased. "
             "Check the clock. If it is right, raise max_days_without_drives in the retention file."
         )
-    forgotten = forget(warehouse, ErasureSubject("before", before.isoformat()), progress=progress)
+    subject = ErasureSubject("before", before.isoformat(), frozenset(implausible))
+    forgotten = forget(warehouse, subject, progress=progress)
     vacuumed = vacuum(warehouse, retention.replaced_files_hours)
-    return RetentionReport(before, forgotten, vacuumed)
+    kept = [day for day in sorted(implausible) if day < before or day > today]
+    reasons = tuple(f"{day}{implausible[day]}" for day in kept)
+    return RetentionReport(before, forgotten, vacuumed, reasons)
+
+
+def _days_of_drives(warehouse: Warehouse, today: date) -> dict[date, str]:
+    """Return the days of all drives, and why a day is implausible, empty for others."""
+    logs = warehouse.logs.snapshot()
+    committed = logs.commit_days()
+    dated = [(file.day, committed[file.path]) for file in logs.files if file.day is not None]
+    for file in filter(is_onboard_file, warehouse.grams.snapshot().files):
+        days = pc.unique(warehouse.grams.read(file.path, ["day"])["day"]).to_pylist()
+        dated += [(day, today) for day in days]
+    reasons: dict[date, str] = {}
+    for day, written in sorted(set(dated)):
+        reasons[day] = reasons.get(day) or implausible_day(day, written)
+    return reasons
 
 
 # Marks of model versions that were trained on drives erased later.

@@ -8,6 +8,7 @@ thresholds: the checks read them there, messages show them, and docs/quality.md 
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date, timedelta
 from math import inf
 from pathlib import Path
 from typing import Any, Literal
@@ -111,3 +112,24 @@ CHECKS: Mapping[str, Check] = {
     ).items()
 }
 """All checks by name, in the order in which they run."""
+
+
+FIRST_DAY = date(2000, 1, 1)
+ROLLOVER = timedelta(weeks=1024)
+"""Period after which the week number of GPS restarts: a receiver may be that early."""
+MAX_BACKLOG = timedelta(weeks=4)
+"""Time between a drive and the file that contains it, by which a rollover is recognized."""
+
+
+def implausible_day(day: date, written: date) -> str:
+    """Return the reason why a day is implausible for a drive, empty for plausible days.
+
+    `written` is the day on which its file was written.
+    """
+    if day < FIRST_DAY:
+        return f", before {FIRST_DAY}"
+    if day > max(written, date.today()) + timedelta(days=1):
+        return ", in the future"
+    if abs(written - day - ROLLOVER) <= MAX_BACKLOG:
+        return ", 1024 weeks before the file was written: the week number of GPS has rolled over"
+    return ""

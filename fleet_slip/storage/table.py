@@ -11,7 +11,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import date
+from datetime import UTC, date, datetime
 from decimal import Decimal
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -333,6 +333,15 @@ class Snapshot:
         with storage_errors(self.table.folder):
             files = sorted(_table_files(self._actions, self.table.folder), key=lambda f: f.path)
         return tuple(file for file in files if file.path not in self.without)
+
+    def commit_days(self) -> dict[str, date]:
+        """Return the day of the commit that added each active file, by path."""
+        if self.delta is None:
+            return {}
+        with storage_errors(self.table.folder):
+            paths, times = (self._actions[name] for name in ("path", "modification_time"))
+            days = (datetime.fromtimestamp(1e-3 * ms, UTC).date() for ms in times.to_pylist())
+            return dict(zip(paths.to_pylist(), days, strict=True))
 
     @property
     def has_same_columns(self) -> bool:

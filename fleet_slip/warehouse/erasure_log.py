@@ -25,7 +25,7 @@ import secrets
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from typing import Any, Literal, TypeAlias
 
 from fleet_slip.base import name_key, normalize_name, pluralize
@@ -43,10 +43,14 @@ SubjectKind: TypeAlias = Literal["vehicle", "drive", "before"]
 
 @dataclass(frozen=True)
 class ErasureSubject:
-    """Subject of an erasure: a vehicle, a drive, or every drive before a day."""
+    """Subject of an erasure: a vehicle, a drive, or every drive before a day.
+
+    `kept_days` are days before that day whose drives stay.
+    """
 
     kind: SubjectKind
     value: str
+    kept_days: frozenset[date] = frozenset()
 
     @property
     def column(self) -> str:

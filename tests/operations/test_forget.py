@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 import time
-from datetime import date
+from datetime import date, timedelta
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.errors import QuestionError, RefusedError, StorageError
+from fleet_slip.errors import AlarmError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams import update
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
@@ -241,6 +241,35 @@ def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -
     assert not retain(warehouse, retention, date(2024, 3, 2)).forgotten.changed
     days = ask(warehouse.root, "SELECT DISTINCT day FROM grams ORDER BY ALL")
     assert days == [(date(2024, 2, 1),), (date(2024, 3, 1),)]
+
+
+def test_retention_keeps_drives_of_implausible_days_and_reports_them(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    today = date.today()
+    rolled_over, future = today - timedelta(weeks=1024), today + timedelta(days=400)
+    implausible = [date(1980, 1, 6), rolled_over, future]
+    for number, day in enumerate([*implausible, date(2012, 3, 1), today]):
+        land(warehouse, f"n{number}", drive("alfa", number, day), day=day)
+    update_grams(warehouse)
+    for erased in (1, 0):
+        report = retain(warehouse, Retention(drives_days=3650, replaced_files_hours=24), today)
+        assert report.forgotten.drives == erased
+        assert [text.partition(",")[0] for text in report.implausible_days] == [
+            str(day) for day in implausible
+        ]
+        assert isinstance(report.problem, AlarmError)
+    days = ask(warehouse.root, "SELECT DISTINCT day FROM grams ORDER BY ALL")
+    assert days == [(day,) for day in sorted([*implausible, today])]
+
+
+def test_a_drive_of_a_future_day_does_not_prove_the_clock(tmp_path: Path) -> None:
+    warehouse = Warehouse(LocalFolder(tmp_path))
+    today = date.today()
+    for number, days in enumerate((-400, -100, 400)):
+        day = today + timedelta(days=days)
+        land(warehouse, f"n{number}", drive("alfa", number, day), day=day)
+    with pytest.raises(RefusedError, match="100 days before the date of the clock"):
+        retain(warehouse, Retention(drives_days=365, replaced_files_hours=24), today)
 
 
 def test_models_are_marked_and_run_trains_again_without_bringing_the_drive_back(
