@@ -218,6 +218,17 @@ def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
     assert "torn.parquet" in str(report.problem)
 
 
+def test_no_night_erases_drives_whose_date_has_rolled_over(place: Path, landing: Landing) -> None:
+    begin = sum(DRIVES[:2])
+    rolled_over = date.today() - timedelta(weeks=1024)
+    landing.land("rolled", landing.drives()[begin : begin + DRIVES[2]], rolled_over)
+    for night in (2, 3):  # the second knows these drives
+        report = give(place, night)
+        (retain,) = (step for step in report.steps if step.name == "retain")
+        assert (retain.state, report.drives, report.exit_code) == ("attention", 8, 10)
+        assert str(rolled_over) in retain.summary
+
+
 def test_with_a_wrong_mapping_what_is_there_is_looked_after(place: Path, landing: Landing) -> None:
     land(landing, 2)
     wrong = place / "wrong.toml"
