@@ -27,7 +27,13 @@ from fleet_slip.evaluation.identify import (
 )
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.evaluation.tuning import Coordinates
-from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program, make_checks
+from fleet_slip.export.compile import (
+    Sample,
+    angles_by_kernel,
+    checks_csv,
+    compile_program,
+    make_checks,
+)
 from fleet_slip.export.costs import count_costs
 from fleet_slip.export.files import export_files, program_content, with_states
 from fleet_slip.export.program import UNKNOWN_CAR, Program
@@ -37,6 +43,7 @@ from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import SANITIZED, build_driver, can_sanitize, drive, needs_cc
 from tests.export.engines import in_si, open_session, run_drives
+from tests.export.fmus import Fmu, drive_fmu, run_fmpy, simulate_with_fmpy, unpack
 from tests.export.models import hostile_drive, model_of
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.drives import simulated_drive
@@ -186,6 +193,52 @@ def test_compiled_c_has_the_same_bits(name: str, tmp_path: Path) -> None:
     samples = hostile_drive(program, 500, 3)
     expected = angles_by_kernel(SIGNALS, manifest, program, UNKNOWN_CAR, samples)
     assert drive(driver, program, UNKNOWN_CAR, samples) == expected
+
+
+def fmu_of(version: ModelVersion) -> bytes:
+    return export_files(version, None, "fmu")["sideslip_any_fmi2.fmu"]
+
+
+@needs_cc
+@pytest.mark.long
+@pytest.mark.parametrize("name", BLENDS)
+def test_an_fmu_gives_the_angles_of_its_vectors(name: str, tmp_path: Path) -> None:
+    manifest = model_with(BLENDS[name]).model_copy(update={"name": "any"})
+    program = compile_program(CATALOG, manifest)
+    instance = Fmu(*unpack(fmu_of(ModelVersion(1, manifest, "0" * 64, CATALOG)), tmp_path))
+    checks = make_checks(SIGNALS, manifest, program)
+    for check in checks:
+        assert drive_fmu(instance, program, UNKNOWN_CAR, check.samples) == list(check.angles)
+    assert (tmp_path / "resources/checks.csv").read_text() == checks_csv(program, checks)
+    samples = hostile_drive(program, 500, 5)
+    expected = angles_by_kernel(SIGNALS, manifest, program, UNKNOWN_CAR, samples)
+    assert drive_fmu(instance, program, UNKNOWN_CAR, samples) == expected
+
+
+@needs_cc
+@pytest.mark.tools("fmpy")
+def test_fmpy_gives_the_angles_of_a_vector(tmp_path: Path) -> None:
+    manifest = model_with(BLENDS["by_lateral"]).model_copy(update={"name": "any"})
+    program = compile_program(CATALOG, manifest)
+    file = tmp_path / "combined.fmu"
+    file.write_bytes(fmu_of(ModelVersion(1, manifest, "0" * 64, CATALOG)))
+    assert "No problems found" in run_fmpy("validate", str(file))
+    complete = [
+        check
+        for check in make_checks(SIGNALS, manifest, program)
+        if all(None not in sample for sample in check.samples)
+    ]
+    assert complete, "FMPy reads no missing values"
+    columns = [signal.column for signal in program.signals]
+    scales = [float(signal.scale) for signal in program.signals]
+    for check in complete:
+        rows = [
+            [float(count or 0) * scale for count, scale in zip(sample, scales, strict=True)]
+            for sample in check.samples
+        ]
+        found = simulate_with_fmpy(file, columns, rows, program.angle.column)
+        angles = [round(rad / float(program.angle.scale)) for rad in found]
+        assert angles == [count or 0 for count in check.angles]
 
 
 def test_onnx_has_the_same_angles() -> None:

@@ -1,16 +1,10 @@
 """Exported FMUs: driven through their binaries here, and by FMPy where it is installed."""
 
-import csv
-import ctypes
-import subprocess
 import zipfile
-from collections.abc import Sequence
-from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
+from ctypes import byref, c_double, c_void_p
 from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -18,17 +12,16 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError
 from fleet_slip.export import fmu
-from fleet_slip.export.compile import Sample, angles_by_kernel, compile_program
+from fleet_slip.export.compile import angles_by_kernel, compile_program
 from fleet_slip.export.files import export_files
-from fleet_slip.export.program import Car, Program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
+from tests.export.fmus import Fmu, drive_fmu, run_fmpy, simulate_with_fmpy, unpack
 from tests.export.models import CARS, MODELS, hostile_drive, model_of
 from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
-TICK_S = 0.01
 MANIFEST = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
 
 
@@ -40,89 +33,8 @@ def archive() -> bytes:
 
 
 @pytest.fixture
-def instance(archive: bytes, tmp_path: Path) -> "Fmu":
+def instance(archive: bytes, tmp_path: Path) -> Fmu:
     return Fmu(*unpack(archive, tmp_path))
-
-
-def unpack(content: bytes, folder: Path) -> tuple[Any, ElementTree.Element]:
-    """The library in an FMU, and its description."""
-    with zipfile.ZipFile(BytesIO(content)) as archive:
-        archive.extractall(folder)
-    (library,) = folder.glob("binaries/*/*.so")
-    description = ElementTree.parse(folder / "modelDescription.xml")  # noqa: S314 - our own
-    return ctypes.CDLL(str(library)), description.getroot()
-
-
-LOGGER = ctypes.CFUNCTYPE(None, c_void_p, c_char_p, c_int, c_char_p, c_char_p)
-
-
-class Functions(ctypes.Structure):
-    """The callbacks of FMI 2.0, of which the logger alone is set."""
-
-    _fields_ = (("logger", LOGGER), *((name, c_void_p) for name in ("a", "f", "s", "e")))
-
-
-class Fmu:
-    """An instance of an FMU, called by the functions of FMI 2.0."""
-
-    def __init__(self, library: Any, description: ElementTree.Element) -> None:
-        self.library = library
-        self.component = c_void_p(self.instantiate(description.attrib["guid"].encode()))
-        self.references = {
-            variable.attrib["name"]: int(variable.attrib["valueReference"])
-            for variable in description.iter("ScalarVariable")
-        }
-
-    def instantiate(self, token: bytes) -> Any:
-        call = self.library.fmi2Instantiate
-        call.restype = c_void_p
-        self.messages: list[tuple[bytes, bytes]] = []
-        self._logger = LOGGER(lambda _, name, *more: self.messages.append((name, more[2])))
-        self._functions = Functions(self._logger)
-        functions = byref(self._functions)
-        return call(b"car", c_int(1), c_char_p(token), None, functions, c_int(0), c_int(0))
-
-    def call(self, function: str, *arguments: Any) -> int:
-        return int(getattr(self.library, f"fmi2{function}")(self.component, *arguments))
-
-    def write(self, kind: str, names: Sequence[str], values: Sequence[Any], number: Any) -> None:
-        references = (c_uint * len(names))(*(self.references[name] for name in names))
-        array = (number * len(names))(*values)
-        assert self.call(f"Set{kind}", references, c_size_t(len(names)), array) == 0
-
-    def read(self, kind: str, name: str, number: Any) -> Any:
-        value = number()
-        reference = c_uint(self.references[name])
-        assert self.call(f"Get{kind}", byref(reference), c_size_t(1), byref(value)) == 0
-        return value.value
-
-    def step(self, step_s: float = TICK_S) -> int:
-        return self.call("DoStep", c_double(0.0), c_double(step_s), c_int(0))
-
-
-def drive(instance: Fmu, program: Program, car: Car, samples: Sequence[Sample]) -> list[int | None]:
-    """Return the angles that an FMU gives, in counts."""
-    counts = [*car.fact_counts(program), *car.number_counts(program)]
-    names = [fact.field for fact in program.facts] + [number.name for number in program.numbers]
-    assert instance.call("Reset") == 0
-    parameters = [-(2**31) if n is None else n for n in counts]
-    instance.write("Integer", names, parameters, c_int)
-    assert instance.call("ExitInitializationMode") == 0
-    columns = [signal.column for signal in program.signals]
-    scale = float(program.angle.scale)
-    angles: list[int | None] = []
-    for sample in samples:
-        values = [
-            np.nan if count is None else count * float(signal.scale)
-            for count, signal in zip(sample, program.signals, strict=True)
-        ]
-        instance.write("Real", columns, values, c_double)
-        assert instance.step() == 0
-        valid = instance.read("Boolean", "valid", c_int)
-        angle = instance.read("Real", program.angle.column, c_double)
-        assert valid or angle == 0
-        angles.append(round(angle / scale) if valid else None)
-    return angles
 
 
 def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu) -> None:
@@ -130,7 +42,7 @@ def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu) -> None:
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
         expected = angles_by_kernel(SIGNALS, MANIFEST, program, car, samples)
-        assert drive(instance, program, car, samples) == expected
+        assert drive_fmu(instance, program, car, samples) == expected
 
 
 def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
@@ -144,7 +56,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
     state = c_void_p()
     program = compile_program(CATALOG, MANIFEST)
     samples = hostile_drive(program, 60, 1)
-    before = drive(instance, program, CARS[1], samples)
+    before = drive_fmu(instance, program, CARS[1], samples)
     assert instance.call("GetFMUstate", byref(state)) == 0
     columns = [signal.column for signal in program.signals]
     instance.write("Real", columns, [0.5] * len(columns), c_double)
@@ -156,7 +68,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
         instance.write("Real", columns, [0.5] * len(columns), c_double)
     assert again[0] == again[1]
     assert instance.call("FreeFMUstate", byref(state)) == 0
-    assert drive(instance, program, CARS[1], samples) == before
+    assert drive_fmu(instance, program, CARS[1], samples) == before
 
 
 def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes) -> None:
@@ -187,14 +99,6 @@ def test_fmpy_finds_no_problem(name: str, tmp_path: Path) -> None:
     assert "No problems found" in run_fmpy("validate", str(file))
 
 
-def run_fmpy(*words: str) -> str:
-    done = subprocess.run(
-        ["fmpy", *words], capture_output=True, text=True, check=False, timeout=300
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
 @pytest.mark.tools("fmpy")
 def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
@@ -203,19 +107,11 @@ def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Pat
     log = fleet.sql("SELECT * FROM log WHERE drive_id = 'smoke-2024-05-01-0003' ORDER BY tick").pl()
     fleet.models.export(version, "fmu", tmp_path)
     columns = [one.column for one in program.signals]
-    with (tmp_path / "in.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["time", *columns])
-        for tick, row in enumerate(log.select(columns).iter_rows()):
-            table.writerow([repr(tick * TICK_S), *map(repr, row)])
-    words = ["--input-file", str(tmp_path / "in.csv"), "--output-file", str(tmp_path / "out.csv")]
-    times = ["--output-interval", str(TICK_S), "--stop-time", str(len(log) * TICK_S)]
     scale = float(program.angle.scale)
     predicted = version.predict(log).to_numpy()
-    run_fmpy("simulate", str(tmp_path / "sideslip_smoke_fmi2.fmu"), *words, *times)
-    with (tmp_path / "out.csv").open() as file:
-        rows = list(csv.DictReader(file))[1:]  # the first is from before the first tick
-    angles = [round(float(row["sideslip_rad"]) / scale) for row in rows]
+    file, rows = tmp_path / "sideslip_smoke_fmi2.fmu", log.select(columns).rows()
+    found = simulate_with_fmpy(file, columns, rows, "sideslip_rad")
+    angles = [round(angle / scale) for angle in found]
     assert angles == np.floor(predicted / scale + 0.5).astype(int).tolist()
 
 
