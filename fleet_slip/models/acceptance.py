@@ -144,9 +144,9 @@ class Comparison:
             f"{incumbent.pooled.correlation:.4f}, difference {gap}"
             for incumbent, gap in zip(self.incumbents, self.gaps, strict=True)
         )
+        alone = "the linear model alone, since Gram rows contain no filter: " * self.of_lines
         return (
-            f"{'the line alone, since Gram rows contain no filter: ' if self.of_lines else ''}"
-            f"on the same {pluralize(challenger.rows, 'row')} of "
+            f"{alone}on the same {pluralize(challenger.rows, 'row')} of "
             f"{pluralize(self.challenger.drives, 'drive')}"
             f"{' that are new to both' if self.unseen else ''}, held out "
             f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "

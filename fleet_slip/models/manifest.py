@@ -284,8 +284,8 @@ class SelectedBy(Config):
 
 
 LINE_ALONE = (
-    "The figures are of the line alone, without the filter, which Gram rows do not contain. "
-    "score and evaluate examine both together."
+    "The figures are of the linear model alone: Gram rows contain no filter. "
+    "score and evaluate examine the combination."
 )
 
 
@@ -473,7 +473,7 @@ class Manifest(Config):
 
     @property
     def line_remark(self) -> str:
-        """A sentence for what Gram rows tell of a version with a filter; empty without one."""
+        """Remark on figures from Gram rows of a version with a filter; empty without a filter."""
         has_filter = self.combination is not None and self.combination.term is not None
         return LINE_ALONE if has_filter else ""
 
@@ -560,9 +560,10 @@ class Manifest(Config):
         figures, trained = self.cross_validation, self.trained_on
         correlation = f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})"
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
+        alone = ", of the linear model alone" * bool(self.line_remark)
         properties = {
             "correlation": correlation,
-            "RMSE": f"{figures.rmse_deg:.4f} deg{', of the line alone' * bool(self.line_remark)}",
+            "RMSE": f"{figures.rmse_deg:.4f} deg{alone}",
             "label noise": figures.label_noise_text,
             "error std": f"{figures.error_std_deg:.4f} deg",
             "error mean": f"{figures.error_mean_deg:+.4f} deg",

@@ -71,7 +71,7 @@ def test_a_version_with_a_filter_is_used_as_any_other(
     shown = done_on(smoke_copy, "show", "both").stdout
     assert "with filter" in shown
     assert "both@1: line = intercept" in shown
-    assert "deg, of the line alone" in shown
+    assert "deg, of the linear model alone" in shown
     assert LINE_ALONE in done_on(smoke_copy, "diagnose", "both").stderr
     assert "inner groups" in shown
     assert answer(smoke_copy, "score", "both")["rmse_deg"] < 1
@@ -89,7 +89,7 @@ def test_a_version_with_a_filter_is_used_as_any_other(
         "--force",
     ]
     reviewed = " ".join(done_on(smoke_copy, *again).stderr.split())
-    assert "the line alone, since Gram rows contain no filter: on the same" in reviewed
+    assert "the linear model alone, since Gram rows contain no filter: on the same" in reviewed
     facts = answer(smoke_copy, "diff", "both", "line")["facts"]
     assert facts["combination.method"] == {"one": combination.method, "other": None}
 

@@ -73,7 +73,7 @@ def test_a_version_with_a_filter_is_charted_as_its_line_and_says_so(
     manifest = version.manifest.model_copy(update={"combination": combination})
     chart = monitor(warehouse, replace(version, manifest=manifest))
     assert chart.days == plain.days
-    assert "line alone" in str(chart)
+    assert "linear model alone" in str(chart)
     assert "remark" in chart.as_dict()
     assert "remark" not in plain.as_dict()
 
