@@ -114,6 +114,7 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     drives = pluralize(len(content["drives"]), "drive") + describe_cohort(content["cohort"])
     if examined := content.get("examined"):
         yield Remark(examined)
+    yield from (Remark(f"assumed: {text}") for text in content.get("assumed", ()))
     is_time = content["parts_of"] == "time"
     held_out, unit = ("in quarters of their time", "quarter") if is_time else ("whole", "drive")
     labels = dict.fromkeys(row["told"] for row in content["estimators"].values())

@@ -58,9 +58,10 @@ from fleet_slip.evaluation.single_track import (
 )
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort
+from fleet_slip.ingest.mapping import NO_WHEEL_SPEEDS, ONE_SPEED
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.prior import simulate_prior
-from fleet_slip.models.publish import recipe_of
+from fleet_slip.models.publish import assumptions_of_cohort, recipe_of
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import calibrated_cars, find_training_overlap
@@ -116,11 +117,14 @@ def evaluate_measured(
     sources = {
         name: estimator.source for fold in fitted.values() for name, estimator in fold.items()
     }
+    assumed = assumptions_of_cohort(warehouse, cohort)
+    speeds = [text for text in assumed if text in {NO_WHEEL_SPEEDS, ONE_SPEED}]
     return {
         "format": 2,
         "package_version": package_version("fleet-slip"),
         "model": versions[0].reference,
         "cohort": predicate,
+        **({"assumed": speeds} if speeds else {}),
         "vehicle": car.name if car else None,
         "parts_of": "drives" if whole_drives else "time",
         "parts": len(folds),

@@ -468,6 +468,13 @@ def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:
 ASSUMPTIONS = "assumptions"
 
 
+NO_WHEEL_SPEEDS = (
+    "no wheel speeds, so that curvature is left out; a speed of the car may replace them "
+    "(docs/real-data.md)"
+)
+ONE_SPEED = "one speed of the car replaces the wheel speeds, which thus contain no slip"
+
+
 def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     """Return the assumed values of keys that a mapping does not state, by key."""
     signals, time, sensor = mapping.signals, mapping.time, mapping.label
@@ -492,10 +499,10 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
                 "antenna at the centre of gravity (antenna_x_m, antenna_y_m)",
             ),
             (mapping.front_wheels, "both front wheels steer alike (steer_fl, steer_fr)"),
+            (not wheels and any(name in signals for name in OWN_SPEEDS), NO_WHEEL_SPEEDS),
             (
-                not wheels and any(name in signals for name in OWN_SPEEDS),
-                "no wheel speeds, so that curvature is left out; a speed of the car may replace "
-                "them (docs/real-data.md)",
+                len(wheels) > 1 and len({signals[name].column for name in wheels}) == 1,
+                ONE_SPEED,
             ),
         )
         if assumed

@@ -14,6 +14,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.signals import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
+from fleet_slip.grams.cohort import Cohort
 from fleet_slip.models.acceptance import review_challenger
 from fleet_slip.models.manifest import (
     CrossValidated,
@@ -317,18 +318,22 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
 
 def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
     """Return a manifest with the assumptions of the mappings of its drives."""
-    from fleet_slip.ingest.mapping import ASSUMPTIONS, kept_assumptions  # noqa: PLC0415 - units
-
-    if not (warehouse.root / ASSUMPTIONS).names():
-        return manifest
-    cohort = selection.cohort
-    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
-        rows = opened.label_sources(cohort.predicate)
-    mappings = {name for source, name, _ in rows if source == MEASURED and name}
-    assumed = kept_assumptions(warehouse.root, mappings)
+    assumed = assumptions_of_cohort(warehouse, selection.cohort)
     if assumed and not manifest.learned_from and selection.label_noise_deg is None:
         assumed += ("label noise unknown: it is part of the RMSE",)
     return manifest.model_copy(update={"assumed": assumed})
+
+
+def assumptions_of_cohort(warehouse: Warehouse, cohort: Cohort) -> tuple[str, ...]:
+    """Return the assumptions of the mappings of a cohort's labelled drives."""
+    from fleet_slip.ingest.mapping import ASSUMPTIONS, kept_assumptions  # noqa: PLC0415 - units
+
+    if not (warehouse.root / ASSUMPTIONS).names():
+        return ()
+    with open_grams(warehouse, cohort.feature_set, cohort.predicate) as opened:
+        rows = opened.label_sources(cohort.predicate)
+    mappings = {name for source, name, _ in rows if source == MEASURED and name}
+    return kept_assumptions(warehouse.root, mappings)
 
 
 def drives_of(selection: Selection, name: str) -> bytes:

@@ -9,7 +9,14 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError, RefusedError
-from fleet_slip.ingest.mapping import Mapping, assumptions_of, load_mapping
+from fleet_slip.ingest.columns import SignalColumn
+from fleet_slip.ingest.mapping import (
+    Mapping,
+    assumptions_of,
+    keep_assumptions,
+    load_mapping,
+)
+from fleet_slip.storage.local import LocalFolder
 from tests.support.catalog import CATALOG
 from tests.support.commands import Finished, run_on
 from tests.support.measured import DRIVE, OWN_MAPPING, SIGNALS, TIME, csv_text, own_columns
@@ -86,6 +93,20 @@ def test_show_and_exports_list_the_assumptions(
     assert fleet.maintenance.verify().damage == []
 
 
+def test_evaluate_lists_a_speed_that_replaces_the_wheels(
+    learned: tuple[Path, Finished, Finished], tmp_path: Path
+) -> None:
+    folder, _, _ = learned
+    root = shutil.copytree(folder / "root", tmp_path / "root")
+    mapping = load_mapping(str(folder / "own.toml"), CATALOG)
+    speed = SignalColumn(column="v", unit="km/h")
+    signals = {**mapping.signals, "wheel_fl": speed, "wheel_fr": speed}
+    keep_assumptions(LocalFolder(root), mapping.model_copy(update={"signals": signals}))
+    done = run_on(root, "evaluate", "golf", "--cohort", "source = 'measured'")
+    assert "assumed: one speed of the car replaces the wheel speeds" in done.stderr
+    assert "side-slip sensor" not in done.stderr
+
+
 def test_a_version_without_assumptions_is_what_it_was(
     learned: tuple[Path, Finished, Finished],
 ) -> None:
@@ -134,11 +155,16 @@ def test_a_path_that_does_not_fit_is_an_error(tmp_path: Path) -> None:
     assert "notes.csv: the path does not end as in path = '*_{}.csv'" in done.stderr
 
 
+SPEED = {"column": "v", "unit": "km/h", "radius_m": 0.3}
+
+
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
         ({"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.31}}, "wheel radius 0.31 m"),
         ({"steer": {"column": "s", "unit": "deg"}}, "both front wheels steer alike"),
+        ({"wheel_fl": SPEED, "wheel_rr": SPEED}, "one speed of the car replaces the wheel speeds"),
+        ({"vx": {"column": "v", "unit": "km/h"}}, "no wheel speeds"),
         ({}, "side-slip sensor at the centre of gravity"),
     ],
 )
