@@ -290,7 +290,13 @@ def _ask_for_open(draft: "Draft", text: str) -> str:
     say("Some keys of the draft are open. An empty answer leaves a key open.")
     for key, units in open_keys(draft, text).items():
         choices = f" in {' or '.join(units)}" if units else ""
-        answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
+        try:
+            answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
+        except typer.Abort as error:
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+            say("")
+            break  # the input has ended
         text = answer_key(text, key, answer.strip())
     return text
 

@@ -89,7 +89,7 @@ def test_lists_and_campaigns_of_a_folder_are_found_without_an_environment_variab
 ) -> None:
     first, second = fleets
     assert first.simulate("brief").drives == 1
-    with pytest.raises(ConfigError, match="nothing is called 'brief'"):
+    with pytest.raises(ConfigError, match="no file 'brief'"):
         second.simulate("brief")
     first.gram("mine")
     published = first.models.publish("few", first.cohort().select(models="few"), force=True)

@@ -52,7 +52,7 @@ def changed(name: str, old: str, new: str) -> str:
 @pytest.mark.parametrize(
     ("name", "old", "new", "complaint"),
     [
-        (SMOKE, '["waterford_hills"]', '["imola"]', "tracks: nothing is called 'imola'"),
+        (SMOKE, '["waterford_hills"]', '["imola"]', "tracks: no file 'imola'"),
         (SMOKE, "[0.7, 0.8, 0.9, 1.0]", "[0.7, -0.8]", "plan.grid.speed_factor.1"),
         (SMOKE, "adhesion = [1.0]", "adhesion = [nan]", "plan.grid.adhesion.0"),
         (SMOKE, "adhesion", "adhesoin", "plan.grid.adhesoin: unknown key"),
@@ -75,7 +75,7 @@ def changed(name: str, old: str, new: str) -> str:
         (SEDAN, "friction = 1.0", "friction = nan", "tyre.friction"),
         (SEDAN, "peak_stiffness_n = 77500", "peak_stiffness_n = 400000", "lower peak_stiffness_n"),
         ("scenarios", "", MINE + 'drive = "nominal"', "cannot be given"),
-        ("scenarios", "", MINE + 'vehicle = "bicycle"', "nothing is called 'bicycle'"),
+        ("scenarios", "", MINE + 'vehicle = "bicycle"', "no file 'bicycle'"),
         ("scenarios", "", MINE.replace("mine", "nominal"), "leads back"),
         ("scenarios", "", f"{MINE}laps = 2\n{FAILURE}", "unchanged: remove laps"),
         ("scenarios", "", MINE + FAILURE.replace('"ax"', '"vx"'), "cannot fail"),
@@ -87,7 +87,7 @@ def changed(name: str, old: str, new: str) -> str:
             "increase",
         ),
         ("campaigns", "", FURTHER + 'base = "waterford_course"', "has a base itself"),
-        ("campaigns", "", FURTHER + 'base = "nowhere"', "nothing is called 'nowhere'"),
+        ("campaigns", "", FURTHER + 'base = "nowhere"', "no file 'nowhere'"),
         ("tracks", "", track(), "segments"),
         ("tracks", "", track(segment(0, 0, length_m=0)), "segments.0.length_m"),
         ("tracks", "", track(segment(0)), "segments.0.curvature_1pm"),

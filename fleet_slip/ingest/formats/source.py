@@ -237,7 +237,8 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
     present = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
     return InputError(
-        f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {present}{more}."
+        f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {present}{more}. "
+        "Correct the mapping, or leave the file out."
     )
 
 
