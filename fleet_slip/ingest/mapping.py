@@ -409,7 +409,19 @@ class Mapping(Config):
     def formats(self) -> FileFormats:
         """The parameters to open a file."""
         zone = self.time.zone if self.time.own_clock else None
-        return FileFormats(self.csv, self.can, self.name, self._plain_numbers, zone)
+        numbers = self._compared_numbers
+        return FileFormats(self.csv, self.can, self.name, self._plain_numbers, zone, numbers)
+
+    @property
+    def _compared_numbers(self) -> dict[str, frozenset[str]]:
+        """Columns that conditions compare with numbers alone, and those of `one_of`."""
+        texts: dict[str, frozenset[str]] = {}
+        for condition in self.where:
+            if condition.column is not None:
+                texts[condition.column] = texts.get(condition.column, frozenset()).union(
+                    condition.one_of
+                )
+        return {column: names for column, names in texts.items() if all(map(is_number, names))}
 
     @property
     def _plain_numbers(self) -> PlainNumbers:

@@ -418,6 +418,21 @@ def test_a_condition_on_a_state_of_another_message_holds_by_time(
     assert (log.counts.rows_read, log.counts.rows_left_out) == (100, 100 - len(expected))
 
 
+@pytest.mark.parametrize("condition", ['one_of = ["8"]', "at_least = 8"])
+def test_a_condition_compares_the_number_of_a_state(tmp_path: Path, condition: str) -> None:
+    where = f'where = [{{ column = "Gear.GEAR", {condition} }}]\n[time]'
+    file = write_gears(tmp_path, [6] * 20 + [8] * 30)
+    log = read(file, AX_ALONE.replace("[time]", where), STATES)
+    assert log.drives["ax"].to_pylist() == list(range(40, 100))
+
+
+def test_the_name_of_a_state_precedes_its_number(tmp_path: Path) -> None:
+    where = 'where = [{ column = "Gear.GEAR", one_of = ["8"] }]\n[time]'
+    file = write_gears(tmp_path, [6] * 20 + [8] * 30)
+    log = read(file, AX_ALONE.replace("[time]", where), STATES.replace('6 "R"', '6 "8"'))
+    assert log.drives["ax"].to_pylist() == list(range(40))
+
+
 def test_a_state_as_a_signal_is_its_number(tmp_path: Path) -> None:
     text = AX_ALONE + 'gear = { column = "Gear.GEAR", unit = "1" }\n'
     gears = [6] * 20 + [8] * 20 + [3, 14, 15] + [7] * 7

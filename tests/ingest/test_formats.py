@@ -451,6 +451,8 @@ def test_a_state_of_mdf_without_a_name_is_missing(tmp_path: Path, default: bytes
     where = [{"column": "gear", "one_of": ["D"]}]
     log = read_measured(file, own_clock(signals=ax, where=where))
     assert log.counts.rows_kept in {68, 70} and log.counts.quarantined == {}
+    of_number = [{"column": "gear", "one_of": ["6"]}]
+    assert read_measured(file, own_clock(signals=ax, where=of_number)).counts.rows_kept in {68, 70}
     both = {**ax, "gear": {"column": "gear", "unit": "1"}}
     assert set(read_measured(file, own_clock(signals=both)).drives["gear"].to_pylist()) <= {
         5, 6, None,

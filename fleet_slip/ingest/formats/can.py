@@ -335,7 +335,7 @@ class CanSource(FormatSource):
                 f"mapping {formats.name!r}."
             )
         self._file, self._bus, self._spool, self._blocks = file, formats.can, Spool(), blocks
-        self._numbers_alone = formats.plain_numbers.columns
+        self._formats = formats
         self._database = parse_database(formats.can)
         self._messages = {message.name: message for message in self._database.messages}
         self._identifiers_to_keep: set[_Key] = set()
@@ -397,7 +397,11 @@ class CanSource(FormatSource):
             for column, signal in signals.items()
             if signal.choices and self._has_states(message, signal)
         }
-        names = states - self._numbers_alone
+        names = {
+            column
+            for column in states
+            if not self._formats.reads_number(column, map(str, signals[column].choices.values()))
+        }
         for times_s, payloads in frames.take(self._bus.channel, needed):
             frame = {OWN_TIME: pl.Series(times_s)}
             has_value = np.zeros(len(times_s), dtype=np.bool_)

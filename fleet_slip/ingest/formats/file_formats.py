@@ -1,6 +1,7 @@
 """The keys of a mapping that describe how a file is written: text, CAN database, time zone."""
 
 import hashlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -122,6 +123,8 @@ class FileFormats:
         Columns of text that are numbers wherever they are used.
     zone
         Time zone of clocks without one; UTC if there is none.
+    compared_numbers
+        Columns that conditions compare with numbers alone, and those of `one_of` as text.
     """
 
     csv: CsvFormat = field(default_factory=CsvFormat)
@@ -129,3 +132,11 @@ class FileFormats:
     name: str = "mapping suggest"
     plain_numbers: PlainNumbers = field(default_factory=PlainNumbers)
     zone: str | None = None
+    compared_numbers: Mapping[str, frozenset[str]] = field(default_factory=dict)
+
+    def reads_number(self, column: str, names: Iterable[str]) -> bool:
+        """Return True if the number of a named state is used, which has one of these names."""
+        if column in self.plain_numbers.columns:
+            return True
+        numbers = self.compared_numbers.get(column)
+        return numbers is not None and numbers.isdisjoint(names)

@@ -90,6 +90,13 @@ def to_physical(conversion: Any, raw: Array, *, as_numbers: bool = False) -> Arr
     return converted
 
 
+def state_names(conversion: Any) -> list[str]:
+    """Return the names of states in a conversion's table."""
+    blocks = {} if conversion is None else conversion.referenced_blocks or {}
+    texts = (text for text in blocks.values() if isinstance(text, bytes))
+    return [text.decode("utf-8", "replace") for text in texts]
+
+
 def _kind_of(conversion: Any) -> str:
     if conversion is None:
         return _NONE
@@ -158,7 +165,7 @@ class MdfSource(FormatSource):
         """Take a file opened by asammdf, and its format in the mapping."""
         self._file, self._mdf = budget.file, mdf
         self._start_s = _start_s(mdf.header, formats.zone)
-        self._numbers_alone = formats.plain_numbers.columns
+        self._formats = formats
 
     def channels(self) -> list[Channel]:
         """Return all channels but the groups' masters."""
@@ -234,8 +241,7 @@ class MdfSource(FormatSource):
             raw=True,
         )
         for signal, (name, index) in zip(signals, indices.items(), strict=True):
-            as_numbers = name in self._numbers_alone
-            signal.samples = self._physical(number, index, signal.samples, as_numbers=as_numbers)
+            signal.samples = self._physical(number, index, signal.samples, name)
         self._release()
         if len(signals[0]) < records:
             raise InputError(
@@ -245,12 +251,13 @@ class MdfSource(FormatSource):
             )
         return list(signals)
 
-    def _physical(self, number: int, index: int, raw: Any, *, as_numbers: bool = False) -> Any:
+    def _physical(self, number: int, index: int, raw: Any, column: str = "") -> Any:
         """Return the physical values of a channel, or None without any raw ones."""
         channel = self._mdf.groups[number].channels[index]
         try:
             conversion = conversion_of(channel)
             if raw is not None:
+                as_numbers = self._formats.reads_number(column, state_names(conversion))
                 return to_physical(conversion, raw, as_numbers=as_numbers)
             require_arithmetic(conversion)
         except ValueError as error:
