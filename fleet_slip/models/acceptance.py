@@ -319,13 +319,14 @@ def threshold_violations(
     """Return the thresholds that a manifest does not reach, as phrases."""
     figures, trained = manifest.cross_validation, manifest.trained_on
     violations = []
+    start = "without the filter, its" if manifest.line_remark else "its"
     if figures.correlation < thresholds.min_correlation:
         violations.append(
-            f"its correlation is {figures.correlation:.4f}, below {thresholds.min_correlation}"
+            f"{start} correlation is {figures.correlation:.4f}, below {thresholds.min_correlation}"
         )
     if figures.rmse_deg > thresholds.max_rmse_deg:
         violations.append(
-            f"its RMSE is {figures.rmse_deg:.4f} deg, above {thresholds.max_rmse_deg} deg"
+            f"{start} RMSE is {figures.rmse_deg:.4f} deg, above {thresholds.max_rmse_deg} deg"
         )
     counts = (
         (trained.drives, "drive", thresholds.min_drives),

@@ -14,6 +14,7 @@ from fleet_slip.evaluation.held_out import QUARTERS, Segments
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.models.acceptance import load_thresholds, threshold_violations
 from fleet_slip.models.manifest import LINE_ALONE
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.regression.combination import (
@@ -68,6 +69,10 @@ def test_a_version_with_a_filter_is_used_as_any_other(
     assert combination is not None
     assert combination.method != "line"
     assert combination.measures["mass_kg"] == 1480
+    strict = load_thresholds(CATALOG.configs).model_copy(update={"max_rmse_deg": 1e-6})
+    assert "without the filter, its RMSE" in str(
+        threshold_violations(strict, version.manifest, None)
+    )
     shown = done_on(smoke_copy, "show", "both").stdout
     assert "with filter" in shown
     assert "both@1: line = intercept" in shown
