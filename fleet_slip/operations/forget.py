@@ -343,8 +343,8 @@ class RetentionReport(Answer):
                 "the next forget --expired"
             )
         else:
-            kept = " with a plausible day" if self.implausible_days else ""
-            yield Remark(f"no drive{kept} is older than {self.before}")
+            limit = " with a plausible day" if self.implausible_days else ""
+            yield Remark(f"no drive{limit} is older than {self.before}")
         yield self.vacuumed.remark
 
 
@@ -387,8 +387,8 @@ def retain(
     subject = ErasureSubject("before", before.isoformat(), frozenset(implausible))
     forgotten = forget(warehouse, subject, progress=progress)
     vacuumed = vacuum(warehouse, retention.replaced_files_hours)
-    kept = [day for day in sorted(implausible) if day < before or day > today]
-    reasons = tuple(f"{day}{implausible[day]}" for day in kept)
+    spared = [day for day in sorted(implausible) if day < before or day > today]
+    reasons = tuple(f"{day}{implausible[day]}" for day in spared)
     return RetentionReport(before, forgotten, vacuumed, reasons)
 
 
