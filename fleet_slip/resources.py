@@ -110,8 +110,7 @@ class Configs:
             return file
         names = ", ".join(self.names(kind))
         raise ConfigError(
-            f"{kind}: no file {name_or_path!r}. Known: {names}; or give the path of a TOML "
-            "file."
+            f"{kind}: no file {name_or_path!r}. Known: {names}; or give the path of a TOML file."
         )
 
 

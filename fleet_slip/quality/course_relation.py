@@ -81,8 +81,8 @@ class CourseRelation:
             max_noise = MAX_EXPLAINED_NOISE_MPS
         if self.scale < CHECKS["sense of the course"].low:
             return CHECKS["sense of the course"].fault(COURSE, **scale)
-        if abs(self.scale) < CHECKS["course that stands still"].low:
-            return CHECKS["course that stands still"].fault(COURSE, **scale)
+        if abs(self.scale) < CHECKS["stuck course"].low:
+            return CHECKS["stuck course"].fault(COURSE, **scale)
         if self.noise_mps > max_noise:
             return CHECKS["noise of the course"].fault(COURSE, noise_mps=self.noise_mps)
         if not CHECKS["scale of the course"].passes(self.scale):
