@@ -44,6 +44,8 @@ def test_a_figure_is_marked_once_its_code_changes(tmp_path: Path) -> None:
     file.write_text(json.dumps({"position": 1, "title": "Rates", "figures": [figure]}))
     fresh = write_page(load_sections(tmp_path), tmp_path)
     assert "| rate | 4 rows/s | `make bench` | 2026-11-28 at abc |" in fresh
+    module.write_text('"""Text."""\n\n# a comment\nx = 1\n')
+    assert write_page(load_sections(tmp_path), tmp_path) == fresh
     module.write_text("x = 2\n")
     assert "2026-11-28 at abc, **older than the code** |" in write_page(
         load_sections(tmp_path), tmp_path
