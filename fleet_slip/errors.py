@@ -78,6 +78,10 @@ class InputError(FleetSlipError):
     exit_code = 4
 
 
+class MissingColumnError(InputError):
+    """A log file lacks a column of its mapping."""
+
+
 class RepeatedError(InputError):
     """A recording that the logs already contain."""
 

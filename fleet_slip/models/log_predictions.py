@@ -2,8 +2,9 @@
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pyarrow as pa
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize, require_extra
 from fleet_slip.columns.drive_columns import Workspace
-from fleet_slip.errors import AlarmError, DataError, InputError, UsageError
+from fleet_slip.errors import AlarmError, DataError, InputError, MissingColumnError, UsageError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.ingest.logs import log_table
@@ -21,6 +22,7 @@ from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import calibrated_cars, label_of
+from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.drive_signals import TICKS_PER_S
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.local import LocalFolder
@@ -161,22 +163,24 @@ def predict_logs(
     log_of_drive: dict[str, Path] = {}
     rejected, suspicions, alarms = 0, list[str](), list[str]()
     workspace = Workspace(predictor.plan)
+    predict_drive = partial(_predict_drive, predictor=predictor, workspace=workspace, cars=cars)
     for log in logs:
-        with open_measured(log, mapping) as stream:
-            for drive in stream.drives():
-                rows = log_table([drive], mapping)
-                label_rad, slow = label_of(mapping.signal_catalog, rows)
-                reference = np.where(slow, np.nan, label_rad)
-                prediction = _predict_drive(rows, reference, predictor, workspace, cars)
-                if prediction.drive_id in log_of_drive:
-                    raise InputError(
-                        f"{log}: the drive {prediction.drive_id} is also in "
-                        f"{log_of_drive[prediction.drive_id]}. Leave out one of them."
-                    )
-                log_of_drive[prediction.drive_id] = log
-                drives.append(prediction)
-            faults = stream.suspicions()
-        rejected += sum(stream.counts.quarantined.values())
+        try:
+            predicted, faults, unusable = _predict_log(log, mapping, predict_drive)
+        except MissingColumnError as error:
+            if not (without_label := _drop_label(mapping)):
+                raise
+            predicted, faults, unusable = _predict_log(log, without_label, predict_drive)
+            suspicions.append(f"no reference: {error}")
+        for prediction in predicted:
+            if prediction.drive_id in log_of_drive:
+                raise InputError(
+                    f"{log}: the drive {prediction.drive_id} is also in "
+                    f"{log_of_drive[prediction.drive_id]}. Leave out one of them."
+                )
+            log_of_drive[prediction.drive_id] = log
+        drives += predicted
+        rejected += unusable
         suspicions += [f"{log}: {fault}" for fault in faults]
         alarms += [f"{log}: {fault}" for fault in faults if fault.does_harm]
     predictions = Predictions(
@@ -192,6 +196,28 @@ def predict_logs(
     content = _encode(output.suffix.lower(), [drive.table for drive in drives], about)
     LocalFolder(output.parent).put(output.name, content)
     return predictions
+
+
+def _drop_label(mapping: Mapping) -> Mapping | None:
+    """Return the mapping without the label, or None if it has none."""
+    label = mapping.signal_catalog.label
+    if label not in mapping.signals:
+        return None
+    signals = {name: column for name, column in mapping.signals.items() if name != label}
+    return mapping.model_copy(update={"signals": signals})
+
+
+def _predict_log(
+    log: Path, mapping: Mapping, predict_drive: Callable[[pa.Table, FloatArray], PredictedDrive]
+) -> tuple[list[PredictedDrive], tuple[Fault, ...], int]:
+    """Predict the drives of a log; return them, the faults, and the number of unusable rows."""
+    drives = []
+    with open_measured(log, mapping) as stream:
+        for drive in stream.drives():
+            rows = log_table([drive], mapping)
+            label_rad, slow = label_of(mapping.signal_catalog, rows)
+            drives.append(predict_drive(rows, np.where(slow, np.nan, label_rad)))
+        return drives, stream.suspicions(), sum(stream.counts.quarantined.values())
 
 
 def _predict_drive(

@@ -120,3 +120,17 @@ def test_no_log_is_overwritten_and_no_drive_is_predicted_twice(own: Path, tmp_pa
     repeated = run_on(own / "data", *predict(own, output, copy))
     assert repeated.exit_code == InputError.exit_code and "is also in" in repeated.stderr
     assert not output.exists()
+
+
+def test_a_log_without_the_reference_of_its_mapping_is_predicted(own: Path, tmp_path: Path) -> None:
+    lines = (own / "log.csv").read_text().splitlines()
+    place = lines[0].split(",").index("beta")
+    rows = [",".join(c for i, c in enumerate(x.split(",")) if i != place) for x in lines]
+    (tmp_path / "plain.csv").write_text("\n".join(rows) + "\n")
+    log, mapping = str(tmp_path / "plain.csv"), str(own / "own.toml")
+    words = ("predict", "own", log, "--mapping", mapping, "--output", str(tmp_path / "b.parquet"))
+    done = done_on(own / "data", *words)
+    assert "no reference:" in done.stderr and "no column 'beta'" in done.stderr
+    frame = pl.read_parquet(tmp_path / "b.parquet")
+    assert frame["sideslip_reference_deg"].null_count() == len(frame) == 1000
+    assert frame["sideslip_estimate_deg"].null_count() < 10

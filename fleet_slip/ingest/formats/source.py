@@ -24,7 +24,7 @@ import numpy as np
 import polars as pl
 
 from fleet_slip.base import quote_name, require_extra
-from fleet_slip.errors import InputError
+from fleet_slip.errors import InputError, MissingColumnError
 
 OWN_TIME = "\0time"
 """Column of times in s, where the file has clocks of its own."""
@@ -224,7 +224,7 @@ def describe_unknown(signal: str, signals: Iterable[str]) -> str:
     return f"unknown signal {signal!r}.{hint} Known signals: {', '.join(names)}"
 
 
-def missing_column(file: object, column: str, names: Sequence[str]) -> InputError:
+def missing_column(file: object, column: str, names: Sequence[str]) -> MissingColumnError:
     """Return the error of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}
     matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
@@ -236,7 +236,7 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> InputErro
     )
     present = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
-    return InputError(
+    return MissingColumnError(
         f"{quote_name(file)}: no column {column!r}.{hint} Its columns are {present}{more}. "
         "Correct the mapping, or leave the file out."
     )
