@@ -344,4 +344,5 @@ def test_the_report_of_a_model_with_few_signals(judged: tuple[Path, Finished]) -
     page = (root / "report" / "report.html").read_text()
     assert "Measured drives with a label" in page
     assert "on the nominal drive; of model 1" in page
-    assert "lack signals of model 2, 3, 4 and 5 of Table I" in page
+    assert 'lack signals of model 2, 3, 4 and 5 of <a href="#table-1">Table I</a>' in page
+    assert 'id="table-1"' in page
