@@ -6,7 +6,7 @@ The format is that of https://openlineage.io/docs/spec/object-model, written by 
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import version as package_version
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from fleet_slip.base import require_extra
-from fleet_slip.errors import INTERRUPTED, UsageError, hide_passwords
+from fleet_slip.errors import INTERRUPTED, FleetSlipError, UsageError, hide_passwords
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.runs import LOGGER, Run
 
@@ -158,14 +158,21 @@ def _emitter(target: str) -> Callable[[Any], object]:
 
 
 def _table_versions(warehouse: "Warehouse") -> dict[str, int]:
-    """Return the versions of the tables that exist; for models, the number of versions."""
+    """Return the versions of the readable tables; for models, the number of versions.
+
+    A damaged table has none: the command itself reports the damage, and its event is sent.
+    """
+    versions: dict[str, int] = {}
     if not warehouse.root.exists():
-        return {}
-    snapshots = {table.folder.name: table.snapshot().version for table in warehouse.tables}
-    versions = {name: version for name, version in snapshots.items() if version is not None}
-    registry = Registry.open(warehouse)
-    if number := sum(len(registry.versions(name)) for name in registry.names()):
-        versions[MODELS] = number
+        return versions
+    for table in warehouse.tables:
+        with suppress(FleetSlipError):
+            if (version := table.snapshot().version) is not None:
+                versions[table.folder.name] = version
+    with suppress(FleetSlipError):
+        registry = Registry.open(warehouse)
+        if number := sum(len(registry.versions(name)) for name in registry.names()):
+            versions[MODELS] = number
     return versions
 
 

@@ -91,6 +91,16 @@ def test_a_failed_run_has_its_message_and_reads_a_version(
     assert "cannot be the name of a model" in message
 
 
+def test_a_run_on_a_damaged_table_fails_in_its_events_too(
+    run_command: RunCommand, smoke_copy: Path, tmp_path: Path
+) -> None:
+    (smoke_copy / "logs/_delta_log/00000000000000000000.json").write_text("x")
+    events = tmp_path / "events.jsonl"
+    assert run_command("--lineage", str(events), "gram").exit_code == 6
+    states = [json.loads(line)["eventType"] for line in events.read_text().splitlines()]
+    assert states == ["START", "FAIL"]
+
+
 def test_a_run_goes_on_without_the_server_and_warns(
     run_command: RunCommand, smoke_copy: Path
 ) -> None:
