@@ -7,14 +7,13 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from fleet_slip.base import Progress, Steps, no_progress, require_extra
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import current_run_id, recording
 
 if TYPE_CHECKING:
-    from fleet_slip.resources import Configs
     from fleet_slip.warehouse.warehouse import Warehouse
 
 ShowProgress = Callable[[int, int], None]
@@ -27,45 +26,6 @@ Workers = int | str | Executor | None
 """Where tasks run, with the same result: a number of threads (None: one per core), the address of a
 Dask scheduler such as `tcp://10.0.0.1:8786`, or an executor.
 """
-
-
-class CarMeasures(TypedDict, total=False):
-    """Measured vehicle data. All are optional; mass and axle distances belong together."""
-
-    mass_kg: float | None
-    """Mass of the car with its driver."""
-    front_axle_m: float | None
-    """Distance from the centre of gravity to the front axle."""
-    rear_axle_m: float | None
-    """Distance from the centre of gravity to the rear axle."""
-    track_m: float | None
-    """Track width. Default: 1.55."""
-    height_m: float | None
-    """Height of the centre of gravity. Default: 0.55."""
-    rolling_radius_m: float | None
-    """Rolling radius of the wheels. Default: 0.315."""
-    front_drive_share: float | None
-    """Share of the drive torque on the front axle, 0 to 1. Default: 1."""
-
-
-def load_measures(vehicle: str, configs: "Configs") -> CarMeasures:
-    """Read the measured data of a car: a vehicle of the configs, or a TOML file of measures.
-
-    "none" is no car. Raises `ConfigError`.
-    """
-    if vehicle == "none":
-        return CarMeasures()
-    from fleet_slip.config import load_config, load_toml
-    from fleet_slip.ingest.mapping import MeasuredVehicle
-
-    file = configs.find("vehicles", vehicle)
-    if "body" not in load_toml(file):
-        return cast(CarMeasures, load_config(file, MeasuredVehicle).measures)
-    from fleet_slip.evaluation.identify import VehicleMeasures
-    from fleet_slip.vehicle.parameters import load_vehicle
-
-    car = VehicleMeasures.of_vehicle(load_vehicle(vehicle, configs))
-    return cast(CarMeasures, car.model_dump(exclude={"name"}))
 
 
 class HasWarehouse(Protocol):

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 from fleet_slip.api.calls import (
-    CarMeasures,
     ShowProgress,
     open_workers,
     record_call,
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import IdentifiedVehicle
     from fleet_slip.evaluation.report import WrittenReport
     from fleet_slip.models.score import Score
+    from fleet_slip.vehicle.parameters import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 WATCH_PAGE = Path("watch.html")
@@ -155,10 +155,9 @@ class FleetEvaluation:
         cohort: str = TRAINING_DRIVES,
         challengers: Sequence[str | ModelVersion] = (),
         *,
-        vehicle: str | None = None,
+        vehicle: "str | VehicleMeasures | None" = None,
         include_faulty: bool = False,
         threads: int | None = None,
-        **measures: Unpack[CarMeasures],
     ) -> "Evaluation":
         """Evaluate models on measured drives with a label, beside Table I and filters.
 
@@ -173,36 +172,26 @@ class FleetEvaluation:
         cohort
             SQL predicate on the view `drives`.
         vehicle
-            A vehicle of `configs/vehicles`, or a TOML file, for filters. Without it and without
-            measures no filter is evaluated, unless a file ships for the class of the drives.
+            The car, for filters: a vehicle of `configs/vehicles`, a TOML file of a vehicle or of
+            measured data (`mass_kg`, `front_axle_m`, `rear_axle_m`), or `VehicleMeasures`. Without
+            it no filter is evaluated, unless a file ships for the class of the drives.
         include_faulty
             Include drives with faulty sensors, which `FleetModels.publish` leaves out.
-        **measures
-            Measured data of the car, as keys of `CarMeasures`, instead of `vehicle`.
 
         Raises
         ------
         DataError
             If the drives have no label.
         ConfigError
-            If there is no such vehicle.
-        UsageError
-            If the measures are impossible for a car, or `vehicle` is given as well.
+            If there is no such vehicle, or its data are impossible for a car.
         """
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
-        from fleet_slip.evaluation.identify import VehicleMeasures, measures_of
         from fleet_slip.evaluation.measured_evaluation import evaluate_measured
         from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
-        from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+        from fleet_slip.vehicle.parameters import load_car
 
         versions = self._versions(model, challengers)
-        car: VehicleParameters | VehicleMeasures | None = None
-        if vehicle:
-            car = load_vehicle(vehicle, self.warehouse.configs)
-        if any(measures.values()):
-            if car is not None:
-                raise UsageError("give a vehicle file or measurements of the car, not both.")
-            car = measures_of("measured", measures)
+        car = load_car(vehicle, self.warehouse.configs) if isinstance(vehicle, str) else vehicle
         screen = SensorScreen(cohort)
         if not include_faulty:
             screen = screen_computed_drives(self.warehouse, cohort)
@@ -234,10 +223,10 @@ class FleetEvaluation:
     def identify(
         self,
         name: str,
+        vehicle: "str | VehicleMeasures",
         cohort: str = TRAINING_DRIVES,
         *,
         threads: int | None = None,
-        **measures: Unpack[CarMeasures],
     ) -> "IdentifiedVehicle":
         """Identify the tyres and the yaw inertia of a car from labelled drives.
 
@@ -248,27 +237,33 @@ class FleetEvaluation:
         ----------
         name
             Name of the car in the result.
+        vehicle
+            Its measured data, as in `evaluate_measured`.
         cohort
             SQL predicate on the view `drives`: the drives of the car.
         threads
             Threads. None means one per core.
-        **measures
-            Measured data of the car, as keys of `CarMeasures`; mass and axle distances are
-            required.
 
         Raises
         ------
         DataError
             If the drives lack the label or a signal of the filter.
+        ConfigError
+            If there is no such vehicle, or its data are impossible for a car.
         UsageError
-            If the name or a measure is impossible for a car.
+            If the name is invalid.
         """
         from fleet_slip.catalog.features import PLAIN
         from fleet_slip.evaluation.filters import TuningDrives
-        from fleet_slip.evaluation.identify import identify_held_out, measures_of
+        from fleet_slip.evaluation.identify import identify_held_out
         from fleet_slip.grams.cohort import load_cohort
+        from fleet_slip.models.manifest import require_model_name
+        from fleet_slip.vehicle.parameters import load_measures
 
-        car = measures_of(name, measures)
+        require_model_name(name)
+        if isinstance(vehicle, str):
+            vehicle = load_measures(vehicle, self.warehouse.configs)
+        car = vehicle.model_copy(update={"name": name})
         rows = load_cohort(self.warehouse, cohort, PLAIN)
         chosen = TuningDrives.choose(self.warehouse, rows, with_mass=False)
         with open_workers(self.warehouse.root, threads) as executor:

@@ -12,7 +12,6 @@ from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from fleet_slip.api.calls import CarMeasures
     from fleet_slip.api.fleet_cohort import FleetCohort
     from fleet_slip.export.program import Target
     from fleet_slip.export.stepping import Estimator
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
     from fleet_slip.models.select import Selection
+    from fleet_slip.vehicle.parameters import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -80,7 +80,7 @@ class FleetModels:
         *,
         force: bool = False,
         candidate: bool = False,
-        with_filter: "CarMeasures | None" = None,
+        with_filter: "str | VehicleMeasures | None" = None,
     ) -> "Publication":
         """Publish the winner of a selection as the next version of a model, and its champion.
 
@@ -97,9 +97,9 @@ class FleetModels:
             Publish as a candidate, which becomes champion by `promote`. A winner also becomes a
             candidate while the champion is pinned.
         with_filter
-            Measured data of the car: mass and axle distances at least. The model is combined with
-            an extended Kalman filter in the car, which is identified from the drives, where that
-            is better in cross-validation. Empty: without a filter. Default: as the champion.
+            A car, as in `FleetEvaluation.evaluate_measured`. The model is combined with an extended
+            Kalman filter in it, which is identified from the drives, where that is better in
+            cross-validation. `none`: without a filter. Default: as the champion.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class FleetModels:
         *,
         force: bool = False,
         candidate: bool = False,
-        with_filter: "CarMeasures | None" = None,
+        with_filter: "str | VehicleMeasures | None" = None,
     ) -> "DryRun":
         """Return what `publish` with these arguments would do, also a refusal; write nothing."""
         from fleet_slip.models.publish import DryRun, build_challenger, would_publish
@@ -142,23 +142,24 @@ class FleetModels:
             return DryRun(name, False, str(error), refused=True)
 
     def _with_filter(
-        self, manifest: "Manifest", selection: "Selection", measures: "CarMeasures | None"
+        self,
+        manifest: "Manifest",
+        selection: "Selection",
+        car: "str | VehicleMeasures | None",
     ) -> "Manifest":
-        """Combine a model with a filter in the car of the measures, else in the champion's car."""
+        """Combine a model with a filter in a car, by default the champion's."""
         champion = self.registry.champion(manifest.name)
-        previous = champion.manifest.combination if champion else None
-        numbers: dict[str, object] = dict(previous.measures) if previous else {}
-        if measures is not None:
-            numbers = {**measures}
-        if not numbers:
+        if car is None and champion and champion.manifest.combination:
+            car = champion.manifest.combination.measures
+        if car in (None, "none"):
             return manifest
         from fleet_slip.api.calls import open_workers
         from fleet_slip.evaluation.filter_column import with_filter
-        from fleet_slip.evaluation.identify import measures_of
+        from fleet_slip.vehicle.parameters import load_measures
 
-        car = measures_of("car", numbers)
+        measures = load_measures(car, self.warehouse.configs) if isinstance(car, str) else car
         with open_workers(self.warehouse.root, None) as executor:
-            return with_filter(self.warehouse, manifest, selection, car, executor)
+            return with_filter(self.warehouse, manifest, selection, measures, executor)
 
     def _selection(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
         """Return a selection, by the recipe of the model if none is given."""

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.api.calls import ShowStep, Workers, step_progress
 from fleet_slip.base import pluralize
@@ -37,7 +37,6 @@ from fleet_slip.warehouse.predicate import hash_drive
 from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
 
 if TYPE_CHECKING:
-    from fleet_slip.api.calls import CarMeasures
     from fleet_slip.api.fleet import Fleet
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.logs import IngestReport
@@ -47,6 +46,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.quality_report import SensorFault
     from fleet_slip.simulation.simulate import SimulationReport
+    from fleet_slip.vehicle.parameters import VehicleMeasures
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Training:
     models: str
     tolerance: str | None = None
     label: "Label | None" = None
-    vehicle: "dict[str, float | None] | None" = None
+    vehicle: "VehicleMeasures | None" = None
     """Measured data of the car: the model is combined with a filter in it."""
 
     @classmethod
@@ -69,8 +69,7 @@ class Training:
         """
         cohort, label = f"campaign = '{mapping.name}'", mapping.signal_catalog.label
         if label in mapping.signal_names:
-            vehicle = mapping.vehicle.measures if mapping.vehicle else None
-            return cls(name, cohort, DEFAULT_MODELS, vehicle=vehicle)
+            return cls(name, cohort, DEFAULT_MODELS, vehicle=mapping.vehicle)
         if COURSE not in mapping.signals:
             raise ConfigError(
                 f"mapping {mapping.name!r}: nothing to learn from. Map {label} (the angle of a "
@@ -110,7 +109,8 @@ class Training:
         manifest = champion.manifest
         if not is_current(manifest, fleet.warehouse, self.cohort, self.models, self.tolerance):
             return None
-        if self.vehicle and not (manifest.combination and manifest.combination.is_of(self.vehicle)):
+        combination = manifest.combination
+        if self.vehicle and (combination is None or combination.measures != self.vehicle):
             return None
         return Publication(champion, False, "The champion was trained with the same data and list.")
 
@@ -153,10 +153,7 @@ class Training:
         )
         try:
             published = fleet.models.publish(
-                self.name,
-                selection,
-                force=force,
-                with_filter=cast("CarMeasures | None", self.vehicle),
+                self.name, selection, force=force, with_filter=self.vehicle
             )
         except RefusedError as error:
             return None, str(error)

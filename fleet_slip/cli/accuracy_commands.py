@@ -7,7 +7,6 @@ from typing import Annotated
 
 from typer import Argument, Context, Option
 
-from fleet_slip.api.calls import CarMeasures
 from fleet_slip.base import require_extra
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
@@ -87,17 +86,7 @@ def evaluate(
         ),
     ] = None,
     include_faulty: opt.IncludeFaulty = False,
-    vehicle: Annotated[
-        str | None,
-        Option(help="With --cohort: vehicle file for filters, instead of --mass and axles."),
-    ] = None,
-    mass: opt.Mass = None,
-    front_axle: opt.FrontAxle = None,
-    rear_axle: opt.RearAxle = None,
-    track_width: opt.TrackWidth = None,
-    height: opt.Height = None,
-    radius: opt.Radius = None,
-    front_drive: opt.FrontDrive = None,
+    vehicle: opt.Vehicle = None,
     threads: opt.Threads = None,
     everything: Annotated[
         bool, Option("--all", help="Print the errors of all estimators on every drive.")
@@ -112,20 +101,10 @@ def evaluate(
 
     Example: fleet-slip evaluate waterford --scenario nominal
     """
-    measures = CarMeasures(
-        mass_kg=mass,
-        front_axle_m=front_axle,
-        rear_axle_m=rear_axle,
-        track_m=track_width,
-        height_m=height,
-        rolling_radius_m=radius,
-        front_drive_share=front_drive,
-    )
-    has_car = vehicle or any(measures.values())
-    if (cohort is None and has_car) or (cohort is not None and (scenario or blind)):
+    if (cohort is None and vehicle) or (cohort is not None and (scenario or blind)):
         raise UsageError(
-            "--cohort evaluates on measured drives, with filters in the car of --vehicle or "
-            "--mass: leave out --scenario and --blind, and name a cohort."
+            "--cohort evaluates on measured drives, with filters in the car of --vehicle: leave "
+            "out --scenario and --blind, and name a cohort."
         )
     if blind and scenario:
         raise UsageError("--blind has drives of its own: leave out --scenario.")
@@ -141,7 +120,6 @@ def evaluate(
             vehicle=vehicle,
             include_faulty=include_faulty,
             threads=threads,
-            **measures,
         )
     else:
         with progress("simulate scenarios") as show:
@@ -154,14 +132,14 @@ def evaluate(
 def identify(
     context: Context,
     name: Annotated[str, Argument(help="Name of the car.")],
+    vehicle: Annotated[
+        str,
+        Option(
+            help="Measured data of the car: a TOML file with mass_kg, front_axle_m and "
+            "rear_axle_m, optionally track_m, height_m, rolling_radius_m and front_drive_share."
+        ),
+    ],
     cohort: opt.Cohort = TRAINING_DRIVES,
-    mass: opt.Mass = None,
-    front_axle: opt.FrontAxle = None,
-    rear_axle: opt.RearAxle = None,
-    track_width: opt.TrackWidth = None,
-    height: opt.Height = None,
-    radius: opt.Radius = None,
-    front_drive: opt.FrontDrive = None,
     threads: opt.Threads = None,
     output: Annotated[Path | None, Option(help="Vehicle file to write.")] = None,
     campaign: Annotated[
@@ -175,19 +153,13 @@ def identify(
     the label. The result contains its error on drives that were left out. A logged steering wheel
     angle suffices where no road wheel angle is logged.
 
-    Example: fleet-slip identify hatchback --mass 1776 --front-axle 1.19 --rear-axle 1.44
+    Example: fleet-slip identify hatchback --vehicle measures.toml --output hatchback.toml
     """
     car = fleet_of(context).evaluation.identify(
         name,
+        vehicle,
         cohort,
         threads=threads,
-        mass_kg=mass,
-        front_axle_m=front_axle,
-        rear_axle_m=rear_axle,
-        track_m=track_width,
-        height_m=height,
-        rolling_radius_m=radius,
-        front_drive_share=front_drive,
     )
     print_answer(car, json)
     train = f". Train with it: fleet-slip publish NAME --prior {campaign}"

@@ -223,12 +223,10 @@ Prior = Annotated[
     ),
 ]
 
-# Measured data of a car.
-
-Mass = Annotated[float | None, Option(help="Mass of the car with its driver, kg.")]
-FrontAxle = Annotated[float | None, Option(help="Centre of gravity to front axle, m.")]
-RearAxle = Annotated[float | None, Option(help="Centre of gravity to rear axle, m.")]
-TrackWidth = Annotated[float | None, Option(help="Track width, m. Default: 1.55.")]
-Height = Annotated[float | None, Option(help="Height of the centre of gravity, m. Default: 0.55.")]
-Radius = Annotated[float | None, Option(help="Rolling radius of the wheels, m. Default: 0.315.")]
-FrontDrive = Annotated[float | None, Option(help="Share of torque on the front axle. Default: 1.")]
+Vehicle = Annotated[
+    str | None,
+    Option(
+        help="The car, for filters: a vehicle of configs/vehicles, or a TOML file with mass_kg, "
+        "front_axle_m and rear_axle_m."
+    ),
+]

@@ -131,7 +131,6 @@ def publish(
 
     Example: fleet-slip publish wet --cohort "adhesion < 0.8"
     """
-    from fleet_slip.api.calls import load_measures
     from fleet_slip.models.manifest import require_model_name
     from fleet_slip.models.publish import DryRun, Publication, recipe_for
     from fleet_slip.models.request import SelectionRequest
@@ -147,9 +146,8 @@ def publish(
     with step("select"):
         selection = drives.run_request(recipe.request, nested=True)
     publish_or_preview = fleet.models.preview if dry_run else fleet.models.publish
-    car = load_measures(with_filter, fleet.warehouse.configs) if with_filter else None
     answer: DryRun | Publication = publish_or_preview(
-        name, selection, force=force, candidate=candidate, with_filter=car
+        name, selection, force=force, candidate=candidate, with_filter=with_filter
     )
     if json:
         if selection.examined:

@@ -22,7 +22,7 @@ from fleet_slip.evaluation.held_out import (
     folds_by_kind,
     predict_drive,
 )
-from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures, identify
+from fleet_slip.evaluation.identify import IdentifiedVehicle, identify
 from fleet_slip.evaluation.single_track import LabelledDrive, hold_last
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort
@@ -33,6 +33,7 @@ from fleet_slip.regression.combination import (
     choose_combination,
 )
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
+from fleet_slip.vehicle.parameters import VehicleMeasures
 
 MAX_GROUPS = 4
 """Inner groups of drives, each held out in turn."""

@@ -145,8 +145,8 @@ def _measured_tables(content: Mapping[str, Any]) -> Iterator[Part]:
     )
     if content["vehicle"] is None:
         yield (
-            "No filter was evaluated, because no vehicle is known. Give --mass, --front-axle and "
-            "--rear-axle, or a vehicle file with --vehicle."
+            "No filter was evaluated, because no vehicle is known. Give --vehicle, a "
+            "file with mass_kg, front_axle_m and rear_axle_m, or a vehicle of configs/vehicles."
         )
 
 

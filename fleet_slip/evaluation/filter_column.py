@@ -22,13 +22,14 @@ from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.combined import LATERAL_ROWS, CombinedEstimate, combine
 from fleet_slip.evaluation.evaluator import MissingSignalError
 from fleet_slip.evaluation.held_out import HeldOutDrive, Learner, read_measured_drives
-from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures
+from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.score import calibrated_cars
 from fleet_slip.models.select import Selection
 from fleet_slip.regression.combination import CLIP_STD
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 
 COUNT_RAD = Fraction(1, 2**16)
@@ -128,10 +129,9 @@ def with_filter(
     lack what the filter needs, the line stays alone, with the reason.
     """
     predicate = selection.cohort.predicate.text
-    numbers = measures.model_dump(exclude={"name"})
     try:
         drives = [
-            prepare_drive(drive, measures.vehicle())
+            prepare_drive(drive, vehicle_with_fit(measures))
             for drive in read_measured_drives(warehouse, load_cohort(warehouse, predicate))
         ]
         learner = Learner.prepare(warehouse, selection.request, predicate, drives)
@@ -148,7 +148,7 @@ def with_filter(
         observer = observer_of_drives(combined.vehicle, warehouse.catalog.signals, drives)
     except (DataError, QuestionError) as error:
         combination = CombinedWithFilter(
-            method="line", rmse_deg={}, worst_rmse_deg={}, groups=0, measures=numbers,
+            method="line", rmse_deg={}, worst_rmse_deg={}, groups=0, measures=measures,
             reason=str(error),
         )  # fmt: skip
         return manifest.model_copy(update={"combination": combination})
@@ -161,7 +161,7 @@ def with_filter(
         rmse_deg={name: math.degrees(rad) for name, rad in choice.rmse_rad.items()},
         worst_rmse_deg={name: math.degrees(rad) for name, rad in choice.worst_rmse_rad.items()},
         groups=choice.groups,
-        measures=numbers,
+        measures=measures,
     )
     return manifest.model_copy(update={"combination": combination})
 

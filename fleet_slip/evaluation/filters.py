@@ -22,7 +22,7 @@ from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.evaluator import Estimator
-from fleet_slip.evaluation.identify import IdentifiedVehicle, VehicleMeasures, identify
+from fleet_slip.evaluation.identify import IdentifiedVehicle, identify
 from fleet_slip.evaluation.single_track import (
     DriveSignals,
     LabelledDrive,
@@ -40,7 +40,7 @@ from fleet_slip.resources import Configs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 

@@ -15,13 +15,11 @@ from functools import partial
 from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.signals import Identifier
-from fleet_slip.config import Config, faults_of
-from fleet_slip.errors import UsageError
+from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.single_track import (
     STEP_S,
@@ -38,7 +36,7 @@ from fleet_slip.evaluation.tuning import (
     value_of,
 )
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleMeasures, VehicleParameters
 
 IDENTIFIED = "Identified from labelled drives"
 """Description of an identified vehicle."""
@@ -68,95 +66,59 @@ class FitParameters(Config):
 DEFAULT_FIT = FitParameters()
 
 
-class VehicleMeasures(Config):
-    """Measured vehicle data. SI units."""
-
-    name: Identifier
-    mass_kg: FiniteFloat = Field(gt=0)
-    """Total mass, with the driver."""
-    front_axle_m: FiniteFloat = Field(gt=0)
-    """Distance of the front axle from the centre of gravity."""
-    rear_axle_m: FiniteFloat = Field(gt=0)
-    track_m: FiniteFloat = Field(default=1.55, gt=0)
-    height_m: FiniteFloat = Field(default=0.55, gt=0)
-    """Height of the centre of gravity above the road."""
-    rolling_radius_m: FiniteFloat = Field(default=0.315, gt=0)
-    front_drive_share: FiniteFloat = Field(default=1.0, ge=0, le=1)
-
-    @classmethod
-    def of_vehicle(cls, car: VehicleParameters) -> Self:
-        """Return the measures of a vehicle."""
-        return cls(
-            name=car.name,
-            mass_kg=car.body.mass_kg,
-            front_axle_m=car.body.front_axle_m,
-            rear_axle_m=car.body.rear_axle_m,
-            track_m=(car.body.track_front_m + car.body.track_rear_m) / 2,
-            height_m=car.body.height_m,
-            rolling_radius_m=car.tyre.rolling_radius_m,
-            front_drive_share=car.drivetrain.front_drive_share,
-        )
-
-    def vehicle(self, fit: FitParameters = DEFAULT_FIT) -> VehicleParameters:
-        """Return the vehicle with fitted parameters."""
-        sprung_kg = (1 - UNSPRUNG_SHARE) * self.mass_kg
-        wheel_n = self.mass_kg * GRAVITY_MPS2 / 4
-        content = {
-            "name": self.name,
-            "description": IDENTIFIED,
-            "body": {
-                "sprung_mass_kg": sprung_kg,
-                "unsprung_mass_front_kg": (self.mass_kg - sprung_kg) / 2,
-                "unsprung_mass_rear_kg": (self.mass_kg - sprung_kg) / 2,
-                "sprung_yaw_inertia_kgm2": (
-                    fit.yaw_inertia * sprung_kg * self.front_axle_m * self.rear_axle_m
-                ),
-                "front_axle_m": self.front_axle_m,
-                "rear_axle_m": self.rear_axle_m,
-                "height_m": self.height_m,
-                "track_front_m": self.track_m,
-                "track_rear_m": self.track_m,
-            },
-            "suspension": {
-                "front_roll_share": fit.front_roll_share,
-                "roll_lag_s": 0.12,
-                "pitch_lag_s": 0.12,
-                "front_stiffness_factor": fit.stiffness_front,
-                "rear_stiffness_factor": fit.stiffness_rear,
-            },
-            "tyre": {
-                "rolling_radius_m": self.rolling_radius_m,
-                "spin_inertia_kgm2": 1.1,
-                # A tyre is stiffest at twice its load at rest, where it has 5/4 of this stiffness.
-                "peak_stiffness_n": 1.25 * STIFFNESS_PER_LOAD * wheel_n,
-                "peak_stiffness_load_n": 2 * wheel_n,
-                "longitudinal_stiffness_ratio": 1.3,
-                "friction": fit.friction,
-                "nominal_load_n": wheel_n,
-                "friction_load_sensitivity": 0.1,
-                "friction_decay_speed_mps": 60.0,
-                "rolling_resistance": 0.012,
-            },
-            "steering": {"ratio": fit.steering_ratio, "lag_s": 0.05, "limit_rad": 8.7},
-            "drivetrain": {
-                "front_drive_share": self.front_drive_share,
-                "front_brake_share": 0.7,
-                "lag_s": 0.1,
-                "power_w": 100_000.0,
-                "slip_control": 0.05,
-            },
-            "aerodynamics": {"drag_area_m2": 0.65},
-        }
-        return VehicleParameters.model_validate(content)
-
-
-def measures_of(name: str, measures: Mapping[str, object]) -> VehicleMeasures:
-    """Return the measures of a vehicle by name. Raises `UsageError` for impossible ones."""
-    values = {key: value for key, value in measures.items() if value is not None}
-    try:
-        return VehicleMeasures.model_validate({"name": name, **values})
-    except ValidationError as error:
-        raise UsageError(f"measures of the car: {faults_of(error)}.") from None
+def vehicle_with_fit(
+    measures: VehicleMeasures, fit: FitParameters = DEFAULT_FIT
+) -> VehicleParameters:
+    """Return the vehicle of these measures with fitted parameters."""
+    sprung_kg = (1 - UNSPRUNG_SHARE) * measures.mass_kg
+    wheel_n = measures.mass_kg * GRAVITY_MPS2 / 4
+    content = {
+        "name": measures.name,
+        "description": IDENTIFIED,
+        "body": {
+            "sprung_mass_kg": sprung_kg,
+            "unsprung_mass_front_kg": (measures.mass_kg - sprung_kg) / 2,
+            "unsprung_mass_rear_kg": (measures.mass_kg - sprung_kg) / 2,
+            "sprung_yaw_inertia_kgm2": (
+                fit.yaw_inertia * sprung_kg * measures.front_axle_m * measures.rear_axle_m
+            ),
+            "front_axle_m": measures.front_axle_m,
+            "rear_axle_m": measures.rear_axle_m,
+            "height_m": measures.height_m,
+            "track_front_m": measures.track_m,
+            "track_rear_m": measures.track_m,
+        },
+        "suspension": {
+            "front_roll_share": fit.front_roll_share,
+            "roll_lag_s": 0.12,
+            "pitch_lag_s": 0.12,
+            "front_stiffness_factor": fit.stiffness_front,
+            "rear_stiffness_factor": fit.stiffness_rear,
+        },
+        "tyre": {
+            "rolling_radius_m": measures.rolling_radius_m,
+            "spin_inertia_kgm2": 1.1,
+            # A tyre is stiffest at twice its load at rest, where it has 5/4 of this stiffness.
+            "peak_stiffness_n": 1.25 * STIFFNESS_PER_LOAD * wheel_n,
+            "peak_stiffness_load_n": 2 * wheel_n,
+            "longitudinal_stiffness_ratio": 1.3,
+            "friction": fit.friction,
+            "nominal_load_n": wheel_n,
+            "friction_load_sensitivity": 0.1,
+            "friction_decay_speed_mps": 60.0,
+            "rolling_resistance": 0.012,
+        },
+        "steering": {"ratio": fit.steering_ratio, "lag_s": 0.05, "limit_rad": 8.7},
+        "drivetrain": {
+            "front_drive_share": measures.front_drive_share,
+            "front_brake_share": 0.7,
+            "lag_s": 0.1,
+            "power_w": 100_000.0,
+            "slip_control": 0.05,
+        },
+        "aerodynamics": {"drag_area_m2": 0.65},
+    }
+    return VehicleParameters.model_validate(content)
 
 
 @dataclass(frozen=True)
@@ -361,13 +323,13 @@ def identify(
     has_road_wheels = any(drive.signals.has_road_wheels for drive in drives)
     unused = "steering_ratio" if has_road_wheels else "noise.sensors.steer_gain"
     names = [name for name in (*PRIOR_STD, *NOISE_NAMES) if name != unused]
-    sensors = fit_accelerometer(drives, measures.vehicle())
+    sensors = fit_accelerometer(drives, vehicle_with_fit(measures))
     usual = FitParameters(noise=ekf.EkfNoise(sensors=sensors or ekf.SensorErrors()))
     coordinates = Coordinates(usual, names)
     prior_std = np.array([PRIOR_STD.get(name, NOISE_PRIOR_STD) for name in names])
 
     def estimate(fit: FitParameters, drive: LabelledDrive) -> FloatArray:
-        return ekf.estimate(drive.signals, measures.vehicle(fit), fit.noise)
+        return ekf.estimate(drive.signals, vehicle_with_fit(measures, fit), fit.noise)
 
     def residuals(x: FloatArray) -> FloatArray:
         estimates = executor.map(partial(estimate, coordinates.parameters(x)), drives)
@@ -400,7 +362,7 @@ def identify(
     if sensors is None:
         unknown += [f"noise.sensors.{name}" for name in ACCELEROMETER]
     return IdentifiedVehicle(
-        measures.vehicle(fit),
+        vehicle_with_fit(measures, fit),
         fit.noise,
         rmse_rad(partial(estimate, fit), drives, executor),
         drives=len(drives),

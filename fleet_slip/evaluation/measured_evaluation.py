@@ -41,13 +41,7 @@ from fleet_slip.evaluation.held_out import (
     predict_drive,
     read_measured_drives,
 )
-from fleet_slip.evaluation.identify import (
-    IDENTIFIED,
-    IdentifiedVehicle,
-    VehicleMeasures,
-    identify,
-    measures_of,
-)
+from fleet_slip.evaluation.identify import IDENTIFIED, IdentifiedVehicle, identify, vehicle_with_fit
 from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
 from fleet_slip.evaluation.single_track import (
     STEP_S,
@@ -68,7 +62,7 @@ from fleet_slip.models.score import calibrated_cars, find_training_overlap
 from fleet_slip.models.summary import group_reasons
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
 
 FITTED = "fitted without held-out rows"
@@ -92,7 +86,8 @@ def evaluate_measured(
     drives = read_measured_drives(warehouse, cohort)
     car = car or class_car(cohort.drives["vehicle_model"][0].as_py(), None, warehouse.configs)
     car = car or next(filter(None, map(identified_prior, map(prior_of, versions))), None)
-    car = car or next(filter(None, map(measures_with_filter, versions)), None)
+    combinations = (version.manifest.combination for version in versions)
+    car = car or next((filtered.measures for filtered in combinations if filtered), None)
     competition = Competition.collect(warehouse, versions, predicate, drives, car, executor)
     folds, kinds = folds_of(drives), folds_by_kind(drives)
     fitted = {
@@ -260,7 +255,7 @@ class Competition:
         measured = VehicleMeasures.of_vehicle(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if is_calibrated else {}
         if measured is not None:
-            drives = [prepare_drive(drive, measured.vehicle()) for drive in drives]
+            drives = [prepare_drive(drive, vehicle_with_fit(measured)) for drive in drives]
         combined = frozenset(v.reference for v in versions if v.manifest.combination)
         return cls(
             catalog, drives, published, learners, vehicle, measured, cars, executor, combined
@@ -360,7 +355,7 @@ class Competition:
         """Tune filters in the car of the file and in the identified car."""
         if self.measured is None:
             return {}
-        rolling = on_signals(rolling_sideslip, self.measured.vehicle())
+        rolling = on_signals(rolling_sideslip, vehicle_with_fit(self.measured))
         fitted = {"kinematic": FittedEstimator("geometry", rolling)}
         cars: dict[str, tuple[str, VehicleParameters]] = {}
         if self.vehicle and (identified is None or self.vehicle.description != IDENTIFIED):
@@ -387,12 +382,6 @@ class Competition:
                 content = tuned.model_dump(mode="json")
                 fitted[name] = FittedEstimator(f"{source}, tuned on labels", estimate, content)
         return fitted
-
-
-def measures_with_filter(version: ModelVersion) -> VehicleMeasures | None:
-    """Return the measures of the car of a version's filter; None without a filter."""
-    combination = version.manifest.combination
-    return measures_of("car", combination.measures) if combination else None
 
 
 def prior_of(version: ModelVersion) -> Campaign | None:

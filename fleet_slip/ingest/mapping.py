@@ -53,6 +53,7 @@ from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.quality.drive_signals import OWN_SPEEDS, RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
+from fleet_slip.vehicle.parameters import VehicleMeasures
 
 FRONT_WHEELS = ("steer_fl", "steer_fr")
 MAX_CONDITIONS = 64
@@ -243,25 +244,6 @@ class FilePattern(Config):
         return Path(*file.parts[: -len(components)]), "".join(map(str, matches))
 
 
-class MeasuredVehicle(Config):
-    """Measured data of the car, for a filter beside the model: `fleet-slip learn`."""
-
-    mass_kg: PositiveFloat
-    """Mass of the car with its driver."""
-    front_axle_m: PositiveFloat
-    """Distance from the centre of gravity to the front axle."""
-    rear_axle_m: PositiveFloat
-    track_m: PositiveFloat | None = None
-    height_m: PositiveFloat | None = None
-    rolling_radius_m: PositiveFloat | None = None
-    front_drive_share: Annotated[float, Field(ge=0, le=1)] | None = None
-
-    @property
-    def measures(self) -> dict[str, float | None]:
-        """The measures by name."""
-        return self.model_dump()
-
-
 class Mapping(Config):
     """How one kind of measured file becomes drives. Identifies itself by `name`.
 
@@ -283,7 +265,8 @@ class Mapping(Config):
     ]
     label: LabelSensor | None = added(None)
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
-    vehicle: MeasuredVehicle | None = added(None)
+    vehicle: VehicleMeasures | None = added(None)
+    """Measured data of the car, for a filter beside the model: `fleet-slip learn`."""
     """Measured data of the car, which no drive depends on."""
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
     """Conditions on rows. A row that misses one is skipped and counted."""

@@ -5,7 +5,6 @@ A manifest may come from anywhere: texts and numbers are bounded, and SQL in it 
 
 import math
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -40,6 +39,7 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
+from fleet_slip.vehicle.parameters import VehicleMeasures
 
 if TYPE_CHECKING:
     from fleet_slip.arrays import BoolArray, Hashes
@@ -312,7 +312,7 @@ class CombinedWithFilter(Config):
     rmse_deg: dict[Identifier, NotNegative]
     worst_rmse_deg: dict[Identifier, NotNegative]
     groups: Count
-    measures: dict[Identifier, FiniteFloat]
+    measures: VehicleMeasures
     reason: Annotated[str, Field(max_length=2000, exclude_if=lambda text: not text)] = ""
     """Why there is no filter."""
 
@@ -323,11 +323,6 @@ class CombinedWithFilter(Config):
         if self.term and not isinstance(self._content, Blend):
             raise ValueError("its column does not contain a filter")
         return self
-
-    def is_of(self, measures: Mapping[str, Any]) -> bool:
-        """Return True if the car has these measures, apart from those that are None."""
-        stated = {name: value for name, value in measures.items() if value is not None}
-        return stated.items() <= self.measures.items()
 
     @property
     def _content(self) -> Made | None:

@@ -362,13 +362,14 @@ def test_no_night_moves_a_champion_that_was_pinned_or_rolled_back(
     assert not night.json["candidate"]
 
 
-CAR = ("--mass", "1480", "--front-axle", "1.11", "--rear-axle", "1.67", "--radius", "0.325")
+CAR = "mass_kg = 1480\nfront_axle_m = 1.11\nrear_axle_m = 1.67\nrolling_radius_m = 0.325\n"
 
 
 def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    some = ("--cohort", "drive_id < 'smoke-2024-05-01-0002'")
-    done = run_on(smoke_root, "identify", "mine", *CAR, *some, "--output", str(file), "--json")
+    measures, file = tmp_path / "measures.toml", tmp_path / "mine.toml"
+    measures.write_text(CAR)
+    some = ("--vehicle", str(measures), "--cohort", "drive_id < 'smoke-2024-05-01-0002'")
+    done = run_on(smoke_root, "identify", "mine", *some, "--output", str(file), "--json")
     assert done.exit_code == 0, done.stderr
     found = json.loads(done.stdout)
     assert (found["name"], found["drives"]) == ("mine", 2)
@@ -379,19 +380,27 @@ def test_a_car_is_identified_and_its_file_is_a_vehicle(smoke_root: Path, tmp_pat
 
 
 def test_a_car_without_labelled_drives_cannot_be_identified(smoke_root: Path) -> None:
-    done = run_on(smoke_root, "identify", "mine", *CAR, "--cohort", "drive_id = 'none'")
+    words = ("--vehicle", "suv", "--cohort", "drive_id = 'none'")
+    done = run_on(smoke_root, "identify", "mine", *words)
     assert done.exit_code == 5
     assert "none" in done.stderr
 
 
 @pytest.mark.parametrize(
-    ("words", "told"), [(("Golf", *CAR), "name: "), (("mine", *CAR, "--mass", "inf"), "mass_kg: ")]
+    ("name", "content", "exit_code", "problem"),
+    [
+        ("Golf", CAR, 2, "cannot be the name"),
+        ("mine", CAR.replace("1480", "inf"), 3, "mass_kg: must be a finite number"),
+        ("mine", CAR.replace("mass_kg", "mass"), 3, "mass_kg: is missing; mass: unknown key"),
+    ],
 )
-def test_what_no_car_can_have_is_a_wrong_use(
-    words: tuple[str, ...], told: str, smoke_root: Path
+def test_measures_that_no_car_has_are_refused(
+    name: str, content: str, exit_code: int, problem: str, smoke_root: Path, tmp_path: Path
 ) -> None:
-    done = run_on(smoke_root, "identify", *words)
-    assert (done.exit_code, told in done.stderr) == (2, True), done.stderr
+    file = tmp_path / "measures.toml"
+    file.write_text(content)
+    done = run_on(smoke_root, "identify", name, "--vehicle", str(file))
+    assert (done.exit_code, problem in done.stderr) == (exit_code, True), done.stderr
 
 
 @pytest.fixture(scope="module")

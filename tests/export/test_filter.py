@@ -23,7 +23,7 @@ from fleet_slip.evaluation.identify import (
     PRIOR_STD,
     FitParameters,
     IdentifiedVehicle,
-    VehicleMeasures,
+    vehicle_with_fit,
 )
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.evaluation.tuning import Coordinates
@@ -40,6 +40,7 @@ from fleet_slip.export.program import UNKNOWN_CAR, Program
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.export import plain
 from tests.export.compiled import SANITIZED, build_driver, can_sanitize, drive, needs_cc
 from tests.export.engines import in_si, open_session, run_drives
@@ -56,19 +57,19 @@ WITHOUT_AX = [name for name in SIGNALS.signals if name != "ax"]
 
 OBSERVERS: dict[str, Observer] = {
     "rear": observer_of(
-        IdentifiedVehicle(CAR.vehicle(), ekf.EkfNoise(), 0.0), SIGNALS, SIGNALS.signals,
+        IdentifiedVehicle(vehicle_with_fit(CAR), ekf.EkfNoise(), 0.0), SIGNALS, SIGNALS.signals,
         one_speed=False,
     ),
     "front": observer_of(
-        IdentifiedVehicle(FRONT.vehicle(), ekf.EkfNoise(), 0.0), SIGNALS, SIGNALS.signals,
+        IdentifiedVehicle(vehicle_with_fit(FRONT), ekf.EkfNoise(), 0.0), SIGNALS, SIGNALS.signals,
         one_speed=False,
     ),
     "one_speed": observer_of(
-        IdentifiedVehicle(CAR.vehicle(), ekf.EkfNoise(), 0.0), SIGNALS, WITHOUT_STEER,
+        IdentifiedVehicle(vehicle_with_fit(CAR), ekf.EkfNoise(), 0.0), SIGNALS, WITHOUT_STEER,
         one_speed=True,
     ),
     "no_ax": observer_of(
-        IdentifiedVehicle(CAR.vehicle(), ekf.EkfNoise(), 0.0), SIGNALS, WITHOUT_AX,
+        IdentifiedVehicle(vehicle_with_fit(CAR), ekf.EkfNoise(), 0.0), SIGNALS, WITHOUT_AX,
         one_speed=True,
     ),
 }  # fmt: skip
@@ -123,7 +124,7 @@ def model_with(blend: Blend, name: str = "sideslip") -> Manifest:
         coefficient_exact=Fraction(1),
     )
     combination = CombinedWithFilter(
-        method="constant", term=term, rmse_deg={}, worst_rmse_deg={}, groups=1, measures={}
+        method="constant", term=term, rmse_deg={}, worst_rmse_deg={}, groups=1, measures=CAR
     )
     line = model_of({"ay": Fraction(1, 700)}, name=name)
     return line.model_copy(update={"combination": combination})
@@ -158,7 +159,7 @@ def estimate(observer: Observer, counts: DriveCounts) -> FloatArray:
 @pytest.mark.parametrize("name", ["rear", "front"])
 def test_integers_are_near_the_filter_in_floating_point(name: str) -> None:
     labelled, measures = simulated(), CAR if name == "rear" else FRONT
-    expected = ekf.estimate(labelled.signals, measures.vehicle(), ekf.EkfNoise())
+    expected = ekf.estimate(labelled.signals, vehicle_with_fit(measures), ekf.EkfNoise())
     found = estimate(OBSERVERS[name], counts_of(labelled, OBSERVERS[name]))
     error = np.degrees(found - expected)[np.isfinite(found)]
     assert len(error) > 0.95 * len(expected)
@@ -290,7 +291,7 @@ def test_no_number_overflows_in_any_car() -> None:
             height_m=float(random.uniform(0.2, 1.5)),
             front_drive_share=float(random.choice([0.0, 1.0])),
         )
-        vehicle = IdentifiedVehicle(measures.vehicle(fit), fit.noise, 0.0)
+        vehicle = IdentifiedVehicle(vehicle_with_fit(measures, fit), fit.noise, 0.0)
         logged = (SIGNALS.signals, WITHOUT_AX, WITHOUT_STEER)[trial % 3]
         observer = observer_of(vehicle, SIGNALS, logged, one_speed=trial % 2 == 0)
         signals = sorted({name for column in observer.columns for name in column.signals})

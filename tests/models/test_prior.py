@@ -11,7 +11,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured_evaluation as module
-from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
+from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.measured_evaluation import identified_prior
 from fleet_slip.grams.cohort import age_weights, load_cohort
 from fleet_slip.grams.update import update_grams
@@ -23,6 +23,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand, done_on, run_on
@@ -173,7 +174,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     ) -> IdentifiedVehicle:
         seen.append(len(drives))
         fitted = FitParameters(stiffness_rear=1.0 + len(seen) / 100)
-        return IdentifiedVehicle(measured.vehicle(fitted), fitted.noise, 0.0)
+        return IdentifiedVehicle(vehicle_with_fit(measured, fitted), fitted.noise, 0.0)
 
     def simulate(_: Catalog, campaign: object, feature_set: str, executor: object) -> object:
         vehicle = identified_prior(campaign)  # type: ignore[arg-type]
@@ -181,7 +182,7 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
         simulated.append(vehicle.suspension.rear_stiffness_factor)
         return prior
 
-    found = IdentifiedVehicle(car.vehicle(), FitParameters().noise, 0.0)
+    found = IdentifiedVehicle(vehicle_with_fit(car), FitParameters().noise, 0.0)
     file = tmp_path / "own.toml"
     file.write_text(found.as_campaign())
     campaign = load_campaign(str(file), SHIPPED_CONFIGS)

@@ -11,7 +11,7 @@ import fleet_slip
 from fleet_slip.evaluation import combined, measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
 from fleet_slip.evaluation.held_out import QUARTERS, Segments
-from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, VehicleMeasures
+from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations
@@ -22,6 +22,7 @@ from fleet_slip.regression.combination import (
     PairedEstimates,
     choose_combination,
 )
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 from tests.support.measured import OWN_MAPPING, ingest_own
@@ -44,7 +45,7 @@ def usual_car(
 ) -> IdentifiedVehicle:
     """Return a car without a search, which takes seconds."""
     assert any(np.isfinite(drive.sideslip_rad).any() for drive in drives)
-    return IdentifiedVehicle(measures.vehicle(), EkfNoise(), 0.0, fit=FitParameters())
+    return IdentifiedVehicle(vehicle_with_fit(measures), EkfNoise(), 0.0, fit=FitParameters())
 
 
 @pytest.fixture
@@ -68,7 +69,7 @@ def test_a_version_with_a_filter_is_used_as_any_other(
     combination = version.manifest.combination
     assert combination is not None
     assert combination.method != "line"
-    assert combination.measures["mass_kg"] == 1480
+    assert combination.measures.mass_kg == 1480
     strict = load_thresholds(CATALOG.configs).model_copy(update={"max_rmse_deg": 1e-6})
     assert "without the filter, its RMSE" in str(
         threshold_violations(strict, version.manifest, None)
@@ -121,7 +122,7 @@ def test_measures_of_a_mapping_train_with_a_filter_and_change_no_drive(tmp_path:
     mappings = [load_mapping(str(file), CATALOG) for file in (plain, with_car)]
     assert mappings[0].canonical_json() == mappings[1].canonical_json()
     assert mappings[1].vehicle is not None
-    assert mappings[1].vehicle.measures["rear_axle_m"] == 1.67
+    assert mappings[1].vehicle.rear_axle_m == 1.67
 
 
 def test_inner_groups_never_contain_what_is_held_out() -> None:

@@ -17,15 +17,15 @@ from fleet_slip.evaluation import identify as identifying
 from fleet_slip.evaluation.filters import checksum_of_sources
 from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
-    VehicleMeasures,
     identify,
     identify_held_out,
+    vehicle_with_fit,
 )
 from fleet_slip.evaluation.kalman import FilterNoise
 from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
 from fleet_slip.evaluation.tuning import rmse_rad, tune
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from tests.support.drives import noisy, simulated_drive, slalom
 
 CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
@@ -49,7 +49,7 @@ def rmse_deg(estimate: np.ndarray, drive: LabelledDrive) -> float:
 def test_the_start_depends_on_measures_alone() -> None:
     stiffer = CAR.with_tyres(stiffness_factor=0.8)
     assert VehicleMeasures.of_vehicle(stiffer) == MEASURED
-    body = MEASURED.vehicle().body
+    body = vehicle_with_fit(MEASURED).body
     assert body.mass_kg == pytest.approx(CAR.body.mass_kg)
     assert body.yaw_inertia_kgm2 != pytest.approx(CAR.body.yaw_inertia_kgm2, rel=0.01)
 
@@ -58,7 +58,9 @@ def test_an_identified_car_estimates_better_than_one_with_usual_tyres(
     drive: LabelledDrive, identified: IdentifiedVehicle
 ) -> None:
     found = identified
-    before = rmse_deg(ekf.estimate(drive.signals, MEASURED.vehicle(), ekf.EkfNoise()), drive)
+    before = rmse_deg(
+        ekf.estimate(drive.signals, vehicle_with_fit(MEASURED), ekf.EkfNoise()), drive
+    )
     assert rmse_deg(ekf.estimate(drive.signals, found.car, found.noise), drive) < 0.7 * before
     assert found.held_out_rad is None
 
