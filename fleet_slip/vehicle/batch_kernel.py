@@ -24,24 +24,15 @@ from fleet_slip.vehicle.driver import (
     Handling,
     decide,
 )
-from fleet_slip.vehicle.dynamics import (
-    NO_BRAKES,
-    Compliance,
-    ComplianceRates,
-    Environment,
-    front_wheels,
-    imperfect_derivative,
-)
+from fleet_slip.vehicle.dynamics import Compliance, ComplianceRates, Environment, front_wheels
 from fleet_slip.vehicle.integration import (
     SECOND_ORDER,
+    Motion,
     Path,
     Pose,
     PoseSlopes,
     Slopes,
-    advance,
-    advance_compliance,
-    advance_pose,
-    pose_slopes,
+    advance_car,
 )
 from fleet_slip.vehicle.parameters import Constants, Controls, ImperfectionConstants, State
 from fleet_slip.vehicle.tyre import arctan2
@@ -326,31 +317,29 @@ def decide_lanes(memory: Any) -> None:
 def integrate_lanes(memory: Any, step_s: float, first_step: bool) -> None:
     """Advance all cars by one step; keep the specific force of a sample's first step."""
     for lane in range(LANES):
-        x = read(memory, STATE, lane, State)
+        motion = Motion(
+            read(memory, STATE, lane, State),
+            read(memory, COMPLIANCE, lane, Compliance),
+            read(memory, POSE, lane, Pose),
+            read(memory, SLOPES, lane, Slopes),
+            read(memory, COMPLIANCE_RATES, lane, ComplianceRates),
+            read(memory, POSE_SLOPES, lane, PoseSlopes),
+        )
         u = read(memory, CONTROLS, lane, Controls)
-        c = read(memory, CAR, lane, Constants)
-        t = read(memory, IMPERFECTION_CONSTANTS, lane, ImperfectionConstants)
-        pose = read(memory, POSE, lane, Pose)
         path = read(memory, PATH, lane, Path)
         environment = read(memory, ENVIRONMENT, lane, Environment)
-        compliance = read(memory, COMPLIANCE, lane, Compliance)
+        c = read(memory, CAR, lane, Constants)
+        t = read(memory, IMPERFECTION_CONSTANTS, lane, ImperfectionConstants)
         order = memory[ORDER * LANES + lane]
-        d, rates = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
-        after, slopes = advance(x, d, read(memory, SLOPES, lane, Slopes), c, step_s, order)
-        previous = read(memory, COMPLIANCE_RATES, lane, ComplianceRates)
-        yielded = advance_compliance(
-            compliance, rates, previous, after.steering_wheel, t, step_s, order
-        )
-        previous_travel = read(memory, POSE_SLOPES, lane, PoseSlopes)
-        travel = pose_slopes(x, pose, path)
-        ax = d.ax if first_step else memory[FORCE * LANES + lane]
-        ay = d.ay if first_step else memory[(FORCE + 1) * LANES + lane]
-        write(memory, STATE, lane, after)
-        write(memory, SLOPES, lane, slopes)
-        write(memory, COMPLIANCE, lane, yielded)
-        write(memory, COMPLIANCE_RATES, lane, rates)
-        write(memory, POSE, lane, advance_pose(pose, travel, previous_travel, step_s, order))
-        write(memory, POSE_SLOPES, lane, travel)
+        after, ax, ay = advance_car(motion, u, path, environment, c, t, step_s, order)
+        if not first_step:
+            ax, ay = memory[FORCE * LANES + lane], memory[(FORCE + 1) * LANES + lane]
+        write(memory, STATE, lane, after.state)
+        write(memory, COMPLIANCE, lane, after.compliance)
+        write(memory, POSE, lane, after.pose)
+        write(memory, SLOPES, lane, after.slopes)
+        write(memory, COMPLIANCE_RATES, lane, after.compliance_rates)
+        write(memory, POSE_SLOPES, lane, after.pose_slopes)
         write(memory, FORCE, lane, (ax, ay))
         memory[ORDER * LANES + lane] = SECOND_ORDER
 

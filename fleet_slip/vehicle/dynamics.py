@@ -33,9 +33,6 @@ class Wheels(NamedTuple, Generic[T]):
     rr: T
 
 
-NO_BRAKES = Wheels(0.0, 0.0, 0.0, 0.0)
-
-
 class Environment(NamedTuple):
     """Road and air at the car, and the temperature of its tyres."""
 
@@ -323,19 +320,19 @@ def spin_rate(
 
 @equation
 def spin_rates(
-    x: State, force: Wheels[WheelForce], load: Wheels[float], brakes: Wheels[float], c: Constants
+    x: State, force: Wheels[WheelForce], load: Wheels[float], c: Constants
 ) -> Wheels[WheelRate]:
-    """Compute the rates of the wheels under the drivetrain's torque and all brakes."""
+    """Compute the rates of the wheels under the drivetrain's torque and the brakes."""
     max_drive = c.power_per_mass / max(abs(x.vx), MIN_DRIVE_SPEED_MPS)
     drive = c.mass * min(max(x.traction, 0.0), max_drive)
     drive_f, drive_r = c.drive_front * drive, c.drive_rear * drive
     brake = c.mass * max(-x.traction, 0.0)
     brake_f, brake_r = c.brake_front * brake, c.brake_rear * brake
     return Wheels(
-        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f + brakes.fl, c),
-        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f + brakes.fr, c),
-        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r + brakes.rl, c),
-        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r + brakes.rr, c),
+        spin_rate(force.fl, x.wheel_fl, load.fl, drive_f, brake_f, c),
+        spin_rate(force.fr, x.wheel_fr, load.fr, drive_f, brake_f, c),
+        spin_rate(force.rl, x.wheel_rl, load.rl, drive_r, brake_r, c),
+        spin_rate(force.rr, x.wheel_rr, load.rr, drive_r, brake_r, c),
     )
 
 
@@ -379,7 +376,6 @@ def imperfect_derivative(
     u: Controls,
     compliance: Compliance,
     environment: Environment,
-    brakes: Wheels[float],
     c: Constants,
     t: ImperfectionConstants,
 ) -> tuple[Derivative, ComplianceRates]:
@@ -398,9 +394,6 @@ def imperfect_derivative(
         Elastic states of steering and tyres.
     environment
         Road and air at the car.
-    brakes
-        Brake force at the rim of each wheel in N, in addition to the driver's, before anti-lock
-        control.
     c, t
         Constants of the car and of its imperfections.
 
@@ -419,7 +412,7 @@ def imperfect_derivative(
     load = transferred_loads(x, c)
     force, compliance_rates = wheel_forces(x, compliance, environment, load, c, t)
     calm = body_acceleration(x, force, c)
-    spin = spin_rates(x, force, load, brakes, c)
+    spin = spin_rates(x, force, load, c)
     push = x.vx * environment.wind
     ay = calm.ay + t.wind_force * push
     rates = Derivative(

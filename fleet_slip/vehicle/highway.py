@@ -25,7 +25,6 @@ from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
     CALM,
-    NO_BRAKES,
     Acceleration,
     Compliance,
     ComplianceRates,
@@ -40,15 +39,13 @@ from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
     SECOND_ORDER,
     STEP_S,
+    Motion,
     Path,
     Pose,
     PoseSlopes,
     Slopes,
-    advance,
-    advance_compliance,
-    advance_pose,
+    advance_car,
     extrapolate,
-    pose_slopes,
 )
 from fleet_slip.vehicle.parameters import (
     PERFECT,
@@ -80,32 +77,13 @@ class PlanePose(NamedTuple):
     heading: float
 
 
-class Motion(NamedTuple):
-    """State and poses of the car, and their rates in the previous step."""
-
-    state: State
-    compliance: Compliance
-    pose: PlanePose
-    place: Pose
-    """Position relative to the line of a road."""
-    slopes: Slopes
-    compliance_rates: ComplianceRates
-    pose_rates: PlanePose
-    place_rates: PoseSlopes
-    force: tuple[float, float]
-    """Specific force ax, ay at the beginning of the last call, in m/s²."""
-
-
 AT_REST = Motion(
     State(*len(State._fields) * (0.0,)),
     Compliance(*len(Compliance._fields) * (0.0,)),
-    PlanePose(0.0, 0.0, 0.0),
     Pose(0.0, 0.0, 1.0, 0.0),
     Slopes(*len(Slopes._fields) * (0.0,)),
     ComplianceRates(*len(ComplianceRates._fields) * (0.0,)),
-    PlanePose(0.0, 0.0, 0.0),
     PoseSlopes(*len(PoseSlopes._fields) * (0.0,)),
-    (0.0, 0.0),
 )
 STRAIGHT = Path(*len(Path._fields) * (0.0,))
 
@@ -119,7 +97,7 @@ def _rates(
     c: Constants,
     t: ImperfectionConstants,
 ) -> Derivative:
-    return imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)[0]
+    return imperfect_derivative(x, u, compliance, environment, c, t)[0]
 
 
 @kernel
@@ -133,7 +111,7 @@ def _rates_on_axles(
 
 
 @equation
-def _pose_rates(x: State, heading: float) -> PlanePose:
+def _plane_rates(x: State, heading: float) -> PlanePose:
     cosine, sine = math.cos(heading), math.sin(heading)
     return PlanePose(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
 
@@ -141,36 +119,31 @@ def _pose_rates(x: State, heading: float) -> PlanePose:
 @kernel
 def _steps(
     motion: Motion,
+    plane: PlanePose,
+    plane_rates: PlanePose,
     u: Controls,
-    environment: Environment,
-    brakes: Wheels[float],
     path: Path,
+    environment: Environment,
     c: Constants,
     t: ImperfectionConstants,
     step: float,
     count: int,
     order: float,
-) -> Motion:
-    x, compliance, pose, place, slopes, yielding, previous, travel, (ax, ay) = motion
+) -> tuple[Motion, PlanePose, PlanePose, tuple[float, float]]:
+    """Advance a car on its road and in the plane; also return its specific force at the start."""
+    force = (0.0, 0.0)
     for k in range(count):
-        d, compliance_rates = imperfect_derivative(x, u, compliance, environment, brakes, c, t)
+        rates = _plane_rates(motion.state, plane.heading)
+        plane = PlanePose(
+            plane.x + step * extrapolate(rates.x, plane_rates.x, order),
+            plane.y + step * extrapolate(rates.y, plane_rates.y, order),
+            plane.heading + step * extrapolate(rates.heading, plane_rates.heading, order),
+        )
+        motion, ax, ay = advance_car(motion, u, path, environment, c, t, step, order)
         if k == 0:
-            ax, ay = d.ax, d.ay
-        place_rates = pose_slopes(x, place, path)
-        place, travel = advance_pose(place, place_rates, travel, step, order), place_rates
-        rates = _pose_rates(x, pose.heading)
-        pose = PlanePose(
-            pose.x + step * extrapolate(rates.x, previous.x, order),
-            pose.y + step * extrapolate(rates.y, previous.y, order),
-            pose.heading + step * extrapolate(rates.heading, previous.heading, order),
-        )
-        previous = rates
-        x, slopes = advance(x, d, slopes, c, step, order)
-        compliance = advance_compliance(
-            compliance, compliance_rates, yielding, x.steering_wheel, t, step, order
-        )
-        yielding, order = compliance_rates, SECOND_ORDER
-    return Motion(x, compliance, pose, place, slopes, yielding, previous, travel, (ax, ay))
+            force = (ax, ay)
+        plane_rates, order = rates, SECOND_ORDER
+    return motion, plane, plane_rates, force
 
 
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
@@ -226,7 +199,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         self.imperfection_constants = imperfection_constants(
             self.parameters, imperfections, SAMPLE_S
         )
-        self.environment, self.brakes, self.path = CALM, NO_BRAKES, STRAIGHT
+        self.environment, self.path = CALM, STRAIGHT
         self.MASS = c.mass
         self.INERTIA_Z = c.yaw_inertia
         self.LENGTH_A, self.LENGTH_B = c.front, c.rear
@@ -234,8 +207,10 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         self.FRICTION_REAR = cornering_stiffness(c.static_rear, c.stiffness_rear, c)
         super().__init__(road, position, heading, speed)
         rolling = speed * c.inverse_radius
-        self._internal = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
-        self.last_motion = AT_REST
+        state = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
+        self.last_motion = AT_REST._replace(state=state)
+        self.force = (0.0, 0.0)
+        self._plane_rates = PlanePose(0.0, 0.0, 0.0)
         self._step_s = 0.0
 
     @classmethod
@@ -253,7 +228,7 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
             vehicle.imperfections,
         )
         copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
-        copy._internal, copy.last_motion = vehicle._internal, vehicle.last_motion
+        copy.last_motion = vehicle.last_motion
         if hasattr(vehicle, "color"):
             copy.color = vehicle.color
         return copy
@@ -261,16 +236,9 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
     @property
     def motion(self) -> State:
         """State of the car in its own frame, with the velocities that highway-env may have set."""
-        return self._internal._replace(
+        return self.last_motion.state._replace(
             vx=float(self.speed), vy=float(self.lateral_speed), yaw_rate=float(self.yaw_rate)
         )
-
-    @property
-    def compliance(self) -> Compliance:
-        """Elastic states of steering and tyres; the rack is within its play."""
-        column, play = self._internal.steering_wheel, self.imperfection_constants.half_lash
-        last = self.last_motion.compliance
-        return last._replace(rack=min(max(last.rack, column - play), column + play))
 
     @property
     def sideslip(self) -> float:
@@ -294,15 +262,13 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """Return the rates of the state (x, y, heading, vx, vy, yaw rate), shape (6, 1)."""
         del time
         heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
-        rates = self._rates_of(self._internal._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
+        rates = self._rates_of(self.last_motion.state._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
         pose_rates = (*_plane_velocity(heading, vx, vy), yaw_rate)
         return np.array([*pose_rates, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
     def _rates_of(self, x: State) -> Derivative | Acceleration:
-        imperfections = self.imperfection_constants
-        return _rates(
-            x, self.controls, self.compliance, self.environment, self.constants, imperfections
-        )
+        compliance, imperfections = self.last_motion.compliance, self.imperfection_constants
+        return _rates(x, self.controls, compliance, self.environment, self.constants, imperfections)
 
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds in steps of at most `STEP_S`."""
@@ -310,24 +276,22 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         count = max(1, math.ceil(dt / STEP_S - 1e-9))
         step_s = dt / count
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
-        pose = PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading))
-        motion = self.last_motion._replace(state=self.motion, compliance=self.compliance, pose=pose)
-        motion = _steps(
-            motion,
+        self.last_motion, plane, self._plane_rates, self.force = _steps(
+            self.last_motion._replace(state=self.motion),
+            PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading)),
+            self._plane_rates,
             self.controls,
-            self.environment,
-            self.brakes,
             self.path,
+            self.environment,
             self.constants,
             self.imperfection_constants,
             step_s,
             count,
             order,
         )
-        self._internal, pose, self.last_motion = motion.state, motion.pose, motion
         self._step_s = step_s
-        self.position, self.heading = np.array([pose.x, pose.y]), pose.heading
-        self.speed, self.lateral_speed, self.yaw_rate = motion.state[:3]
+        self.position, self.heading = np.array([plane.x, plane.y]), plane.heading
+        self.speed, self.lateral_speed, self.yaw_rate = self.last_motion.state[:3]
         self.on_state_update()
 
 
@@ -398,8 +362,8 @@ class HighwayLanes:
         demands = Controls(*_read(column, batch_kernel.CONTROLS, Controls))
         vehicle.environment = Environment(*_read(column, batch_kernel.ENVIRONMENT, Environment))
         vehicle.path = Path(*_read(column, batch_kernel.PATH, Path))
-        place = Pose(*_read(column, batch_kernel.POSE, Pose))  # in this lap
-        vehicle.last_motion = vehicle.last_motion._replace(place=place)
+        pose = Pose(*_read(column, batch_kernel.POSE, Pose))  # in this lap
+        vehicle.last_motion = vehicle.last_motion._replace(pose=pose)
         wheel = math.atan(demands.steering_wheel / vehicle.parameters.steering.ratio)
         vehicle.act({"steering": wheel, "acceleration": demands.traction})
         vehicle.step(SAMPLE_S)
@@ -407,8 +371,8 @@ class HighwayLanes:
         for row, values in (
             (batch_kernel.STATE, motion.state),
             (batch_kernel.SLOPES, motion.slopes),
-            (batch_kernel.POSE, motion.place),
-            (batch_kernel.FORCE, motion.force),
+            (batch_kernel.POSE, motion.pose),
+            (batch_kernel.FORCE, vehicle.force),
             (batch_kernel.COMPLIANCE, motion.compliance),
         ):
             column[row : row + len(values)] = values

@@ -13,8 +13,15 @@ differential equations", SIAM J. Numer. Anal. 32 (1995).
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
-from fleet_slip.vehicle.dynamics import Compliance, ComplianceRates, Derivative, WheelRate
-from fleet_slip.vehicle.parameters import Constants, ImperfectionConstants, State
+from fleet_slip.vehicle.dynamics import (
+    Compliance,
+    ComplianceRates,
+    Derivative,
+    Environment,
+    WheelRate,
+    imperfect_derivative,
+)
+from fleet_slip.vehicle.parameters import Constants, Controls, ImperfectionConstants, State
 
 STEP_S = 0.002
 """Time step in s. `docs/simulator.md` compares the errors of other steps."""
@@ -279,3 +286,56 @@ def advance_pose(
         cosine * scale,
         sine * scale,
     )
+
+
+class Motion(NamedTuple):
+    """State and pose of a car, and their rates in the previous step."""
+
+    state: State
+    compliance: Compliance
+    pose: Pose
+    slopes: Slopes
+    compliance_rates: ComplianceRates
+    pose_slopes: PoseSlopes
+
+
+@equation
+def advance_car(
+    motion: Motion,
+    u: Controls,
+    path: Path,
+    environment: Environment,
+    c: Constants,
+    t: ImperfectionConstants,
+    step: float,
+    order: float,
+) -> tuple[Motion, float, float]:
+    """Advance a car by one step: the equations of motion, and their integration.
+
+    Parameters
+    ----------
+    motion
+        Motion at the beginning of the step.
+    u, path, environment
+        Demands of the driver, curvature of the line, and road and air.
+    c, t
+        Constants of the car and of its imperfections.
+    step, order
+        As of `advance`.
+
+    Returns
+    -------
+    Motion
+        Motion at the end of the step.
+    float, float
+        Specific force ax and ay at the beginning of the step, in m/s².
+    """
+    x = motion.state
+    d, rates = imperfect_derivative(x, u, motion.compliance, environment, c, t)
+    state, slopes = advance(x, d, motion.slopes, c, step, order)
+    compliance = advance_compliance(
+        motion.compliance, rates, motion.compliance_rates, state.steering_wheel, t, step, order
+    )
+    travel = pose_slopes(x, motion.pose, path)
+    pose = advance_pose(motion.pose, travel, motion.pose_slopes, step, order)
+    return Motion(state, compliance, pose, slopes, rates, travel), d.ax, d.ay

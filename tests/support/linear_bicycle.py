@@ -9,7 +9,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.vehicle.driver import SAMPLE_S, SPEED_GAIN_1PS
 from fleet_slip.vehicle.dynamics import (
-    NO_BRAKES,
     Compliance,
     ComplianceRates,
     Environment,
@@ -144,7 +143,7 @@ def _run(
         u = Controls(demand[i], resistance - x.vy * x.yaw_rate + SPEED_GAIN_1PS * (speed - x.vx))
         out[0, i], out[1, i], out[3, i] = x.yaw_rate, x.vy, x.vx
         for step in range(STEPS):
-            d, new = imperfect_derivative(x, u, compliance, environment, NO_BRAKES, c, t)
+            d, new = imperfect_derivative(x, u, compliance, environment, c, t)
             if step == 0:
                 out[2, i] = d.ay
             x, slopes = advance(x, d, slopes, c, STEP_S, order)

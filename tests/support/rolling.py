@@ -14,10 +14,8 @@ from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_block
 from fleet_slip.vehicle.batch_kernel import CHANNELS
 from fleet_slip.vehicle.dynamics import (
     CALM,
-    NO_BRAKES,
     Compliance,
     Derivative,
-    Wheels,
     imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import FIRST_ORDER, SECOND_ORDER, STEP_S, Slopes, advance
@@ -37,7 +35,7 @@ NO_SLOPES = Slopes(*(0.0 for _ in Slopes._fields))
 
 
 @equation
-def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> Derivative:
+def derivative(x: State, u: Controls, c: Constants) -> Derivative:
     """Compute the rates of the textbook's car on a flat, even and calm road.
 
     Parameters and result are as those of `imperfect_derivative`.
@@ -46,13 +44,13 @@ def derivative(x: State, u: Controls, brakes: Wheels[float], c: Constants) -> De
     ideal = ImperfectionConstants(
         0.0, 0.0, 0.0, 0.0, 0.0, r, r, r, r, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     )
-    rates, _ = imperfect_derivative(x, u, rigid, CALM, brakes, c, ideal)
+    rates, _ = imperfect_derivative(x, u, rigid, CALM, c, ideal)
     return rates
 
 
 @kernel
 def rates(x: State, u: Controls, c: Constants) -> Derivative:
-    return derivative(x, u, NO_BRAKES, c)
+    return derivative(x, u, c)
 
 
 @kernel
@@ -63,7 +61,7 @@ def _run(x: State, u: Controls, c: Constants, slopes: Slopes, step: float, count
     for i in range(count):
         for k, value in enumerate(x):
             states[i, k] = value
-        d = derivative(x, u, NO_BRAKES, c)
+        d = derivative(x, u, c)
         forces[i, 0], forces[i, 1] = d.ax, d.ay
         x, slopes = advance(x, d, slopes, c, step, order)
         order = SECOND_ORDER

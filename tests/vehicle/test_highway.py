@@ -42,7 +42,10 @@ def test_at_small_slip_the_car_moves_as_highway_env_s() -> None:
         turn = yaw_rate * np.array([-c.half_track_width_front, c.half_track_width_front] * 2)
         wheels = dict(zip(State._fields[-4:], (vx + turn) * c.inverse_radius, strict=True))
         at_wheel = SEDAN.steering.ratio * np.tan(steering)
-        car._internal = rolling(vx, steering_wheel=at_wheel)._replace(**wheels)
+        car.last_motion = car.last_motion._replace(
+            state=rolling(vx, steering_wheel=at_wheel)._replace(**wheels),
+            compliance=car.last_motion.compliance._replace(rack=at_wheel),
+        )
         car.action = twin.action = {"steering": steering, "acceleration": 0.0}
         state = np.array([[100.0, 100.0, 0.3, vx, vy, yaw_rate]]).T
         ours, theirs = car.derivative_func(0.0, state), twin.derivative_func(0.0, state)
