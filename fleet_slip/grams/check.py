@@ -1,7 +1,7 @@
 """Comparison of stored Gram rows with the kernel and with SQL, bit for bit."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,8 +16,8 @@ from fleet_slip.grams.drive_sums import wide_grams
 from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.update import transaction_name
 from fleet_slip.regression.gram import Gram
-from fleet_slip.storage.table import TableFile, retry_if_stale
-from fleet_slip.warehouse.gram_reader import find_backlog, is_onboard, is_onboard_file
+from fleet_slip.storage.table import Snapshot, TableFile, retry_if_stale
+from fleet_slip.warehouse.gram_reader import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SQL_COSTS = 4
@@ -63,7 +63,6 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
             "ingest, or fleet-slip run. Gram rows sent by cars are checked by: fleet-slip verify"
         )
     files = _evenly(logs.files, count, begin)
-    gram_files = find_gram_files(warehouse, grams.files)
     catalog = warehouse.catalog
     wide = tuple(
         name
@@ -71,16 +70,14 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
         if catalog.feature_set(name).windows
         and grams.transaction_version(transaction_name(catalog.identity(name))) is not None
     )
-    work = [(file, PLAIN, gram_files.get(file.path, ())) for file in files]
+    work = [(file, PLAIN) for file in files]
     for name in wide:
         missing = find_backlog(logs, grams, catalog.identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
-        paths = tuple(file.path for file in grams.files)
-        sample = _evenly(computed, max(1, count // SQL_COSTS), begin)
-        work += [(file, name, paths) for file in sample]
+        work += [(file, name) for file in _evenly(computed, max(1, count // SQL_COSTS), begin)]
     drives = Counter[bool]()
-    for file, name, paths in work:
-        drives[name == PLAIN] += _compare_ways(warehouse, file, name, paths)
+    for file, name in work:
+        drives[name == PLAIN] += _compare_ways(warehouse, grams, file, name)
         progress(1, len(work))
     rows = sum(file.rows for file in files)
     return CheckReport(len(files), rows, drives[True], wide, drives[False])
@@ -92,17 +89,17 @@ def _evenly(files: Sequence[TableFile], count: int, begin: int) -> list[TableFil
 
 
 def _compare_ways(
-    warehouse: Warehouse, file: TableFile, feature_set: str, gram_files: Iterable[str]
+    warehouse: Warehouse, stored_in: Snapshot, file: TableFile, feature_set: str
 ) -> int:
     """Compare the Gram rows of a log file by the kernel with the stored ones and with SQL.
 
     Returns the number of drives; 0 for windows that were not computed.
     """
     identity = warehouse.catalog.identity(feature_set)
-    stored = stored_grams(warehouse, [file], gram_files, identity).get(file.path, {})
+    stored = stored_grams(stored_in, [file], identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
-    delays = recorded_delays(warehouse.grams.snapshot(), identity, file.path)
+    delays = recorded_delays(stored_in, identity, file.path)
     rows = wide_grams(warehouse, [file], feature_set, delays)
     computed, references = grams_of(rows), {"the stored Gram rows": stored}
     if has_statement(warehouse.catalog, feature_set):
@@ -142,29 +139,18 @@ def _sort_signals(grams: DriveGrams) -> DriveGrams:
     return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
 
 
-def find_gram_files(warehouse: Warehouse, grams: Iterable[TableFile]) -> dict[str, tuple[str, ...]]:
-    """Return the paths of the Gram files with rows of logged signals, by log file."""
-    paths: dict[str, tuple[str, ...]] = {}
-    for path in (gram_file.path for gram_file in grams if not is_onboard_file(gram_file)):
-        pairs = warehouse.grams.read_combinations(path, ["feature_set", "file"])
-        mask = pc.and_(pc.equal(pairs["feature_set"], PLAIN), pc.invert(is_onboard(pairs)))
-        for file in pairs.filter(mask)["file"].to_pylist():
-            paths[file] = (*paths.get(file, ()), path)
-    return paths
-
-
 def stored_grams(
-    warehouse: Warehouse, files: Sequence[TableFile], grams: Iterable[str], identity: str = PLAIN
+    grams: Snapshot, files: Sequence[TableFile], identity: str = PLAIN
 ) -> dict[str, DriveGrams]:
     """Return the stored Grams of log files and a feature set, by log file."""
     paths = pa.array([file.path for file in files], pa.string())
     stored: dict[str, DriveGrams] = defaultdict(dict)
-    for path in grams:
-        pairs = warehouse.grams.read(path, ["feature_set", "file"])
+    for file in grams.files:
+        pairs = grams.table.read(file.path, ["feature_set", "file"])
         names = pairs["file"].cast(pa.string())
         mask = pc.and_(pc.equal(pairs["feature_set"], identity), pc.is_in(names, paths))
         if pc.any(mask).as_py():
-            rows = warehouse.grams.read(path).filter(mask)
-            for file in rows["file"].unique().to_pylist():
-                stored[file] |= grams_of(rows.filter(pc.equal(rows["file"], file)))
+            rows = grams.table.read(file.path).filter(mask)
+            for path in rows["file"].unique().to_pylist():
+                stored[path] |= grams_of(rows.filter(pc.equal(rows["file"], path)))
     return stored

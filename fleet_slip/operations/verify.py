@@ -8,10 +8,11 @@ names against the erasure log. `repair` rebuilds Gram rows and checkpoints.
 import contextlib
 import os
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence, Set
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import pyarrow as pa
@@ -32,7 +33,6 @@ from fleet_slip.grams.check import (
     CheckReport,
     DriveGrams,
     differing_drives,
-    find_gram_files,
     grams_of,
     stored_grams,
 )
@@ -40,19 +40,23 @@ from fleet_slip.grams.drive_sums import wide_grams
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
 from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
-from fleet_slip.operations.find_drives import find_temporary_files, find_unreferenced
+from fleet_slip.operations.find_drives import (
+    find_temporary_files,
+    find_unreferenced,
+    path_below,
+)
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
 from fleet_slip.storage.data_files import checksum_in, checksum_of, read_names
 from fleet_slip.storage.documents import document_folders
-from fleet_slip.storage.folder import Folder, StoredFile
+from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import find_changed_lines
 from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, retry_if_stale, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
-from fleet_slip.warehouse.gram_reader import is_onboard, is_onboard_file, named_files
+from fleet_slip.warehouse.gram_reader import is_onboard_file, named_files
 from fleet_slip.warehouse.warehouse import Warehouse
 
 DamageKind: TypeAlias = Literal[
@@ -137,8 +141,7 @@ class Verification(Answer):
     def problem(self) -> DamageError | None:
         """The error for damage, with what to do."""
         advice = (
-            "What is left cannot be rebuilt here: restore these files from a backup. Data files "
-            "may be copied below their table under any name; then give the command again."
+            "These files cannot be rebuilt: restore them from a backup."
             if self.repaired
             else "Rebuild what can be rebuilt with: fleet-slip verify --repair"
         )
@@ -171,14 +174,20 @@ def _verify(
         table: verify_files(snapshot, report, steps(f"read {table}"), executor)
         for table, snapshot in snapshots.items()
     }
-    logs, grams = ([result.file for result in read.get(table, [])] for table in ("logs", "grams"))
     verify_names(warehouse, read, report, full)
-    verify_rows(warehouse, logs, grams, report)
-    _report_missing_logs(snapshots, grams, report)
-    if grams:
-        active = {file.path for file in snapshots["logs"].files} if "logs" in snapshots else set()
+    sound = {table: _sound(snapshots[table], files) for table, files in read.items()}
+    verify_rows(sound, report)
+    if (grams := sound.get("grams")) and grams.files:
+        stale = named_files(grams, PLAIN)[1]
+        if logs := snapshots.get("logs"):
+            stale -= {file.path for file in logs.files}
+            if stale and logs.version is None:  # as of a folder that was not mounted
+                problem = f"the table is gone; Gram rows of {pluralize(len(stale), 'file')} remain"
+                report.note("log", "logs", problem)
         progress = steps("compute Gram rows")
-        verify_grams(warehouse, logs, grams, active, report, progress, full, executor)
+        verify_grams(
+            warehouse, sound.get("logs"), grams, len(stale), report, progress, full, executor
+        )
     verify_documents(warehouse.root, report)
     verify_models(warehouse, snapshots, report)
     _list_unreferenced(warehouse, snapshots, report)
@@ -189,6 +198,12 @@ def _verify(
             "right folder, and is its disk there? Choose another data root."
         )
     return report
+
+
+def _sound(snapshot: Snapshot, read: Sequence["ReadFile"]) -> Snapshot:
+    """Return a snapshot without the files that are damaged."""
+    damaged = frozenset(file.path for file in snapshot.files) - {r.file.path for r in read}
+    return replace(snapshot, without=snapshot.without | damaged)
 
 
 def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
@@ -258,24 +273,9 @@ def read_whole(table: Table, file: TableFile) -> ReadFile:
 def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
     if metadata.num_rows != file.rows:
         return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
-    if (nulls := _null_counts(metadata)).items() - file.null_counts.items():
-        wrong = [name for name, count in nulls.items() if file.null_counts.get(name) != count]
-        return f"the null counts of {', '.join(wrong)} differ from the Delta log"
     if file.day and not file.path.startswith(f"day={file.day}/"):
         return f"its folder is not that of the day in the Delta log, {file.day}"
     return None
-
-
-def _null_counts(metadata: pq.FileMetaData) -> dict[str, int]:
-    counts: dict[str, int] = {}
-    for group in range(metadata.num_row_groups):
-        for number in range(metadata.num_columns):
-            column = metadata.row_group(group).column(number)
-            statistics = column.statistics
-            if "." not in column.path_in_schema and statistics and statistics.has_null_count:
-                name = column.path_in_schema
-                counts[name] = counts.get(name, 0) + statistics.null_count
-    return counts
 
 
 def verify_names(
@@ -299,81 +299,65 @@ def verify_names(
                 report.note("name", f"{table}/{file.file.path}", problem)
 
 
-def verify_rows(
-    warehouse: Warehouse,
-    logs: Sequence[TableFile],
-    grams: Sequence[TableFile],
-    report: Verification,
-) -> None:
+def verify_rows(sound: Mapping[str, Snapshot], report: Verification) -> None:
     """Find incomplete drives, drives in several files, and doubled Gram rows."""
-    with open_database(reading=warehouse.root) as database, database_errors("verifying rows"):
 
-        def ask(table: Table, files: Sequence[TableFile], name: str) -> list[tuple[Any, ...]]:
-            paths = [table.uri(file.path) for file in files]
-            database.execute("SET VARIABLE files = $files", {"files": paths})
-            return database.execute(read_sql("jobs", name)).fetchall() if files else []
+    def rows_of(name: str, statement: str) -> list[tuple[Any, ...]]:
+        snapshot = sound.get(name)
+        if snapshot is None or not snapshot.files:
+            return []
+        with (
+            open_database(reading=snapshot.table.folder) as database,
+            database_errors(f"verifying the rows of {snapshot.table.folder}"),
+        ):
+            database.execute("SET VARIABLE files = $files", {"files": snapshot.paths})
+            return database.execute(read_sql("jobs", statement)).fetchall()
 
-        cut = ask(warehouse.logs, logs, "verify_drives.sql")
-        twice = ask(warehouse.grams, grams, "verify_grams.sql")
-    for drive, in_files, beginnings, n, file in cut:
+    for drive, in_files, beginnings, n, file in rows_of("logs", "verify_drives.sql"):
         problem = (
             f"{n:,} rows in {pluralize(in_files, 'file')} with {pluralize(beginnings, 'row')} of "
             f"tick 0; one is {file}"
         )
         report.note("drive", drive, problem)
-    for identity, file, drive, n in twice:
+    for identity, file, drive, n in rows_of("grams", "verify_grams.sql"):
         problem = f"the Gram row {identity} of drive {drive} is stored {n} times"
         report.note("gram", f"logs/{file}", problem)
-
-
-def _report_missing_logs(
-    snapshots: Mapping[str, Snapshot], sound: Sequence[TableFile], report: Verification
-) -> None:
-    """Report a table of logs that is gone, as a folder that was not mounted is."""
-    logs, grams = snapshots.get("logs"), snapshots.get("grams")
-    if not logs or not grams or logs.version is not None:
-        return
-    damaged = frozenset(file.path for file in grams.files).difference(file.path for file in sound)
-    if missing := named_files(replace(grams, without=damaged), PLAIN)[1]:
-        problem = f"the table is gone; Gram rows of {pluralize(len(missing), 'file')} remain"
-        report.note("log", "logs", problem)
 
 
 SAMPLE = 4
 """Log files whose Gram rows are computed again, evenly chosen, unless all are asked for."""
 
+FILES_IN_MEMORY = 1_000
+"""Log files whose stored Gram rows are in memory at a time."""
+
 
 def verify_grams(
     warehouse: Warehouse,
-    logs: Sequence[TableFile],
-    grams: Sequence[TableFile],
-    active: Collection[str],
+    logs: Snapshot | None,
+    grams: Snapshot,
+    stale: int,
     report: Verification,
     progress: Progress,
     full: bool,
     executor: Executor | None,
 ) -> None:
-    """Find Gram rows that are missing, of removed files, or wrong (in a sample, or all).
+    """Find Gram rows that are missing, or wrong (in a sample, or all).
 
-    `logs` and `grams` are files whose bytes are sound; `active` are the paths of all log files.
+    `logs` and `grams` have the files whose bytes are sound; `stale` is the number of removed log
+    files that still have Gram rows.
     """
-    sets = cache(lambda: onboard_feature_sets(warehouse.catalog))
-    for file in grams:
-        rows = warehouse.grams.read(file.path)
-        received = rows.filter(is_onboard(rows))
-        for row, why in impossible_rows(received, sets()) if len(received) else ():
+    sets = onboard_feature_sets(warehouse.catalog)
+    for file in filter(is_onboard_file, grams.files):
+        for row, why in impossible_rows(warehouse.grams.read(file.path), sets):
             problem = f"the Gram row of drive {row['drive_id']}, sent by a car, {why}"
             report.note("gram", f"grams/{file.path}", problem)
-    where = find_gram_files(warehouse, grams)
-    covered = [file for file in logs if file.path in where]
-    step = 1 if full else max(1, len(covered) // SAMPLE)
-    by_place: dict[tuple[str, ...], list[TableFile]] = {}
-    chosen = covered[::step]
-    for file in chosen:
-        by_place.setdefault(where[file.path], []).append(file)
-    for places, files in by_place.items():
-        stored = stored_grams(warehouse, files, places)
-        task = partial(_compute_grams, warehouse)
+    computed_files, log_files = named_files(grams, PLAIN)[0], logs.files if logs else ()
+    covered = [file for file in log_files if file.path in computed_files]
+    chosen = covered[:: 1 if full else max(1, len(covered) // SAMPLE)]
+    task = partial(_compute_grams, warehouse)
+    for start in range(0, len(chosen), FILES_IN_MEMORY):
+        files = chosen[start : start + FILES_IN_MEMORY]
+        stored = stored_grams(grams, files)
         for file, computed in run_tasks(
             executor, task, files, lambda f: f"the Gram rows of {f.path}"
         ):
@@ -382,12 +366,10 @@ def verify_grams(
                 report.note("gram", f"logs/{file.path}", problem)
             report.log_files_recomputed += 1
             progress(1, len(chosen))
-    missing = len(logs) - len(covered)
-    stale = where.keys() - set(active)
+    missing = len(log_files) - len(covered)
     if missing or stale:
         problem = (
-            f"no Gram rows of {pluralize(missing, 'log file')}, Gram rows of {len(stale)} that "
-            "are gone"
+            f"no Gram rows of {pluralize(missing, 'log file')}, Gram rows of {stale} that are gone"
         )
         report.note("backlog", "grams", f"{problem}; run: fleet-slip gram")
 
@@ -411,89 +393,83 @@ def verify_documents(root: Folder, report: Verification) -> None:
 
 
 def verify_models(
-    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+    warehouse: Warehouse, snapshots: Mapping[str, Snapshot], report: Verification
 ) -> None:
-    """Look for versions that nothing present can have made, and aliases that point at nothing."""
+    """Find versions without their drives or tables, and aliases of versions that do not exist.
+
+    Lost and damaged documents are reported as such.
+    """
     registry = Registry.open(warehouse)
     for name in registry.names():
-        try:
+        with contextlib.suppress(FleetSlipError, ValueError):
             numbers = registry.versions(name)
-        except StorageError:  # a lost document, which is reported as such
-            continue
-        for number in numbers:
-            try:
-                manifest = registry.load(name, number).manifest
-                registry.trained_drives(manifest)
-            except (RefusedError, StorageError, DataError, QuestionError) as error:
-                # Faults other than of format and drives are reported with the document.
-                if isinstance(error, RefusedError) or "drives" in str(error):
-                    report.note("model", f"{name}@{number}", str(error))
-                continue
-            trained, made_of = manifest.trained_on, {}
-            if manifest.imported_from is None:  # else the tables that made it are elsewhere
-                made_of["grams"] = trained.grams_version
-                if trained.drives_without_log != trained.drives:
-                    made_of["logs"] = trained.logs_version
-            for table, version in made_of.items():
-                latest = snapshots[table].version if table in snapshots else None
-                if latest is None or version > latest:
-                    problem = f"was made of version {version} of {table}, which does not exist"
+            for number in numbers:
+                for problem in _faults_of_version(registry, name, number, snapshots):
                     report.note("model", f"{name}@{number}", problem)
-        try:
-            aliases = registry.history(name).aliases()
-        except (FleetSlipError, ValueError):
-            continue
-        for alias, version in aliases.items():
-            if version not in numbers:
-                problem = f"points at version {version}, which does not exist"
-                report.note("model", f"{name}@{alias}", problem)
+            for alias, number in registry.history(name).aliases().items():
+                if number not in numbers:
+                    problem = f"points at version {number}, which does not exist"
+                    report.note("model", f"{name}@{alias}", problem)
+
+
+def _faults_of_version(
+    registry: Registry, name: str, number: int, snapshots: Mapping[str, Snapshot]
+) -> Iterator[str]:
+    try:
+        manifest = registry.load(name, number).manifest
+        registry.trained_drives(manifest)
+    except (RefusedError, StorageError, DataError, QuestionError) as error:
+        # Faults other than of format and drives are reported with the document.
+        if isinstance(error, RefusedError) or "drives" in str(error):
+            yield str(error)
+        return
+    if manifest.imported_from is not None:  # the tables that made it are elsewhere
+        return
+    trained = manifest.trained_on
+    made_of = {"grams": trained.grams_version}
+    if trained.drives_without_log != trained.drives:
+        made_of["logs"] = trained.logs_version
+    for table, version in made_of.items():
+        latest = snapshots[table].version if table in snapshots else None
+        if latest is None or version > latest:
+            yield f"was made of version {version} of {table}, which does not exist"
 
 
 def _list_unreferenced(
-    warehouse: Warehouse, snapshots: dict[str, Snapshot], report: Verification
+    warehouse: Warehouse, snapshots: Mapping[str, Snapshot], report: Verification
 ) -> None:
     for snapshot in snapshots.values():
-        try:
-            removals, files = snapshot.removals, find_unreferenced(snapshot.table)
-        except StorageError:  # a damaged log, reported above, does not state the state of files
-            continue
-        for file in files:
-            state = "replaced" if file.path in removals else "never committed"
-            then = "fleet-slip compact removes it in time"
-            removed_ns = snapshot.removals.get(file.path, 0) * 10**6
-            if max(file.modified_ns, removed_ns) > time.time_ns():
-                then = "its date is in the future, so compact keeps it: check the clocks"
-            if snapshot.version is None:
-                then = "if the table had a Delta log, restore that from a backup"
-            _remark(warehouse, file, f"{state}; {then}", report)
+        with contextlib.suppress(StorageError):  # of a damaged log, which is reported as such
+            for file in find_unreferenced(snapshot.table):
+                advice = "fleet-slip compact removes it in time"
+                removed_ns = snapshot.removals.get(file.path, 0) * 10**6
+                if snapshot.version is None:
+                    advice = "if the table had a Delta log, restore that from a backup"
+                elif max(file.modified_ns, removed_ns) > time.time_ns():
+                    advice = "its date is in the future, so compact keeps it: check the clocks"
+                problem = f"no version refers to it; {advice}"
+                report.note("unreferenced", path_below(warehouse, file), problem)
     for file in find_temporary_files(warehouse):
-        _remark(warehouse, file, "left by a killed job, or being written", report)
-
-
-def _remark(warehouse: Warehouse, file: StoredFile, problem: str, report: Verification) -> None:
-    where = str(file).removeprefix(f"{warehouse.root}/")
-    report.note("unreferenced", where, problem)
+        problem = "left by a killed job, or being written"
+        report.note("unreferenced", path_below(warehouse, file), problem)
 
 
 # Repair: Gram rows are rebuilt from the logs, and checkpoints from the commits.
-#
-# Nothing is deleted. A data file that was copied below its table under any name is put back.
 
 
 def repair(warehouse: Warehouse, verification: Verification) -> list[str]:
-    """Rebuild damaged parts; return their paths below the root."""
-    logs = {finding.path for finding in verification.damage if finding.kind == "log"}
-    rebuilt = _sum_up_again(warehouse, logs)
-    damaged = {finding.path for finding in verification.damage if finding.kind == "file"}
-    wrong = {f.path.removeprefix("logs/") for f in verification.damage if f.kind == "gram"}
-    rebuilt += _find_elsewhere(warehouse, damaged)
-    lost = {path.removeprefix("logs/") for path in damaged.difference(rebuilt)}
-    rebuilt += _drop_wrong(warehouse, damaged, wrong)
+    """Rebuild damaged parts; return their paths below the root. Nothing else is deleted."""
+    paths: dict[str, set[str]] = defaultdict(set)
+    for finding in verification.damage:
+        paths[finding.kind].add(finding.path)
+    rebuilt = _write_checkpoints(warehouse, paths["log"])
+    rebuilt += _drop_wrong(warehouse, paths["file"], paths["gram"])
+    lost = {path.removeprefix("logs/") for path in paths["file"]}
     reconcile(warehouse, unreadable=lost)  # also files that an interrupted repair has dropped
     return rebuilt
 
 
-def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
+def _write_checkpoints(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
     """Write the checkpoints of damaged logs again whose commits are all there, and sound."""
     rebuilt = []
     for table in warehouse.tables:
@@ -513,49 +489,19 @@ def _sum_up_again(warehouse: Warehouse, damaged: Set[str]) -> list[str]:
     return rebuilt
 
 
-def _find_elsewhere(warehouse: Warehouse, damaged: Collection[str]) -> list[str]:
-    """Put back the files whose very bytes a job or a person left under another name."""
-    rebuilt = []
-    for table in warehouse.tables:
-        name = table.folder.name
-        files = table.snapshot().files
-        lost = [file for file in files if f"{name}/{file.path}" in damaged]
-        sizes = {file.size_bytes for file in lost}
-        for other in table.folder.files() if lost else ():
-            if other.size_bytes not in sizes or other.path.startswith("_delta_log/"):
-                continue
-            with contextlib.suppress(StorageError):
-                content = table.folder.read(other.path)
-                for file in lost:
-                    if checksum_in(file.path) == checksum_of(content):
-                        table.folder.put(file.path, content)
-                        rebuilt.append(f"{name}/{file.path}")
-                lost = [file for file in lost if f"{name}/{file.path}" not in rebuilt]
-    return rebuilt
-
-
 @retrying
-def _drop_wrong(warehouse: Warehouse, damaged: Collection[str], wrong: set[str]) -> list[str]:
+def _drop_wrong(warehouse: Warehouse, damaged: Set[str], wrong: Set[str]) -> list[str]:
     """Drop the Gram files that are damaged, or have wrong rows of log files; return them."""
     snapshot = warehouse.grams.snapshot()
-    readable = _readable_grams(warehouse).items()
-    named = {path: rows["file"].unique().to_pylist() for path, rows in readable}
-    bad = [
-        file
-        for file in snapshot.files
-        if (f"grams/{file.path}" in damaged and not is_onboard_file(file))
-        or not wrong.isdisjoint(named.get(file.path, ()))
-    ]
+    bad = []
+    for file in snapshot.files:
+        if read_whole(warehouse.grams, file).problem:
+            is_bad = f"grams/{file.path}" in damaged and not is_onboard_file(file)
+        else:
+            names = warehouse.grams.read_combinations(file.path, ["file"])["file"].to_pylist()
+            is_bad = not wrong.isdisjoint(f"logs/{name}" for name in names)
+        if is_bad:
+            bad.append(file)
     if bad:
         snapshot.commit(Change(remove=bad, note={"job": "repair"}))
     return [f"grams/{file.path}" for file in bad]
-
-
-def _readable_grams(warehouse: Warehouse) -> dict[str, pa.Table]:
-    """Return which drives and log files the Gram files name, of those that are whole."""
-    readable = {}
-    for file in warehouse.grams.snapshot().files:
-        if read_whole(warehouse.grams, file).problem is None:
-            with contextlib.suppress(FleetSlipError):
-                readable[file.path] = warehouse.grams.read(file.path, ["file", "drive_id"])
-    return readable
