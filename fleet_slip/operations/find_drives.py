@@ -189,6 +189,31 @@ def drives_by_file(
     return by_file
 
 
+def tables_with(
+    warehouse: Warehouse,
+    subject: ErasureSubject,
+    drives: Collection[str] = (),
+    located: Located | None = None,
+) -> dict[str, set[str]]:
+    """Return the tables that have rows of a subject or of its drives, and the drives of these."""
+    located = located or locate(warehouse.grams.snapshot(), subject)
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    tables: dict[str, set[str]] = {}
+    for name, by_file in (("grams", located.drives), ("logs", in_logs)):
+        if by_file:
+            tables[name] = set().union(*by_file.values())
+    for file in warehouse.quarantine.snapshot().files:
+        refused = find_in_file(warehouse, warehouse.quarantine, file.path, subject, drives)
+        if refused is not None:
+            tables.setdefault("quarantine", set()).update(refused)
+    return tables
+
+
+def drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
+    """Return a subject's drives in all tables."""
+    return frozenset().union(*tables_with(warehouse, subject, (), located).values())
+
+
 def remove_uncommitted(
     warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
 ) -> None:
@@ -204,7 +229,7 @@ def remove_uncommitted(
             if file.path in removals:
                 continue
             with suppress(StorageError):  # half a file, or just deleted
-                matches = find_in_file(warehouse, table, file, subject, drives)
+                matches = find_in_file(warehouse, table, file.path, subject, drives)
                 if matches is not None:
                     drives = {*drives, *matches}
                     leftovers.append(file)
@@ -215,12 +240,12 @@ def remove_uncommitted(
 def find_in_file(
     warehouse: Warehouse,
     table: Table,
-    file: StoredFile,
+    path: str,
     subject: ErasureSubject,
     drives: Collection[str],
 ) -> set[str] | None:
     """Return a subject's drives in a file, None if no row is of the subject."""
-    rows = table.read(file.path, ["drive_id", "vehicle_id"])
+    rows = table.read(path, ["drive_id", "vehicle_id"])
     is_quarantine = table is warehouse.quarantine
     mask = quarantined_of(rows, subject, drives) if is_quarantine else rows_of(rows, subject)
     matches = rows["drive_id"].filter(mask)
@@ -237,7 +262,7 @@ def find_remains(
     for table in warehouse.tables if subject.kind != "before" else ():
         for file in find_unreferenced(table):
             try:
-                if find_in_file(warehouse, table, file, subject, drives) is not None:
+                if find_in_file(warehouse, table, file.path, subject, drives) is not None:
                     yield path_below(warehouse, file)
             except StorageError:
                 if any(file == other for other in find_unreferenced(table)):  # not just deleted

@@ -8,17 +8,14 @@ jobs that have not read the new logs. Files of such jobs are deleted by them or 
 """
 
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import date, timedelta
-from functools import cache
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
 
-from fleet_slip.arrays import Hashes
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import (
@@ -32,7 +29,6 @@ from fleet_slip.errors import (
 )
 from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.update import reconcile
-from fleet_slip.models.manifest import TrainedDrives
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.find_drives import (
     RETENTION_HOURS,
@@ -40,6 +36,7 @@ from fleet_slip.operations.find_drives import (
     VacuumReport,
     digests_of,
     drives_by_file,
+    drives_of,
     find_remains,
     find_replaced,
     find_unreferenced,
@@ -48,19 +45,20 @@ from fleet_slip.operations.find_drives import (
     path_below,
     quarantined_of,
     remove_uncommitted,
+    tables_with,
     vacuum,
 )
 from fleet_slip.operations.rewriting import (
     Rewriting,
     erase_onboard_rows,
+    erase_rows,
     rewrite,
-    write_remaining_rows,
 )
 from fleet_slip.quality.checks import implausible_day
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
 from fleet_slip.storage.runs import runs_under_way
-from fleet_slip.storage.table import Change, retrying, rows_in
+from fleet_slip.storage.table import retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.gram_reader import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -124,9 +122,6 @@ class ForgetReport(Answer):
             )
 
 
-DAYS_SHOWN = 3
-"""Maximum number of implausible days named in the error; --json lists all."""
-
 RUN = "the run "
 _NO_RUN = (
     "No other run is under way. Run fleet-slip verify, restore or delete what it finds damaged or "
@@ -149,7 +144,7 @@ def forget(
     _require_delta_logs(warehouse)
     erasure_log = ErasureLog(warehouse.root)
     located = locate(warehouse.grams.snapshot(), subject)
-    drives = _drives_of(warehouse, subject, located)
+    drives = drives_of(warehouse, subject, located)
     state = erasure_log.state(subject)
     if not drives and state is None and subject.kind != "before":
         raise QuestionError(
@@ -162,22 +157,22 @@ def forget(
     for table in (warehouse.quarantine, warehouse.logs):
         if drives or state:
             table.fence()
-    landed = _drives_of(warehouse, subject, located)
+    landed = drives_of(warehouse, subject, located)
     if not landed <= drives:  # they landed before the fence
         drives |= landed
         models = _begin(warehouse, erasure_log, subject, drives, located)
     if drives:
-        _erase_quarantined(warehouse, subject, drives)
+        erase_rows(warehouse.quarantine, lambda rows: quarantined_of(rows, subject, drives))
     rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
     if drives or state:
         warehouse.grams.fence()
-    rows += erase_onboard_rows(warehouse, subject)
+    rows += erase_onboard_rows(warehouse.grams, subject)
     remove_uncommitted(warehouse, subject, drives)
     reconcile(warehouse)
     replaced = find_replaced(warehouse)
     deleted = sum(file.folder.remove(file) for file in replaced) if now else 0
     look = (drives or state) and subject.kind != "before"  # such drives may be landing
-    tables = list(_find_tables_with(warehouse, subject, drives)) if look else []
+    tables = list(tables_with(warehouse, subject, drives)) if look else []
     if not tables and (drives or state in ("begun", ALLOWED)):
         erasure_log.end(subject, warehouse.grams.snapshot().version)
     pending: list[str] = []
@@ -205,17 +200,6 @@ def _require_delta_logs(warehouse: Warehouse) -> None:
             )
 
 
-def _drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
-    """Return a subject's drives in logs, quarantine and Gram rows."""
-    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
-    drives: set[str] = set().union(*in_logs.values(), *located.drives.values())
-    for file in warehouse.quarantine.snapshot().files:
-        rows = warehouse.quarantine.read(file.path)
-        names = rows.filter(quarantined_of(rows, subject, ()))["drive_id"].drop_null()
-        drives.update(names.to_pylist())
-    return frozenset(drives)
-
-
 def _begin(
     warehouse: Warehouse,
     erasure_log: ErasureLog,
@@ -229,16 +213,6 @@ def _begin(
     digests = () if subject.kind == "before" else digests_of(warehouse, subject, located)
     erasure_log.begin(subject, len(drives), models, examined, set(digests))
     return models
-
-
-@retrying
-def _erase_quarantined(
-    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
-) -> None:
-    snapshot = warehouse.quarantine.snapshot()
-    add, remove = write_remaining_rows(snapshot, lambda rows: quarantined_of(rows, subject, drives))
-    if remove:
-        snapshot.commit_or_discard(Change(add=add, remove=remove, note={"job": "forget"}))
 
 
 @retrying
@@ -260,22 +234,6 @@ def _rewrite_logs(
     )
     rows = sum(file.rows for file in concerned) - sum(map(rows_in, added))
     return rows, len(added), len(concerned) - len(added)
-
-
-def _find_tables_with(
-    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
-) -> Iterator[str]:
-    """Yield the tables whose newest version still has rows of a subject."""
-    located = locate(warehouse.grams.snapshot(), subject)
-    if located.drives:
-        yield "grams"
-    if drives_by_file(warehouse.logs.snapshot(), subject, located):
-        yield "logs"
-    for file in warehouse.quarantine.snapshot().files:
-        rows = warehouse.quarantine.read(file.path)
-        if pc.any(quarantined_of(rows, subject, drives)).as_py():
-            yield "quarantine"
-            return
 
 
 def _find_pending(
@@ -325,26 +283,18 @@ class RetentionReport(Answer):
         """The drives that are kept because their day is implausible."""
         if not self.implausible_days:
             return None
-        shown = "; ".join(self.implausible_days[:DAYS_SHOWN])
-        more = len(self.implausible_days) - DAYS_SHOWN
         return AlarmError(
-            f"drives of implausible days were not erased by age: {shown}"
-            f"{f'; {more} more' if more > 0 else ''}. Erase them with fleet-slip forget --drive "
-            "DRIVE, or set the clock of their logger, correct the day in the mapping and ingest "
-            "them again."
+            f"drives of {pluralize(len(self.implausible_days), 'implausible day')} were not erased "
+            f"by age, such as {self.implausible_days[0]}. Erase them with fleet-slip forget "
+            "--drive DRIVE, or correct the day in the mapping and ingest them again."
         )
 
     def parts(self) -> Iterator[Part]:
         """Return remarks: the erased drives and the removed files."""
         if self.forgotten.changed:
             yield from self.forgotten.parts()
-            yield Remark(
-                "their files are not read again; drives as old that come in other files do, until "
-                "the next forget --expired"
-            )
         else:
-            limit = " with a plausible day" if self.implausible_days else ""
-            yield Remark(f"no drive{limit} is older than {self.before}")
+            yield Remark(f"no drive of a plausible day is older than {self.before}")
         yield self.vacuumed.remark
 
 
@@ -408,63 +358,42 @@ def _days_of_drives(warehouse: Warehouse, today: date) -> dict[date, str]:
 
 # Marks of model versions that were trained on drives erased later.
 #
-# An erasure examines the versions that exist. A version published during it, on older Gram rows,
-# is marked until the erasure has ended; then only if one of its drives has no Gram rows any more,
-# or its drives are unknown.
+# An erasure examines the versions that exist. Later ones are marked while it is under way, and
+# afterwards if they were trained on Gram rows from before its end.
 
 
 def marked_models(warehouse: Warehouse) -> frozenset[str]:
     """Return the model versions, NAME@VERSION, that were or may have been trained on them."""
     entries = ErasureLog(warehouse.root).entries()
     marked = {name for entry in entries for name in entry.get("models", ())}
-    judged: dict[str, dict[str, int]] = {}
-    without: dict[str, int | None] = {}
+    examined: dict[str, dict[str, int]] = {}
+    ended: dict[str, int | None] = {}
     for entry in entries:
         if entry["event"] == "begun" and "judged" in entry:
-            judged[entry["subject"]] = entry["judged"]
-            without[entry["subject"]] = None
+            examined[entry["subject"]] = entry["judged"]
+            ended[entry["subject"]] = None
         elif entry["event"] == "done":
-            without[entry["subject"]] = entry.get("grams_version")
+            ended[entry["subject"]] = entry.get("grams_version")
     registry = Registry.open(warehouse)
-    versions = [(n, number) for n in registry.names() if judged for number in registry.versions(n)]
-    hashes = cache(lambda: _hashes_of_present(warehouse))
-    present = cache(lambda name: TrainedDrives.from_hashes(name, hashes()).salted)
-    for subject, numbers in judged.items():
-        marked |= {
-            f"{name}@{number}"
-            for name, number in versions
-            if number > numbers.get(name, 0)
-            and _may_have_seen(registry, name, number, without[subject], present)
-        }
+    for name in registry.names() if examined else ():
+        for number in registry.versions(name):
+            later = [ended[s] for s, numbers in examined.items() if number > numbers.get(name, 0)]
+            if later and _is_trained_before(registry, name, number, later):
+                marked.add(f"{name}@{number}")
     return frozenset(marked)
 
 
-def _hashes_of_present(warehouse: Warehouse) -> Hashes:
-    grams = warehouse.grams.snapshot()
-    drives = (grams.table.read(file.path, ["drive_id"])["drive_id"] for file in grams.files)
-    hashes = [hash_names(names.unique()) for names in drives]
-    return np.unique(np.concatenate(hashes)) if hashes else np.array([], dtype=np.uint64)
-
-
-def _may_have_seen(
-    registry: Registry,
-    name: str,
-    number: int,
-    without: int | None,
-    present: Callable[[str], Hashes],
+def _is_trained_before(
+    registry: Registry, name: str, number: int, ends: Sequence[int | None]
 ) -> bool:
-    """Return True if a version may be trained on drives without Gram rows since `without`."""
-    if without is None:
-        return True
+    """Return True if Gram rows from before the end of an erasure may have trained a version."""
     try:
         manifest = registry.load(name, number).manifest
-        trained_here = manifest.imported_from is None
-        if trained_here and manifest.trained_on.grams_version >= without:
-            return False
-        trained = registry.trained_drives(manifest)
-        return not bool(np.isin(trained.salted, present(name)).all())
     except FleetSlipError:
         return True
+    if manifest.imported_from is not None:  # from Gram rows of another data root
+        return True
+    return any(end is None or manifest.trained_on.grams_version < end for end in ends)
 
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:

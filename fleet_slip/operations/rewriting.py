@@ -22,7 +22,6 @@ from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.gram_files import read_rows, write_rows
 from fleet_slip.grams.update import commit_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
@@ -41,7 +40,7 @@ from fleet_slip.storage.table import (
     scales_of,
 )
 from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.gram_reader import is_onboard, rows_of_set
+from fleet_slip.warehouse.gram_reader import is_onboard_file, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -156,39 +155,44 @@ def _order(rows: pa.Table) -> IntArray:
     return np.lexsort((rows["tick"].to_numpy(), drive))
 
 
-def write_remaining_rows(
-    snapshot: Snapshot, is_removed: Callable[[pa.Table], pa.ChunkedArray]
-) -> tuple[list[AddAction], list[TableFile]]:
-    """Write the files of a table again that have rows which go; return them, and the old ones."""
+def without_rows(
+    snapshot: Snapshot,
+    files: Iterable[TableFile],
+    is_removed: Callable[[pa.Table], pa.ChunkedArray],
+) -> tuple[Change, list[pa.Table]]:
+    """Write the files of a table again that have rows which go; return the change, and these."""
     add: list[AddAction] = []
     remove: list[TableFile] = []
-    for file in snapshot.files:
+    removed_rows = []
+    for file in files:
         rows = snapshot.table.read(file.path)
-        remaining = rows.filter(pc.invert(is_removed(rows)))
-        if remaining.num_rows < rows.num_rows:
+        mask = is_removed(rows)
+        if pc.any(mask).as_py():
             remove.append(file)
-            add += [snapshot.table.write_file("kept", remaining)] if remaining.num_rows else []
-    return add, remove
+            removed_rows.append(rows.filter(mask))
+            if (remaining := rows.filter(pc.invert(mask))).num_rows:
+                add.append(snapshot.table.write_file(file.path.rpartition("-x")[0], remaining))
+    return Change(add, remove, note={"job": "forget"}), removed_rows
 
 
 @retrying
-def erase_onboard_rows(warehouse: Warehouse, subject: ErasureSubject) -> int:
-    """Commit the Gram rows without those that came without a log; return how many rows."""
-    snapshot = warehouse.grams.snapshot()
-    concerned: list[TableFile] = []
-    rows = 0
-    for file in snapshot.files:
-        names = warehouse.grams.read(file.path, ["file", "drive_id", "vehicle_id", "day", "n"])
-        selected = pc.and_(rows_of(names, subject), is_onboard(names))
-        if pc.any(selected).as_py():
-            concerned.append(file)
-            rows += pc.sum(names.filter(selected)["n"]).as_py()
-    if concerned:
-        read = (read_rows(warehouse.grams, file) for file in concerned)
-        remaining = (r.filter(pc.invert(pc.and_(rows_of(r, subject), is_onboard(r)))) for r in read)
-        add = write_rows(warehouse, remaining)
-        snapshot.commit_or_discard(Change(add=add, remove=concerned, note={"job": "forget"}))
-    return rows
+def erase_rows(table: Table, is_removed: Callable[[pa.Table], pa.ChunkedArray]) -> None:
+    """Commit a table without some rows."""
+    snapshot = table.snapshot()
+    change, removed_rows = without_rows(snapshot, snapshot.files, is_removed)
+    if removed_rows:
+        snapshot.commit_or_discard(change)
+
+
+@retrying
+def erase_onboard_rows(grams: Table, subject: ErasureSubject) -> int:
+    """Commit the Gram rows without those that cars sent; return the rows that they count."""
+    snapshot = grams.snapshot()
+    files = [file for file in snapshot.files if is_onboard_file(file)]
+    change, removed_rows = without_rows(snapshot, files, lambda rows: rows_of(rows, subject))
+    if removed_rows:
+        snapshot.commit_or_discard(change)
+    return sum(pc.sum(rows["n"]).as_py() for rows in removed_rows)
 
 
 # Removal of drives that others replace.
@@ -224,9 +228,10 @@ def _without_refused(snapshot: Snapshot, sources: Collection[SourceRef]) -> Chan
         removed = [n for n in names.unique().drop_null().to_pylist() if is_from(n, sources)]
         return pc.fill_null(pc.is_in(names, pa.array(removed, pa.string())), False)
 
-    add, remove = write_remaining_rows(snapshot, is_removed)
+    change, _ = without_rows(snapshot, snapshot.files, is_removed)
     files = {source for source in sources if source == source.file}
-    return Change(add, remove, Fingerprints(snapshot.transactions).withdraw((), files))
+    transactions = Fingerprints(snapshot.transactions).withdraw((), files)
+    return dataclasses.replace(change, transactions=transactions, note={})
 
 
 def drives_in(warehouse: Warehouse, logs: Snapshot) -> dict[str, set[str]]:

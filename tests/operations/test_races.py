@@ -26,7 +26,7 @@ from fleet_slip.operations import rewriting
 from fleet_slip.operations.find_drives import find_expired
 from fleet_slip.operations.forget import forget, marked_models
 from fleet_slip.operations.rewriting import compact
-from fleet_slip.operations.verify import repair, verify
+from fleet_slip.operations.verify import verify
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.simulate import simulate_batches
@@ -250,17 +250,7 @@ def test_vacuum_does_not_move_what_took_the_place_of_a_leftover(
     assert not verify(warehouse).damage
 
 
-def test_repair_finds_a_file_by_its_checksum_under_any_name(tmp_path: Path) -> None:
-    warehouse = fill(tmp_path, "alfa")
-    path = Path(warehouse.logs.snapshot().paths[0])
-    path.rename(path.with_name(".tmp-0123"))
-    report = verify(warehouse)
-    assert report.damage
-    assert repair(warehouse, report) == [str(path.relative_to(tmp_path))]
-    assert not verify(warehouse, full=True).damage
-
-
-def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their_own_drives(
+def test_versions_published_from_gram_rows_before_an_erasure_are_marked(
     tmp_path: Path,
 ) -> None:
     """Whoever selected before the erasure and publishes after it."""
@@ -274,9 +264,9 @@ def test_versions_published_from_gram_rows_before_an_erasure_are_judged_by_their
     forget(warehouse, BETA, now=True)
     for name, answer in answers.items():
         publish_challenger(registry, manifests[name], answer, force=True)
-    assert marked_models(warehouse) == {"of_all@1"}
-    (kept,) = Path(str(registry.folder_of("of_others"))).glob("drives-*.bin")
-    kept.unlink()  # then it cannot be told
+    assert marked_models(warehouse) == {"of_all@1", "of_others@1"}
+    answer = run_selection(warehouse, SelectionRequest(order="ay,yaw_rate"))
+    publish_challenger(registry, manifest_of(answer, "later"), answer, force=True)
     assert marked_models(warehouse) == {"of_all@1", "of_others@1"}
 
 
