@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 class Fleet:
     """The fleet of a data root; `fleet_slip.open` returns one.
 
-    Threads may share it. Close it, or use it in a `with` block, to release the connections that it
-    keeps between calls; it can be used again afterwards. Calls that change the data root are
-    recorded in the view `runs`. Every call raises `StorageError` if the root cannot be read or
+    Threads may share it. Close it, or use it in a `with` block, to release the tables and models
+    that it keeps between calls; it can be used again afterwards. Calls that change the data root
+    are recorded in the view `runs`. Every call raises `StorageError` if the root cannot be read or
     written.
 
     Attributes
@@ -94,7 +94,7 @@ class Fleet:
         return FleetMaintenance(self.warehouse)
 
     def close(self) -> None:
-        """Release the connections and models that are kept between calls."""
+        """Release the tables and models that are kept between calls."""
         self.warehouse.close()
 
     def __enter__(self) -> Self:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 from fleet_slip.base import document_of
 from fleet_slip.errors import StorageError, hide_passwords, printable
 from fleet_slip.rendering import FILE_WIDTH, Answer, Part, Remark, TextTable, wrap_lines
+from fleet_slip.storage.folder import storage_errors
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.storage.storage_errors import storage_errors
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -26,7 +26,6 @@ from fleet_slip.grams.update import commit_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
 from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
-from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -325,10 +324,8 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
         yield pack
 
 
-# Brings the tables of a data root to this program and to the signal catalog, step by step.
-#
-# 1. Documents of earlier formats are rewritten, and their folders anchored.
-# 2. Every table gets the columns that came later. No file is touched: there they are null.
+# Brings the tables of a data root to the signal catalog: every table gets the columns that came
+# later. No file is touched: there they are null.
 
 
 @dataclass(frozen=True)
@@ -338,22 +335,18 @@ class MigrationReport(Answer):
     added: tuple[str, ...]
     retired: tuple[str, ...]
     logs_version: int | None
-    sealed: tuple[str, ...] = ()
-    """Folders whose documents were brought to the present format, or anchored."""
 
     @property
     def changed(self) -> bool:
         """True if there was anything to do."""
-        return bool(self.added or self.sealed)
+        return bool(self.added)
 
     def parts(self) -> Iterator[Part]:
-        """Return remarks: the added columns and anchored folders."""
+        """Return a remark on the added columns."""
         if not self.changed:
             yield Remark("migrate: nothing to do, the logs agree with the signal catalog")
         if self.added:
             yield Remark(f"added: {', '.join(self.added)}; null in the files that are there")
-        if self.sealed:
-            yield Remark(f"anchored the documents of {', '.join(self.sealed)}")
 
 
 def migrate(warehouse: Warehouse) -> MigrationReport:
@@ -362,7 +355,6 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
     Raises `RefusedError` if the counts are in other scales, and `ConflictError`.
     """
     warehouse.require()
-    sealed = tuple(folder.path for folder in document_folders(warehouse.root) if folder.seal())
     evolution: Evolution | None = None
     for table in (warehouse.quarantine, warehouse.grams, warehouse.logs):
         delta = table.open_delta()
@@ -371,9 +363,9 @@ def migrate(warehouse: Warehouse) -> MigrationReport:
             evolution = table.require_readable(delta)
             _add_columns(table, delta, evolution)
     if evolution is None:
-        return MigrationReport((), (), None, sealed=sealed)
+        return MigrationReport((), (), None)
     version = warehouse.logs.snapshot().version
-    return MigrationReport(evolution.added, evolution.retired, version, sealed)
+    return MigrationReport(evolution.added, evolution.retired, version)
 
 
 def _add_columns(table: Table, delta: DeltaTable, evolution: Evolution) -> None:

@@ -27,9 +27,8 @@ from fleet_slip.quality.peers import thresholds
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.documents import find_lost
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, Folder, storage_errors
 from fleet_slip.storage.runs import add_runs, find_changed_lines, state_of
-from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Snapshot
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import find_erased

@@ -50,9 +50,8 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.commits import LATEST, LOG, check_commits, find_commit_faults
 from fleet_slip.storage.data_files import checksum_in, checksum_of, read_names
 from fleet_slip.storage.documents import document_folders
-from fleet_slip.storage.folder import Folder
+from fleet_slip.storage.folder import Folder, storage_errors
 from fleet_slip.storage.runs import find_changed_lines
-from fleet_slip.storage.storage_errors import storage_errors
 from fleet_slip.storage.table import Change, Snapshot, Table, TableFile, retry_if_stale, retrying
 from fleet_slip.warehouse.database import database_errors, open_database
 from fleet_slip.warehouse.erasure_log import ErasureLog
@@ -382,12 +381,8 @@ def verify_documents(root: Folder, report: Verification) -> None:
     """Report documents that are lost, moved or changed, and changed lines of the history."""
     for folder in document_folders(root):
         report.documents += len(folder.inventory().present)
-        faults = folder.faults()
-        for file, problem in faults.items():
+        for file, problem in folder.faults().items():
             report.note("document", file.removeprefix(f"{root}/"), problem)
-        if not faults and folder.needs_seal():
-            problem = "documents without an anchor or of an earlier format; run: fleet-slip migrate"
-            report.note("backlog", folder.path, problem)
     for path, problem in find_changed_lines(root):
         report.note("document", path, problem)
 

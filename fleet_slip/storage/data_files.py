@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import xxhash
 
 from fleet_slip.errors import StorageError
-from fleet_slip.storage.storage_errors import storage_errors
+from fleet_slip.storage.folder import storage_errors
 
 if TYPE_CHECKING:
     import pyarrow as pa

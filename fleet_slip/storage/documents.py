@@ -9,8 +9,7 @@ a lost document, also the newest:
     anchors/FOLDER/3.lost          somebody accepted the loss of document 3
 
 A process killed between document and anchor leaves a valid folder; the next document is anchored
-again. Only the first and the newest anchor stay. The first one separates documents of earlier
-versions, whose checksum covers the content alone, from later ones.
+again. Only the newest anchor stays.
 """
 
 import contextlib
@@ -29,7 +28,7 @@ ANCHORS = "anchors"
 """Folder of the anchors. It sorts before all others, so a copy in that order takes them first."""
 
 FORMAT = 2
-"""Format of the documents. Those of versions before 0.3.0 state none."""
+"""Format of the documents."""
 
 MAX_LOST = 100
 """Number of lost documents of a folder that are listed."""
@@ -122,37 +121,31 @@ class DocumentFolder:
         try:
             envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
             _require_depth(envelope)
-            content, stated = envelope["content"], envelope["sha256"]
-            place = {key: envelope[key] for key in _PLACE if "format" in envelope}
-            document = Document(number, content, checksum(content))
-            expected = _seal(place, document.sha256)
+            document = Document(number, envelope["content"], checksum(envelope["content"]))
+            place = {key: envelope[key] for key in ("format", "folder", "number")}
+            is_intact = envelope["sha256"] == _seal(place, document.sha256)
         except (ValueError, KeyError, TypeError, RecursionError):
-            raise StorageError(f"{file}: not a document of this program. {_RESTORE}") from None
-        if expected != stated:
+            raise StorageError(
+                f"{file}: not a document of this program, or of a development version before "
+                f"0.3.0. {_RESTORE}"
+            ) from None
+        if not is_intact:
             raise StorageError(
                 f"{file}: its content does not match its SHA-256; it was changed or damaged. "
                 f"{_RESTORE}"
             )
-        if place and place["format"] != FORMAT:
+        if place != self._place(number):
             raise StorageError(
-                f"{file}: format {place['format']}, which this release cannot read. Upgrade it."
+                f"{file}: a copy of document {place['number']} of {place['folder']}, or of a later "
+                f"release, in format {place['format']}. {_RESTORE} Otherwise upgrade fleet-slip."
             )
-        if place and place != self._place(number):
-            raise StorageError(
-                f"{file}: a copy of document {place['number']} of {place['folder']}. {_RESTORE}"
-            )
-        if not place and number >= min(self._anchored(), default=10**MAX_DIGITS):
-            raise StorageError(
-                f"{file}: in the format of earlier versions, but the folder is of a later one; the "
-                f"file came from another place. {_RESTORE}"
-            )
-        return document, text == _rendered(place, content, stated)
+        return document, text == self._sealed(document)
 
     def faults(self) -> dict[str, str]:
         """Return the problems of the files of the folder, by file, down to the last byte."""
         inventory = self.inventory()
         problems = {self.file(number): self._loss(number) for number in inventory.lost}
-        anchored = sorted(self._anchored())
+        anchored = sorted(_numbers_in(self._anchors.names(), "sha256"))
         texts = self._anchors.read_many(list(map(_anchor, anchored)))  # None: removed meanwhile
         anchors = {number: text for number, text in zip(anchored, texts, strict=True) if text}
         for number in inventory.present:
@@ -195,33 +188,11 @@ class DocumentFolder:
         return None
 
     def _anchor(self, document: Document) -> None:
-        """Record that a document exists, and remove the anchors between the first and the last."""
+        """Record that a document exists, and remove earlier anchors."""
         self._anchors.create(_anchor(document.number), _text_of(document))
         with contextlib.suppress(StorageError):  # without the right to delete, they stay
-            for number in sorted(self._anchored())[1:-1]:
+            for number in sorted(_numbers_in(self._anchors.names(), "sha256"))[:-1]:
                 self._anchors.delete(_anchor(number))
-
-    def needs_seal(self) -> bool:
-        """Return True if `seal` has something to do."""
-        numbers = self.inventory().present
-        return bool(numbers) and not {numbers[0], numbers[-1]} <= self._anchored()
-
-    def seal(self) -> bool:
-        """Rewrite documents of earlier versions in the present format, and anchor the folder.
-
-        Returns False if there was nothing to do. Raises `StorageError` if a document is damaged or
-        lost.
-        """
-        if not self.needs_seal():
-            return False
-        documents = [self.read(number) for number in self.numbers()]
-        for document in reversed(documents):  # never an earlier format after the present one
-            text = self._sealed(document)
-            if self.folder.read(document_file(document.number)) != text:
-                self.folder.put(document_file(document.number), text)
-        self._anchor(documents[-1])
-        self._anchor(documents[0])
-        return True
 
     def accept_loss(self, number: int) -> None:
         """Go on without a lost document, for good. Its number is not taken again."""
@@ -230,10 +201,6 @@ class DocumentFolder:
     def file(self, number: int) -> str:
         """Return the path of a document."""
         return f"{self.folder}/{document_file(number)}"
-
-    def _anchored(self) -> set[int]:
-        """Return the numbers of the anchors."""
-        return _numbers_in(self._anchors.names(), "sha256")
 
     def _loss(self, number: int) -> str:
         return (
@@ -246,7 +213,9 @@ class DocumentFolder:
 
     def _sealed(self, document: Document) -> bytes:
         place = self._place(document.number)
-        return _rendered(place, document.content, _seal(place, document.sha256))
+        seal = _seal(place, document.sha256)
+        envelope = {**place, "content": document.content, "sha256": seal}
+        return (json.dumps(envelope, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def document_folders(root: Folder) -> list[DocumentFolder]:
@@ -337,17 +306,9 @@ def _text_of(document: Document) -> bytes:
     return f"{document.sha256}\n".encode()
 
 
-_PLACE = ("format", "folder", "number")
-
-
 def _seal(place: Mapping[str, Any], sha256: str) -> str:
     """Return the checksum of a document from its place and the checksum of its content."""
-    return checksum({**place, "content": sha256}) if place else sha256
-
-
-def _rendered(place: Mapping[str, Any], content: Mapping[str, Any], sha256: str) -> bytes:
-    envelope = {**place, "content": content, "sha256": sha256}
-    return (json.dumps(envelope, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    return checksum({**place, "content": sha256})
 
 
 _RESTORE = "Restore the file from a backup."

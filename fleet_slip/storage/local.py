@@ -22,8 +22,7 @@ from urllib.parse import unquote, urlsplit
 from fleet_slip.base import require_extra
 from fleet_slip.errors import StorageError
 from fleet_slip.storage.data_files import check_local_files
-from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, Folder, StoredFile
-from fleet_slip.storage.storage_errors import storage_errors
+from fleet_slip.storage.folder import TEMPORARY_PREFIX, Content, Folder, StoredFile, storage_errors
 
 if TYPE_CHECKING:
     import pyarrow as pa

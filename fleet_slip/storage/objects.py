@@ -25,8 +25,7 @@ from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
 from fleet_slip.storage.data_files import require_content
-from fleet_slip.storage.folder import Content, Folder, StoredFile
-from fleet_slip.storage.storage_errors import NoSuchObjectError, object_errors
+from fleet_slip.storage.folder import Content, Folder, NoSuchObjectError, StoredFile, object_errors
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore

@@ -26,8 +26,7 @@ from fleet_slip.storage.commits import (
     read_transactions,
 )
 from fleet_slip.storage.data_files import Encoded, Encoding, read_names
-from fleet_slip.storage.folder import Folder
-from fleet_slip.storage.storage_errors import first_line, storage_errors
+from fleet_slip.storage.folder import Folder, first_line, storage_errors
 
 # pyarrow and the Delta library are imported by the functions that use them: together they take
 # longer to start than a command that only reads documents.

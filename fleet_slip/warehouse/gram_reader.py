@@ -30,7 +30,7 @@ from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import Snapshot, TableFile
 from fleet_slip.warehouse.predicate import Predicate, guarded_query
 from fleet_slip.warehouse.table_views import gram_snapshots, lock, open_tables
-from fleet_slip.warehouse.warehouse import IdleConnection, Warehouse
+from fleet_slip.warehouse.warehouse import Warehouse
 
 Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
 
@@ -241,8 +241,7 @@ class OpenedGrams:
 class GramReader:
     """The newest Gram rows of a warehouse, for one cohort after another in one thread.
 
-    A database is reused until the next commit, so that a cohort costs only its query. The next
-    reader of the warehouse takes it over, since DuckDB takes 20 ms to start.
+    A database is reused until the next commit, so that a cohort costs only its query.
     """
 
     def __init__(self, warehouse: Warehouse) -> None:
@@ -250,20 +249,12 @@ class GramReader:
         self._logs: Snapshot | None = None
         self._grams: Snapshot | None = None
         self._database: duckdb.DuckDBPyConnection | None = None
-        self._uses = 1
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind or not self._grams or not self._logs or self._grams.size_bytes > MAX_REUSED_BYTES:
-            self._close()
-        elif self._database and self._uses < MAX_USES:
-            connection = IdleConnection(self._grams, self._logs, self._database, self._uses)
-            self.warehouse.connections.put(connection)
-            self._database = None
-        else:
-            self._close()
+    def __exit__(self, *_: object) -> None:
+        self._close()
 
     def opened(self, feature_set: str, predicate: Predicate) -> OpenedGrams:
         """Open the Gram rows of a feature set, which are valid until the next call.
@@ -288,8 +279,6 @@ class GramReader:
         return self._opened(grams, logs, feature_set)
 
     def _opened(self, grams: Snapshot, logs: Snapshot, feature_set: str) -> OpenedGrams:
-        if self._database is None and (idle := self.warehouse.connections.take(grams, logs)):
-            self._database, self._uses = idle.database, idle.uses + 1
         if self._database is None:
             self._database = open_tables(self.warehouse, {"grams"}, [grams, logs])
             lock(self._database, grams.paths)
@@ -305,13 +294,6 @@ class GramReader:
         if self._database is not None:
             self._database.close()
             self._database = None
-
-
-MAX_USES = 20
-"""Maximum number of readers of a database, which lists all files that its queries open."""
-
-MAX_REUSED_BYTES = 2**27
-"""Size of Gram rows above which a database is closed: it may have them in memory."""
 
 
 @contextlib.contextmanager

@@ -2,10 +2,10 @@
 
 import json
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -19,78 +19,10 @@ from fleet_slip.storage.data_files import Encoding
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import data_root
-from fleet_slip.storage.table import SCALE, Snapshot, Table
+from fleet_slip.storage.table import SCALE, Table
 
 if TYPE_CHECKING:
-    import duckdb
     import pyarrow as pa
-
-
-class IdleConnection(NamedTuple):
-    """A connection to the Gram rows of two snapshots, and how many readers have used it."""
-
-    grams: Snapshot
-    logs: Snapshot
-    database: "duckdb.DuckDBPyConnection"
-    uses: int
-
-
-class ConnectionCache:
-    """Holds at most one idle connection. A `Warehouse` owns it.
-
-    DuckDB takes 20 ms to start, so that a second reader of the same snapshots reuses a connection.
-    Threads and forked processes may use it at once: list operations are atomic, and no lock can be
-    inherited in a locked state.
-    """
-
-    def __init__(self) -> None:
-        """Start without a connection."""
-        self._idle: list[tuple[int, IdleConnection]] = []
-        self._is_closed = False
-
-    def take(self, grams: Snapshot, logs: Snapshot) -> IdleConnection | None:
-        """Return the idle connection if it is of these snapshots; close it otherwise."""
-        connection = self._pop()
-        if connection is None:
-            return None
-        if connection.grams is grams and connection.logs is logs:
-            return connection
-        connection.database.close()
-        return None
-
-    def put(self, connection: IdleConnection) -> None:
-        """Keep a connection for the next reader, instead of the previous one."""
-        if previous := self._pop():
-            previous.database.close()
-        if self._is_closed:
-            connection.database.close()
-        else:
-            self._idle.append((os.getpid(), connection))
-
-    def close(self) -> None:
-        """Close the idle connection. Connections of later readers are closed with them."""
-        self._is_closed = True
-        if connection := self._pop():
-            connection.database.close()
-
-    def _pop(self) -> IdleConnection | None:
-        """Remove and return the idle connection of this process."""
-        try:
-            process, connection = self._idle.pop()
-        except IndexError:
-            return None
-        if process == os.getpid():
-            return connection
-        import ctypes  # slow
-
-        # Inherited by a fork, without its threads: to destroy it would crash the process.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(connection.database))
-        return None
-
-    def __del__(self) -> None:
-        """Close the idle connection, unless another process owns it."""
-        if connection := self._pop():
-            connection.database.close()
 
 
 LINES = "lines"
@@ -147,18 +79,13 @@ class Warehouse:
         Folder of the data root.
     configs
         Configuration files that the catalog is loaded from.
-    connections
-        The idle connection to the Gram rows.
     """
 
     root: Folder
     configs: Configs = SHIPPED_CONFIGS
-    connections: ConnectionCache = field(
-        default_factory=ConnectionCache, init=False, repr=False, compare=False
-    )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle without connections; with the catalog, unless it is the shipped one.
+        """Pickle without tables; with the catalog, unless it is the shipped one.
 
         A worker elsewhere need not have the folder of configs.
         """
@@ -167,8 +94,7 @@ class Warehouse:
         return _unpickle, (self.root, self.configs, self.catalog)
 
     def close(self) -> None:
-        """Release the idle connection, the tables, and the first-stage models that were read."""
-        self.connections.close()
+        """Release the tables, and the first-stage models that were read."""
         self.stacked_models.clear()
         for table in ("logs", "grams", "quarantine"):
             self.__dict__.pop(table, None)

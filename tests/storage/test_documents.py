@@ -5,7 +5,6 @@ import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,7 +12,6 @@ from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.storage.documents import (
     DocumentFolder,
     accept_losses,
-    checksum,
     document_folders,
     find_lost,
 )
@@ -22,13 +20,6 @@ from fleet_slip.storage.local import LocalFolder
 from tests.support.logs import path_of
 
 PATH = "models/m/history"
-
-
-def write_old(folder: DocumentFolder, number: int, content: dict[str, Any]) -> None:
-    """Write a document as versions before 0.3.0 did, whose checksum covers the content alone."""
-    envelope = {"content": content, "sha256": checksum(content)}
-    text = json.dumps(envelope, indent=1, ensure_ascii=False) + "\n"
-    folder.folder.put(f"{number}.json", text.encode())
 
 
 @pytest.fixture
@@ -127,10 +118,8 @@ def test_a_process_killed_before_the_anchor_leaves_a_valid_folder(
             folder.append({"n": 5})
     assert folder.numbers() == [1, 2, 3, 4, 5]
     assert not folder.faults()
-    assert folder.needs_seal()
     folder.append({"n": 6})
-    assert anchors(folder) == ["1.sha256", "6.sha256"]
-    assert not folder.needs_seal()
+    assert anchors(folder) == ["6.sha256"]
 
 
 def test_writers_and_readers_at_once_see_no_loss(place: Folder) -> None:
@@ -180,10 +169,6 @@ def take_from_another_model(folder: DocumentFolder) -> None:
     shutil.copy(file(other, 2), file(folder, 2))
 
 
-def take_from_an_old_root(folder: DocumentFolder) -> None:
-    write_old(folder, 2, {"n": 2})
-
-
 def state_another_number(folder: DocumentFolder) -> None:
     envelope = json.loads(file(folder, 3).read_text())
     file(folder, 2).write_text(json.dumps(envelope | {"number": 2}))
@@ -196,7 +181,7 @@ def state_no_place(folder: DocumentFolder) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [swap, take_from_another_model, take_from_an_old_root, state_another_number, state_no_place],
+    [swap, take_from_another_model, state_another_number, state_no_place],
 )
 def test_a_document_counts_in_its_place_alone(
     folder: DocumentFolder, change: Callable[[DocumentFolder], None]
@@ -215,61 +200,3 @@ def test_a_newest_document_of_another_root_is_a_fault(
         other.append({"n": "other"})
     shutil.copy(file(other, 4), file(folder, 4))
     assert "was replaced" in folder.faults()[folder.file(4)]
-
-
-@pytest.fixture
-def old(place: Folder) -> DocumentFolder:
-    """Three documents in the format before 0.3.0."""
-    folder = DocumentFolder(place, PATH)
-    for number in (1, 2, 3):
-        write_old(folder, number, {"n": number})
-    return folder
-
-
-def numbers_read(folder: DocumentFolder) -> list[int]:
-    return [folder.read(number).content["n"] for number in folder.numbers()]
-
-
-def test_documents_of_earlier_versions_are_read_and_continued(old: DocumentFolder) -> None:
-    assert numbers_read(old) == [1, 2, 3]
-    assert not old.faults()
-    old.append({"n": 4})
-    assert numbers_read(old) == [1, 2, 3, 4]
-    write_old(old, 4, {"n": 3})
-    with pytest.raises(StorageError, match="earlier versions"):
-        old.read(4)
-
-
-@pytest.mark.parametrize("appended", [False, True])
-def test_documents_of_earlier_versions_get_the_present_format(
-    old: DocumentFolder, appended: bool
-) -> None:
-    if appended:
-        old.append({"n": 4})
-    before = [old.read(number) for number in old.numbers()]
-    assert old.seal()
-    assert not old.seal()
-    assert [old.read(number) for number in old.numbers()] == before
-    assert not old.faults()
-    exchange(file(old, 1), file(old, 2))
-    with pytest.raises(StorageError, match="a copy of document 2"):
-        old.read(1)
-
-
-def test_a_migration_killed_after_any_file_is_continued(
-    old: DocumentFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    put = LocalFolder.put
-
-    def put_once(self: LocalFolder, path: str, content: bytes) -> None:
-        monkeypatch.setattr(LocalFolder, "put", kill)
-        put(self, path, content)
-
-    for _ in range(2):
-        monkeypatch.setattr(LocalFolder, "put", put_once)
-        with pytest.raises(KeyboardInterrupt):
-            old.seal()
-        assert numbers_read(old) == [1, 2, 3]
-    monkeypatch.setattr(LocalFolder, "put", put)
-    assert old.seal()
-    assert numbers_read(old) == [1, 2, 3]

@@ -5,8 +5,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import duckdb
-import numpy as np
 import pytest
 
 from fleet_slip.catalog.catalog import FirstStageModel
@@ -18,7 +16,7 @@ from fleet_slip.resources import folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, configs_with
-from tests.support.logs import ask, land, log_rows, path_of, random_counts
+from tests.support.logs import ask, path_of
 from tests.support.measured import a_mapping, csv_text, ingest_file
 
 SHIPPED = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
@@ -93,29 +91,6 @@ def test_two_roots_in_one_process_have_each_their_own_results(
     assert (before["scale"], found["scale"]) == ([("0.001 m/s^2",)], [("0.002 m/s^2",)])
     with pytest.raises(QuestionError, match="no feature set is called 'doubled'"):
         update_grams(warehouse, feature_set="doubled")
-
-
-def read(warehouse: Warehouse) -> duckdb.DuckDBPyConnection:
-    """Read a cohort; return the connection that waits for the next reader."""
-    load_cohort(warehouse, "true")
-    ((_, idle),) = warehouse.connections._idle
-    return idle.database
-
-
-def test_a_root_that_is_closed_or_collected_closes_its_connection(warehouse: Warehouse) -> None:
-    land(warehouse, "one", log_rows("a", random_counts(np.random.default_rng(1), 30)))
-    update_grams(warehouse)
-    another = Warehouse(warehouse.root)
-    connections = [read(warehouse), read(another)]
-    assert connections[0] is read(warehouse), "the second reader opened it anew"
-    warehouse.close()
-    load_cohort(warehouse, "true")
-    assert not warehouse.connections._idle
-    assert connections[1] is read(another), "closing a root closed another's connection"
-    del another
-    for connection in connections:
-        with pytest.raises(duckdb.ConnectionException):
-            connection.execute("SELECT 1")
 
 
 def first_stage_model() -> FirstStageModel:
