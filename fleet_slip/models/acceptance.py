@@ -10,15 +10,14 @@ many small losses must not add up.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.config import Config, load_config, refuse_renamed
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
@@ -57,11 +56,6 @@ class PublishThresholds(Config):
     max_columns_per_drive: float = Field(default=3.0, gt=0)
     min_rows_per_column: int = Field(default=100, ge=1)
 
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_renamed(cls, content: Any) -> Any:
-        return refuse_renamed(content, {"worth_deg": "tolerance_deg"})
-
     @property
     def tolerance(self) -> Tolerance:
         """RMSE gap to the champion that is no reason to refuse a challenger."""
@@ -99,8 +93,6 @@ class Comparison:
         RMSE gap of the challenger to each incumbent.
     unseen
         True if no incumbent was trained on these rows.
-    of_lines
-        True if a version has a filter, which is not compared.
     """
 
     by: FoldKey
@@ -108,16 +100,12 @@ class Comparison:
     incumbents: tuple[CrossValidation, ...]
     gaps: tuple[RmseGap, ...]
     unseen: bool = False
-    of_lines: bool = False
 
     @property
-    def better(self) -> tuple[CrossValidation, ...]:
+    def better(self) -> tuple[str, ...]:
         """The incumbents that the challenger is worse than."""
-        return tuple(
-            incumbent
-            for incumbent, shortfall in zip(self.incumbents, self.gaps, strict=True)
-            if not shortfall.negligible
-        )
+        pairs = zip(self.incumbents, self.gaps, strict=True)
+        return tuple(incumbent.name for incumbent, gap in pairs if not gap.negligible)
 
     @property
     def is_significantly_worse(self) -> bool:
@@ -125,11 +113,6 @@ class Comparison:
         gap = self.gaps[0]
         has_groups = len(self.challenger.folds) >= MIN_VEHICLES
         return has_groups and gap.rmse > MAX_STANDARD_ERRORS * gap.standard_error
-
-    @property
-    def contradicted(self) -> bool:
-        """True if an incumbent correlates negatively with the label."""
-        return any(incumbent.pooled.correlation < 0 for incumbent in self.incumbents)
 
     @property
     def best(self) -> str | None:
@@ -144,12 +127,11 @@ class Comparison:
             f"{incumbent.pooled.correlation:.4f}, difference {gap}"
             for incumbent, gap in zip(self.incumbents, self.gaps, strict=True)
         )
-        alone = "the linear model alone, since Gram rows contain no filter: " * self.of_lines
         return (
-            f"{alone}on the same {pluralize(challenger.rows, 'row')} of "
+            f"on the same {pluralize(challenger.rows, 'row')} of "
             f"{pluralize(self.challenger.drives, 'drive')}"
-            f"{' that are new to both' if self.unseen else ''}, held out "
-            f"in {len(self.challenger.folds)} groups by {self.by}, it has RMSE "
+            f"{' that are new to both' if self.unseen else ''}, held out in "
+            f"{len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; "
             f"{incumbents}"
         )
@@ -183,21 +165,56 @@ class ChallengerEvaluation:
     incumbents: dict[str, LinearModel]
     tolerance: Tolerance
 
-    def complete_folds(self, folds: CohortFolds) -> Folds:
-        """Return the folds of drives with all signals. Raises `DataError` without."""
-        return folds.complete_cases(self.signals, self.catalog.signals.label, sparse=True)
+    @classmethod
+    def prepare(
+        cls, selection: Selection, incumbents: Sequence[ModelVersion]
+    ) -> "ChallengerEvaluation":
+        """Prepare the comparison of a selection's winner with published versions.
 
-    def folds_of(self, cohort: Cohort, mask: BoolArray) -> Folds:
+        Raises `DataError` or `QuestionError` if columns of a version are defined differently now.
+        """
+        catalog, feature_set = selection.cohort.catalog, selection.cohort.feature_set
+        models = {}
+        for version in incumbents:
+            _require_same_columns(catalog, version, feature_set)
+            models[version.reference] = version.manifest.counts_model(catalog, feature_set)
+        winner, search = selection.winner.model, selection.searched_winner
+        label, intercept = catalog.signals.label, selection.intercept
+        inputs = winner.signals if search is None else search.inputs
+        incumbent_signals = (name for model in models.values() for name in model.signals)
+        signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))
+        cars = selection.cohort.count_vehicles_with((*signals, label))
+        by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
+        if search is None:
+            procedure = least_squares(inputs, label, intercept=intercept)
+        else:
+            procedure = search_procedure(label, search, len(winner.signals), intercept=intercept)
+        tolerance = load_thresholds(catalog.configs).tolerance
+        return cls(catalog, winner.name, signals, by, procedure, models, tolerance)
+
+    def groups_of(self, cohort: Cohort) -> Folds:
+        """Return the drives that have all signals, by group. Raises `DataError` without."""
+        return self._complete(cohort.folds(self.by, MAX_GROUPS))
+
+    def groups_within(self, cohort: Cohort, mask: BoolArray) -> Folds:
         """Return the masked drives in the groups of the whole cohort. Raises `DataError`."""
         values = cohort.drives[FOLD_KEYS[self.by]].to_pylist()
         groups = assign_folds(values, self.by, MAX_GROUPS)
         used, fold = np.unique(groups.fold[mask], return_inverse=True)
-        names = tuple(groups.names[number] for number in used.tolist())
+        assignment = FoldAssignment(fold, tuple(groups.names[number] for number in used.tolist()))
         drives = cohort.filter(mask)
-        assignment = FoldAssignment(fold, names)
-        return self.complete_folds(
+        return self._complete(
             CohortFolds.from_tables(drives.tables, assignment, drives.drive_numbers)
         )
+
+    def _complete(self, folds: CohortFolds) -> Folds:
+        return folds.complete_cases(self.signals, self.catalog.signals.label, sparse=True)
+
+    def as_published(self, reference: str, tested: Folds) -> CrossValidation:
+        """Return the figures of an incumbent without refitting it."""
+        model = self.incumbents[reference]
+        sums = [error_sums(model, test) for test in tested.grams]
+        return assemble(reference, tested, sums, model, self.catalog.input_scales)
 
     def compare(self, training: Folds, tested: Folds) -> Comparison:
         """Fit the challenger without each group of `training` and compare on `tested`."""
@@ -209,73 +226,11 @@ class ChallengerEvaluation:
         ]
         fitted = self.procedure(training.total)
         challenger = assemble(self.name, tested, sums, fitted, self.catalog.input_scales)
-        incumbents = tuple(
-            evaluate_frozen(self.catalog, name, model, tested)
-            for name, model in self.incumbents.items()
-        )
+        incumbents = tuple(self.as_published(name, tested) for name in self.incumbents)
         gaps = tuple(
             compare_paired(challenger, incumbent, self.tolerance) for incumbent in incumbents
         )
         return Comparison(self.by, challenger, incumbents, gaps)
-
-
-def prepare_evaluation(
-    selection: Selection, incumbents: Sequence[ModelVersion]
-) -> ChallengerEvaluation:
-    """Prepare the comparison of a selection's winner with published versions.
-
-    Raises `DataError` or `QuestionError` if columns of a version are defined differently now.
-    """
-    catalog, feature_set = selection.cohort.catalog, selection.cohort.feature_set
-    for version in incumbents:
-        _require_same_features(catalog, version, feature_set)
-    winner, search = selection.winner.model, selection.searched_winner
-    label = catalog.signals.label
-    inputs = search.inputs if search is not None else winner.signals
-    models = {
-        version.reference: version.manifest.counts_model(catalog, feature_set)
-        for version in incumbents
-    }
-    incumbent_signals = (name for model in models.values() for name in model.signals)
-    signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))
-    cars = selection.cohort.count_vehicles_with((*signals, label))
-    by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
-    intercept = selection.intercept
-    if search is not None:
-        procedure = search_procedure(label, search, len(winner.signals), intercept=intercept)
-    else:
-        procedure = least_squares(inputs, label, intercept=intercept)
-    tolerance = load_thresholds(catalog.configs).tolerance
-    return ChallengerEvaluation(catalog, winner.name, signals, by, procedure, models, tolerance)
-
-
-def compare(selection: Selection, incumbents: Sequence[ModelVersion]) -> Comparison:
-    """Compare a selection's winner with the published coefficients of versions.
-
-    Raises `DataError` or `QuestionError` if no drive has all signals, and as `prepare_evaluation`.
-    """
-    evaluation = prepare_evaluation(selection, incumbents)
-    groups = evaluation.complete_folds(selection.cohort.folds(evaluation.by, MAX_GROUPS))
-    return evaluation.compare(groups, groups)
-
-
-def compare_unseen(
-    registry: Registry, selection: Selection, incumbents: Sequence[ModelVersion]
-) -> Comparison | None:
-    """Compare only on drives that no incumbent was trained on: elsewhere it has an advantage.
-
-    Returns None if no drive, every drive, or drives of fewer than `MIN_VEHICLES` groups are such.
-    Raises as `compare`, and `StorageError` if a training set cannot be read.
-    """
-    if (split := _split_by_training(registry, selection, incumbents)) is None:
-        return None
-    cohort, is_trained = split
-    evaluation = prepare_evaluation(selection, incumbents)
-    groups = evaluation.folds_of(cohort, np.ones_like(is_trained))
-    unseen = evaluation.folds_of(cohort, ~is_trained)
-    if len(unseen.names) < MIN_VEHICLES:
-        return None
-    return replace(evaluation.compare(groups, unseen), unseen=True)
 
 
 MAX_REVIEWED_DRIVES = 20_000
@@ -284,33 +239,71 @@ MAX_REVIEWED_DRIVES = 20_000
 _HEX = 4
 
 
-def _split_by_training(
-    registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
-) -> tuple[Cohort, BoolArray] | None:
-    """Return a selection's cohort and the mask of drives that any of the versions was trained on.
+@dataclass(frozen=True)
+class TrainingSplit:
+    """The drives of a selection, with the mask of those that an incumbent was trained on."""
 
-    Returns None if the mask has one value. Raises `StorageError` if a training set cannot be read.
-    """
-    training_sets = [registry.trained_drives(version.manifest) for version in versions]
-    cohort = selection.cohort
-    if cohort.source is not None and cohort.sums is not None:
-        predicate, drives = cohort.predicate, cohort.drive_count
-        if drives > MAX_REVIEWED_DRIVES:
-            below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
-            sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-            predicate &= parse_predicate(cohort.catalog.signals, sample)
-        cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
-    hashes = hash_names(cohort.drives["drive_id"])
-    is_trained = np.any([drives.among(hashes) for drives in training_sets], axis=0)
-    return (cohort, is_trained) if is_trained.any() and not is_trained.all() else None
+    cohort: Cohort
+    is_trained: BoolArray
+
+    @classmethod
+    def load(
+        cls, registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
+    ) -> "TrainingSplit | None":
+        """Split the drives; return None if all are of one kind.
+
+        Raises `StorageError` if a training set cannot be read.
+        """
+        training_sets = [registry.trained_drives(version.manifest) for version in versions]
+        cohort = selection.cohort
+        if cohort.source is not None and cohort.sums is not None:
+            predicate, drives = cohort.predicate, cohort.drive_count
+            if drives > MAX_REVIEWED_DRIVES:
+                below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
+                sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
+                predicate &= parse_predicate(cohort.catalog.signals, sample)
+            cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
+        hashes = hash_names(cohort.drives["drive_id"])
+        is_trained = np.any([drives.among(hashes) for drives in training_sets], axis=0)
+        return cls(cohort, is_trained) if is_trained.any() and not is_trained.all() else None
+
+    def compare_unseen(self, evaluation: ChallengerEvaluation) -> Comparison | None:
+        """Compare on drives that no incumbent was trained on: elsewhere it has an advantage.
+
+        Returns None if they are of fewer than `MIN_VEHICLES` groups. Raises `DataError`.
+        """
+        groups = evaluation.groups_within(self.cohort, np.ones_like(self.is_trained))
+        unseen = evaluation.groups_within(self.cohort, ~self.is_trained)
+        if len(unseen.names) < MIN_VEHICLES:
+            return None
+        return replace(evaluation.compare(groups, unseen), unseen=True)
+
+    def problems(self, evaluation: ChallengerEvaluation, champion: str) -> list[str]:
+        """Return a reason to refuse if the challenger is better on unusual new drives alone.
+
+        Such drives make it better on them, held out or not. If the champion's error on new drives
+        is much larger than on its training set, both are compared on that training set.
+        """
+        groups, old, new = (
+            evaluation.groups_within(self.cohort, mask)
+            for mask in (np.ones_like(self.is_trained), self.is_trained, ~self.is_trained)
+        )
+        on_old, on_new = (
+            evaluation.as_published(champion, tested).pooled.rmse_deg for tested in (old, new)
+        )
+        if on_new <= OUTLIER_RATIO * on_old:
+            return []
+        comparison = evaluation.compare(groups, old)
+        if champion not in comparison.better:
+            return []
+        return [
+            "the improvement comes only from unusual new drives, on which the champion has "
+            f"{on_new:.4f} deg: on its training set, {comparison}. Check them before training"
+        ]
 
 
-def evaluate_frozen(
-    catalog: Catalog, name: str, model: LinearModel, folds: Folds
-) -> CrossValidation:
-    """Return the figures of a model over folds without refitting it."""
-    tests = [error_sums(model, test) for test in folds.grams]
-    return assemble(name, folds, tests, model, catalog.input_scales)
+OUTLIER_RATIO = 2.0
+"""Drives are unusual if the champion's RMSE on them exceeds this multiple of its usual RMSE."""
 
 
 def threshold_violations(
@@ -318,8 +311,8 @@ def threshold_violations(
 ) -> list[str]:
     """Return the thresholds that a manifest does not reach, as phrases."""
     figures, trained = manifest.cross_validation, manifest.trained_on
-    violations = []
     start = "without the filter, its" if manifest.line_remark else "its"
+    violations = []
     if figures.correlation < thresholds.min_correlation:
         violations.append(
             f"{start} correlation is {figures.correlation:.4f}, below {thresholds.min_correlation}"
@@ -328,17 +321,17 @@ def threshold_violations(
         violations.append(
             f"{start} RMSE is {figures.rmse_deg:.4f} deg, above {thresholds.max_rmse_deg} deg"
         )
-    counts = (
-        (trained.drives, "drive", thresholds.min_drives),
-        (trained.vehicles, "car", thresholds.min_vehicles),
-    )
-    violations += [
-        f"it was trained on {pluralize(count, noun)}, fewer than {minimum}"
-        for count, noun, minimum in counts
-        if count < minimum
-    ]
-    if champion is not None:
-        violations += _too_small_share(manifest, champion, thresholds.min_part_of_champion)
+    share = thresholds.min_part_of_champion if champion else 0.0
+    before = champion.trained_on if champion else trained
+    for count, noun, minimum, reference in (
+        (trained.drives, "drive", thresholds.min_drives, before.drives),
+        (trained.vehicles, "car", thresholds.min_vehicles, before.vehicles),
+    ):
+        required = max(minimum, math.ceil(share * reference))
+        if count < required:
+            text = f"it was trained on {pluralize(count, noun)}, fewer than {required:,}"
+            champions = f" ({share:.0%} of the champion's {reference:,})"
+            violations.append(text + champions * (required > minimum))
     return violations
 
 
@@ -360,87 +353,17 @@ def missing_evidence(thresholds: PublishThresholds, manifest: Manifest) -> list[
     return reasons
 
 
-def _too_small_share(manifest: Manifest, champion: Manifest, share: float) -> list[str]:
-    """Return in what the training set is smaller than this share of the champion's."""
-    pairs = (
-        ("drives", manifest.trained_on.drives, champion.trained_on.drives),
-        ("cars", manifest.trained_on.vehicles, champion.trained_on.vehicles),
-    )
-    return [
-        f"it was trained on {count:,} {noun}, less than {share:.0%} of the champion's {reference:,}"
-        for noun, count, reference in pairs
-        if count < share * reference
-    ]
-
-
-def _has_another_line(catalog: Catalog, version: ModelVersion, feature_set: str) -> bool:
-    """Return True if a version has the same set with another first-stage model.
-
-    Its columns are then in no Gram row of this feature set.
-    """
-    model, identity = (
-        catalog.first_stage_model(feature_set),
-        version.manifest.trained_on.feature_set,
-    )
-    if model is None or identity == catalog.identity(feature_set):
-        return False
-    return identity.startswith(feature_set.removesuffix(model.digest))
-
-
-def _require_same_features(catalog: Catalog, version: ModelVersion, feature_set: str) -> None:
+def _require_same_columns(catalog: Catalog, version: ModelVersion, feature_set: str) -> None:
     """Raise `DataError` if a feature or column of a version is defined differently now."""
     manifest, definitions = version.manifest, catalog.definitions(feature_set)
-    for name, feature in manifest.features.items():
-        if catalog.rows([name]).get(name) != feature:
-            raise DataError(f"the feature {name} has changed since {version.reference}.")
-    for name, definition in manifest.definitions.items():
+    for name, published in (manifest.features | manifest.definitions).items():
         current = None
-        if name in catalog.inputs:
+        if name in manifest.features:
+            current = catalog.rows([name]).get(name)
+        elif name in catalog.inputs:
             current = definitions.get(name) or catalog.definition(name)
-        if current != definition:
+        if current != published:
             raise DataError(f"the column {name} has changed since {version.reference}.")
-
-
-# A challenger that was trained on unusual drives is better on them, held out or not. If the
-# champion's error on new drives is much larger than on its training set, both are compared on that
-# training set alone.
-
-OUTLIER_RATIO = 2.0
-"""Drives are unusual if the champion's RMSE on them exceeds this multiple of its usual RMSE."""
-
-
-def gain_on_outliers_only(
-    registry: Registry, selection: Selection, champion: ModelVersion
-) -> str | None:
-    """Return a reason to refuse if the challenger is better on unusual new drives alone.
-
-    Returns None where all drives are new, or none. Raises `DataError` if there are too few of
-    either, and `StorageError` if the champion's training set cannot be read.
-    """
-    if (split := _split_by_training(registry, selection, [champion])) is None:
-        return None
-    cohort, is_trained = split
-    evaluation = prepare_evaluation(selection, [champion])
-    groups, old, new = (
-        evaluation.folds_of(cohort, mask)
-        for mask in (np.ones_like(is_trained), is_trained, ~is_trained)
-    )
-    ((name, model),) = evaluation.incumbents.items()
-    on_old, on_new = (
-        evaluate_frozen(evaluation.catalog, name, model, folds).pooled for folds in (old, new)
-    )
-    if on_new.rmse_deg <= OUTLIER_RATIO * on_old.rmse_deg:
-        return None
-    comparison = evaluation.compare(groups, old)
-    (gap,) = comparison.gaps
-    if gap.negligible:
-        return None
-    return (
-        "the improvement comes only from unusual new drives: on the training set of "
-        f"{champion.reference} it has {comparison.challenger.pooled.rmse_deg:.4f} deg and the "
-        f"champion {on_old.rmse_deg:.4f} deg, difference {gap}; on the new drives the champion has "
-        f"{on_new.rmse_deg:.4f} deg. Check these before training"
-    )
 
 
 @dataclass(frozen=True)
@@ -493,13 +416,13 @@ def review_challenger(
         return Review(tuple(problems), "It is the first version")
     if _has_another_line(catalog, champion, selection.cohort.feature_set):
         return _review_another_line(champion, selection, thresholds, problems)
+    best = registry.history(manifest.name).best_of(CHAMPION)
+    others = [] if best in (None, champion.version) else [registry.load(manifest.name, best)]
+    incumbents = [champion, *others]
     try:
-        incumbents = _incumbents(registry, champion)
-        comparison = compare(selection, incumbents)
-        if comparison.better:
-            comparison = compare_unseen(registry, selection, incumbents) or comparison
-        manifests = [manifest, *(version.manifest for version in incumbents)]
-        comparison = replace(comparison, of_lines=any(m.line_remark for m in manifests))
+        evaluation = ChallengerEvaluation.prepare(selection, incumbents)
+        groups = evaluation.groups_of(selection.cohort)
+        comparison = evaluation.compare(groups, groups)
     except (DataError, QuestionError) as error:
         feature_set, _, _ = champion.manifest.trained_on.feature_set.partition("-")
         problems.append(
@@ -507,13 +430,32 @@ def review_challenger(
             f"feature set is {feature_set}; choose a model list that has this set: --models LIST)"
         )
         return Review(tuple(problems), "")
-    problems += _comparison_problems(comparison, champion)
-    if not problems and champion.manifest.learned_from is None and manifest.learned_from is None:
-        problems += _unusual_drives(comparison, champion)
-    if not problems:
-        problems += _outlier_problems(registry, selection, champion)
-    best = next((v.version for v in incumbents if v.reference == comparison.best), None)
-    return Review(tuple(problems), str(comparison), best, comparison.is_significantly_worse)
+    try:
+        split = TrainingSplit.load(registry, selection, incumbents)
+        if split and comparison.better:
+            comparison = split.compare_unseen(evaluation) or comparison
+        problems += _comparison_problems(comparison, champion, manifest)
+        if split and not problems:
+            problems += split.problems(evaluation, champion.reference)
+    except StorageError as error:
+        problems.append(f"no comparison on the champion's training set: {error}")
+    except DataError as error:
+        problems += _comparison_problems(comparison, champion, manifest)
+        LOGGER.warning("new drives were not compared with those of the champion: %s", error)
+    better = next((v.version for v in incumbents if v.reference == comparison.best), None)
+    return Review(tuple(problems), str(comparison), better, comparison.is_significantly_worse)
+
+
+def _has_another_line(catalog: Catalog, version: ModelVersion, feature_set: str) -> bool:
+    """Return True if a version has the same set with another first-stage model.
+
+    Its columns are then in no Gram row of this feature set.
+    """
+    model = catalog.first_stage_model(feature_set)
+    identity = version.manifest.trained_on.feature_set
+    if model is None or identity == catalog.identity(feature_set):
+        return False
+    return identity.startswith(feature_set.removesuffix(model.digest))
 
 
 def _review_another_line(
@@ -523,10 +465,8 @@ def _review_another_line(
     problems: list[str],
 ) -> Review:
     """Compare cross-validated RMSEs: the first-stage model was refitted, so no row has both."""
-    old, new = (
-        champion.manifest.cross_validation.rmse_deg,
-        selection.winner.model.pooled.rmse_deg,
-    )
+    old = champion.manifest.cross_validation.rmse_deg
+    new = selection.winner.model.pooled.rmse_deg
     compared = (
         f"its first-stage model was fitted again; its cross-validated RMSE is {new:.4f} deg, that "
         f"of {champion.reference} was {old:.4f} deg"
@@ -535,57 +475,31 @@ def _review_another_line(
     return Review((*problems, *worse), compared)
 
 
-def _incumbents(registry: Registry, champion: ModelVersion) -> list[ModelVersion]:
-    """Return the champion, and the best champion so far if it is another version."""
-    name = champion.manifest.name
-    best = registry.history(name).best_of(CHAMPION)
-    return [champion, *([] if best in (None, champion.version) else [registry.load(name, best)])]
-
-
-def _comparison_problems(comparison: Comparison, champion: ModelVersion) -> list[str]:
+def _comparison_problems(
+    comparison: Comparison, champion: ModelVersion, manifest: Manifest
+) -> list[str]:
     """Return the reasons to refuse that a comparison on held-out rows gives."""
     problems = []
-    if comparison.contradicted:
+    name, better = champion.reference, comparison.better
+    if any(incumbent.pooled.correlation < 0 for incumbent in comparison.incumbents):
         problems.append(
-            f"the label has the opposite sign of the estimates of {champion.reference}. Is it "
-            f"reversed? {comparison}"
+            f"the label has the opposite sign of the estimates of {name}. Is it reversed? "
+            f"{comparison}"
         )
-    better = [incumbent.name for incumbent in comparison.better]
-    if champion.reference in better:
+    if name in better:
         problems.append(f"it is worse than the champion: {comparison}")
     elif better:
         problems.append(
             f"it is worse than {better[0]}, the best champion so far, after several small losses: "
             f"{comparison}. To accept the present champion as the new reference: fleet-slip "
-            f"promote {champion.reference}"
+            f"promote {name}"
         )
-    return problems
-
-
-def _unusual_drives(comparison: Comparison, champion: ModelVersion) -> list[str]:
-    """Return a reason to refuse if the champion's error is much larger than when it was trained."""
     old = champion.manifest.cross_validation.rmse_deg
     new = comparison.incumbents[0].pooled.rmse_deg
-    if new <= OUTLIER_RATIO * old:
-        return []
-    return [
-        f"{champion.reference} had a cross-validated RMSE of {old:.4f} deg and has {new:.4f} deg "
-        "here: these drives differ from its training set. Check them before training: "
-        f"{comparison}"
-    ]
-
-
-def _outlier_problems(
-    registry: Registry, selection: Selection, champion: ModelVersion
-) -> list[str]:
-    """Return the reason of `gain_on_outliers_only`, or why the training set cannot be compared."""
-    try:
-        reason = gain_on_outliers_only(registry, selection, champion)
-    except StorageError as error:
-        return [f"no comparison on the champion's training set: {error}"]
-    except DataError as error:
-        LOGGER.warning(
-            "not checked whether the improvement comes only from unusual drives: %s", error
+    has_reference = champion.manifest.learned_from is None and manifest.learned_from is None
+    if has_reference and not problems and new > OUTLIER_RATIO * old:
+        problems.append(
+            f"{name} had a cross-validated RMSE of {old:.4f} deg and has {new:.4f} deg here: these "
+            f"drives differ from its training set. Check them before training: {comparison}"
         )
-        return []
-    return [reason] if reason else []
+    return problems

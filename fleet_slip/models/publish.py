@@ -28,7 +28,7 @@ from fleet_slip.models.manifest import (
     TrainedOn,
     checksum_of_drives,
 )
-from fleet_slip.models.registry import CANDIDATE, CHAMPION, AliasMove, ModelVersion, Registry
+from fleet_slip.models.registry import CANDIDATE, CHAMPION, ModelVersion, Registry
 from fleet_slip.models.request import (
     GIVEN,
     LOGGED_MODELS,
@@ -413,46 +413,6 @@ class Publication(Answer):
         yield Remark(f"{verb} {self.version.reference}. {self.reason}")
 
 
-def publish_challenger(
-    registry: Registry,
-    manifest: Manifest,
-    selection: Selection,
-    *,
-    force: bool = False,
-    candidate: bool = False,
-) -> Publication:
-    """Publish a challenger as the next version of its model, and its champion.
-
-    Raises `RefusedError` if the review finds problems (`review_challenger`), unless forced. A
-    `candidate` waits for `promote`; so does any version while the champion is held by `rollback` or
-    `pin`. The same estimator from the same rows changes nothing. Decides again if the champion
-    changes meanwhile.
-    """
-    history = registry.history(manifest.name)
-
-    @functools.cache
-    def add_version() -> ModelVersion:
-        return registry.add(manifest, drives_of(selection, manifest.name))
-
-    def publish(newest_move: int) -> Publication | None:
-        decision = _decide(registry, manifest, selection, force=force, candidate=candidate)
-        if decision.champion:
-            return Publication(decision.champion, False, decision.reason)
-        version = add_version()
-        number = version.version
-        alias, best = (CANDIDATE, None) if decision.waits else (CHAMPION, decision.best)
-        is_there = history.pointed_at(alias) == number
-        if not (is_there or history.move(alias, number, "publish", after=newest_move, best=best)):
-            return None
-        if not decision.waits:
-            return Publication(version, True, decision.reason)
-        until = f"until: fleet-slip promote {version.reference}"
-        reason = f"{decision.reason} {_why_waiting(manifest.name, decision.held)}, {until}"
-        return Publication(version, not is_there, reason, candidate=True)
-
-    return history.decide(publish)
-
-
 @dataclass(frozen=True)
 class DryRun(Answer):
     """Result that publishing would have.
@@ -490,33 +450,8 @@ class DryRun(Answer):
         return RefusedError(self.reason) if self.refused else None
 
 
-def would_publish(
-    registry: Registry,
-    manifest: Manifest,
-    selection: Selection,
-    *,
-    force: bool = False,
-    candidate: bool = False,
-) -> DryRun:
-    """Return what `publish_challenger` would do, and raise as it does; write nothing."""
-    decision = _decide(registry, manifest, selection, force=force, candidate=candidate)
-    if decision.champion:
-        return DryRun(manifest.name, False, decision.reason)
-    if not decision.waits:
-        return DryRun(manifest.name, True, decision.reason)
-    waiting = registry.history(manifest.name).pointed_at(CANDIDATE)
-    newest = max(registry.versions(manifest.name), default=None)
-    is_there = (
-        waiting is not None
-        and waiting == newest
-        and registry.load(manifest.name, waiting).manifest.same_estimator(manifest)
-    )
-    reason = f"{decision.reason} {_why_waiting(manifest.name, decision.held)}."
-    return DryRun(manifest.name, not is_there, reason, candidate=True)
-
-
 @dataclass(frozen=True)
-class _Decision:
+class Decision:
     """Decision on a challenger.
 
     Attributes
@@ -527,8 +462,6 @@ class _Decision:
         The champion if it stays, and nothing is published.
     waits
         True if the challenger becomes the candidate.
-    held
-        The move that holds the champion.
     best
         Number of the best champion so far, for `AliasHistory.move`.
     """
@@ -536,43 +469,91 @@ class _Decision:
     reason: str
     champion: ModelVersion | None = None
     waits: bool = False
-    held: AliasMove | None = None
     best: int | None = None
 
 
-def _decide(
+def decide(
     registry: Registry,
     manifest: Manifest,
     selection: Selection,
     *,
-    force: bool,
-    candidate: bool,
-) -> _Decision:
-    """Review a challenger and decide. Raises `RefusedError`."""
-    champion = registry.champion(manifest.name)
+    force: bool = False,
+    candidate: bool = False,
+) -> Decision:
+    """Review a challenger and decide.
+
+    A `candidate` waits for `promote`; so does any version while the champion is held by `rollback`
+    or `pin`. Raises `RefusedError` if the review finds problems (`review_challenger`), unless
+    forced.
+    """
+    name, champion = manifest.name, registry.champion(manifest.name)
     if champion and champion.manifest.same_estimator(manifest):
-        return _Decision("The champion is the same model.", champion)
-    held = registry.history(manifest.name).held_by(CHAMPION)
+        return Decision("The champion is the same model.", champion)
+    held = registry.history(name).held_by(CHAMPION)
     if champion and champion.manifest.same_line(manifest):
-        reason = f"The terms are the champion's. {manifest.combination or 'No filter any more.'}"
-        return _Decision(reason, None, candidate or held is not None, held, champion.version)
-    review = review_challenger(registry, champion, manifest, selection)
-    if not force and not candidate:
-        review.require_passed(manifest.name)
-    if champion and review.is_significantly_worse and not (force or candidate or held):
-        reason = f"The champion stays: it is significantly better. {review.reason}"
-        return _Decision(reason, champion)
-    best = None if review.problems else review.best
-    reason = f"{review.reason} {manifest.combination or ''}".rstrip()
-    return _Decision(reason, None, candidate or held is not None, held, best)
+        best: int | None = champion.version
+        reason = "The terms are the champion's."
+    else:
+        review = review_challenger(registry, champion, manifest, selection)
+        if not force and not candidate:
+            review.require_passed(name)
+            if review.is_significantly_worse and not held:
+                reason = f"The champion stays: it is significantly better. {review.reason}"
+                return Decision(reason, champion)
+        best, reason = None if review.problems else review.best, review.reason
+    waits = candidate or held is not None
+    remarks = [reason, str(manifest.combination or ""), manifest.line_remark]
+    if held:
+        remarks.append(
+            f"{name}@{held.version} stays champion: {held.command} chose it on "
+            f"{held.at:%Y-%m-%d %H:%M} UTC."
+        )
+    if waits:
+        remarks.append(f"It is a candidate until: fleet-slip promote {name}@{CANDIDATE}")
+    return Decision(" ".join(filter(None, remarks)), None, waits, best)
 
 
-_VERBS = {"rollback": "rolled back to", "pin": "pinned"}
+def publish_challenger(
+    registry: Registry, manifest: Manifest, selection: Selection, **options: bool
+) -> Publication:
+    """Publish a challenger as the next version of its model, and its champion; see `decide`.
+
+    The same estimator from the same rows changes nothing. Decides again if the champion changes
+    meanwhile.
+    """
+    history = registry.history(manifest.name)
+
+    @functools.cache
+    def add_version() -> ModelVersion:
+        return registry.add(manifest, drives_of(selection, manifest.name))
+
+    def publish(newest_move: int) -> Publication | None:
+        decision = decide(registry, manifest, selection, **options)
+        if decision.champion:
+            return Publication(decision.champion, False, decision.reason)
+        version, alias = add_version(), CANDIDATE if decision.waits else CHAMPION
+        is_there = history.pointed_at(alias) == version.version
+        if not is_there and not history.move(
+            alias, version.version, "publish", after=newest_move, best=decision.best
+        ):
+            return None
+        is_new = not (decision.waits and is_there)
+        return Publication(version, is_new, decision.reason, decision.waits)
+
+    return history.decide(publish)
 
 
-def _why_waiting(name: str, held: AliasMove | None) -> str:
-    """Return why a version waits for `promote`."""
-    if held is None:
-        return "It is a candidate"
-    move = f"{_VERBS[held.command]} on {held.at:%Y-%m-%d %H:%M} UTC"
-    return f"{name}@{held.version} stays champion: it was {move}"
+def would_publish(
+    registry: Registry, manifest: Manifest, selection: Selection, **options: bool
+) -> DryRun:
+    """Return what `publish_challenger` would do, and raise as it does; write nothing."""
+    name, decision = manifest.name, decide(registry, manifest, selection, **options)
+    if decision.champion or not decision.waits:
+        return DryRun(name, decision.champion is None, decision.reason)
+    waiting = registry.history(name).pointed_at(CANDIDATE)
+    is_there = (
+        waiting is not None
+        and waiting == registry.versions(name)[-1]
+        and registry.load(name, waiting).manifest.same_estimator(manifest)
+    )
+    return DryRun(name, not is_there, decision.reason, candidate=True)
