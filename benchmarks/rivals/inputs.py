@@ -10,8 +10,7 @@ import numpy as np
 from benchmarks.rivals.learners import Fit, FittedLearner, Names, one_thread
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Definition
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
+from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, as_counts, compute_columns
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
 from fleet_slip.evaluation.test_drives import TestDrive

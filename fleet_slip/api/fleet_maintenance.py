@@ -240,7 +240,7 @@ class FleetMaintenance:
     ) -> "CheckReport":
         """Compute the Gram rows of some log files in several ways and compare the bits.
 
-        These are the compiled kernel, SQL where the set has a statement, and the stored rows.
+        These are the kernel, SQL where the set has a statement, and the stored rows.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
 """Definitions of columns of counts over time, as types of a manifest.
 
 A window covers past values of a logged signal or a feature within a drive. The same rules hold in
-SQL, in the compiled kernel and on board:
+SQL, in the kernel and on board:
 
 * A window of N ticks contains the values logged in the last N ticks, the current one included. At
   the start of a drive or after a gap there are fewer values; a mean divides by their number.

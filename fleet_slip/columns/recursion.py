@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_slip.columns.lowering import Step, operands_of, operation_of, plain_of
-from fleet_slip.compiling import inner_loop
+from fleet_slip.compiling import kernel
 
 NAMES = (
     "state", "next", "+", "-", "*", "shift", "nearest", "//", "clip", "min", "max", "negative",
@@ -33,10 +33,13 @@ class Recursion:
         All steps.
     members
         Numbers of the steps between the states of the tick before and the next ones, in order.
+    dependent
+        Numbers of all steps that depend on a state.
     """
 
     steps: Sequence[Step]
     members: tuple[int, ...]
+    dependent: frozenset[int]
 
     @classmethod
     def of_steps(cls, steps: Sequence[Step]) -> "Recursion":
@@ -48,7 +51,7 @@ class Recursion:
         for number in range(len(steps) - 1, -1, -1):
             if number in before or steps[number][0] == "next":
                 before |= {number, *operands_of(steps[number])}
-        return cls(steps, tuple(sorted(after & before)))
+        return cls(steps, tuple(sorted(after & before)), frozenset(after))
 
     @cached_property
     def inputs(self) -> tuple[int, ...]:
@@ -57,6 +60,13 @@ class Recursion:
         inner = set(self.members)
         read = dict.fromkeys(i for i in operands if i not in inner)
         return tuple(i for i in read if self.steps[i][0] != "constant")
+
+    @cached_property
+    def outputs(self) -> tuple[int, ...]:
+        """Numbers of the members that other steps read."""
+        readers = self.dependent.difference(self.members)
+        read = dict.fromkeys(i for number in readers for i in operands_of(self.steps[number]))
+        return tuple(i for i in self.members if i in read)
 
     @cached_property
     def places(self) -> dict[int, int]:
@@ -90,18 +100,19 @@ class Recursion:
         return memory
 
 
-@inner_loop
+@kernel
 def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
-    code: Any, words: Any, outputs: Any, memory: Any, at: int, stride: int, inputs: int, size: int
+    code: Any, words: Any, places: Any, inputs: Any, results: Any
 ) -> None:
     """Execute the recursive steps for a block of rows.
 
-    Inputs and outputs are binary64 in the memory from `at` on, NaN where missing, `stride` apart.
+    Inputs and results are binary64, shape (steps, rows), NaN where missing. `words` is the memory,
+    and `places` has the places of the results in it.
     """
     values, present = words[0], words[1]
-    for row in range(size):
-        for number in range(inputs):
-            x = memory[at + number * stride + row]
+    for row in range(inputs.shape[1]):
+        for number in range(len(inputs)):
+            x = inputs[number, row]
             present[number] = 0 if np.isnan(x) else 1
             values[number] = 0 if np.isnan(x) else np.int64(x)
         for step in range(len(code)):
@@ -155,10 +166,9 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
                 value = a if present[first] else b
                 valid = present[first] | present[second]
             values[out], present[out] = (value if valid else 0), valid
-        for number in range(len(outputs)):
-            place = outputs[number]
-            valid = present[place] == 1
-            memory[at + (inputs + number) * stride + row] = values[place] if valid else np.nan
+        for number in range(len(places)):
+            place = places[number]
+            results[number, row] = values[place] if present[place] == 1 else np.nan
         for step in range(len(code)):
             if code[step, 0] == NEXT:
                 values[code[step, 3]] = values[code[step, 2]]

@@ -14,8 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import Workspace
+from fleet_slip.columns.drive_columns import ColumnPlan
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation.filters import choose_evenly
 from fleet_slip.evaluation.single_track import LabelledDrive, read_drive
@@ -171,14 +170,14 @@ class Learner:
         feature_set, label = catalog.feature_set(name), catalog.signals.label
         if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
-        workspace = Workspace(ColumnPlan.of_set(catalog, name))
+        plan = ColumnPlan.of_set(catalog, name)
         blocks = DriveBlocks.of_set(feature_set)
         attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
         rows = [
             row
             for drive in self.drives
             for quarter in range(QUARTERS)
-            for row in _gram_rows(label, workspace, blocks, drive, quarter, attributes[drive.name])
+            for row in _gram_rows(label, plan, blocks, drive, quarter, attributes[drive.name])
         ]
         of_quarter = [("quarter", pa.int64()), ("sums", _SUMS), ("products", _SUMS)]
         schema = pa.schema([*self.cohort.drives.schema, *of_quarter])
@@ -229,18 +228,18 @@ def _quarters_as_trips(quarters: Cohort) -> pa.Table:
 
 def _gram_rows(
     label: str,
-    workspace: Workspace,
+    plan: ColumnPlan,
     blocks: DriveBlocks,
     drive: HeldOutDrive,
     quarter: int,
     attributes: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return the Gram rows of a quarter's labelled rows; columns look back beyond it."""
-    counts = counts_of(drive.rows, workspace.plan, attributes)
+    counts = counts_of(drive.rows, plan, attributes)
     labelled = counts.present.get(label, np.ones(len(drive.rows), dtype=np.bool_))
     present = {**counts.present, label: labelled & (drive.quarter == quarter)}
-    sums = drive_sums(workspace, blocks, replace(counts, present=present))
-    rows = gram_rows(sums, workspace.plan.names, blocks, {**attributes, "quarter": quarter})
+    sums = drive_sums(plan, blocks, replace(counts, present=present))
+    rows = gram_rows(sums, plan.names, blocks, {**attributes, "quarter": quarter})
     return [row for row in rows if label in row["signals"].split(",")]
 
 

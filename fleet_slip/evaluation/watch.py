@@ -16,8 +16,7 @@ from fleet_slip.arrays import FloatArray, IntArray, float_column
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import as_counts, compute_columns
+from fleet_slip.columns.drive_columns import ColumnPlan, as_counts, compute_columns
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.test_drives import simulate_drives
 from fleet_slip.models.manifest import Manifest

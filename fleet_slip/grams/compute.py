@@ -1,4 +1,4 @@
-"""Gram rows of log files: plain feature sets by `jobs/gram.sql`, windows by the compiled kernel."""
+"""Gram rows of log files: plain feature sets by `jobs/gram.sql`, windows by the kernel."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -64,7 +64,7 @@ def gram_statement(
     resolved = catalog.feature_set(feature_set)
     if not has_statement(catalog, feature_set):
         raise QuestionError(
-            f"SQL cannot compute the Gram rows of {feature_set}: only the compiled kernel has "
+            f"SQL cannot compute the Gram rows of {feature_set}: only the kernel has "
             "changes of the course, blocks of time, slopes and sets of many columns. Its columns: "
             "fleet-slip features --sql"
         )

@@ -1,4 +1,4 @@
-"""Sums of the rows, blocks and course changes of each drive, by the compiled kernel."""
+"""Sums of the rows, blocks and course changes of each drive, by the kernel."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,8 +22,7 @@ from fleet_slip.catalog.course import (
     split_late,
 )
 from fleet_slip.catalog.signals import HALF_TURN, SignalCatalog
-from fleet_slip.columns.block_program import BLOCK_ROWS, ColumnPlan
-from fleet_slip.columns.drive_columns import DriveCounts, Workspace
+from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts
 from fleet_slip.errors import DataError, StorageError
 from fleet_slip.storage.table import TableFile
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -157,10 +156,8 @@ def wide_grams(
     """
     catalog = warehouse.catalog
     resolved, model = catalog.feature_set(feature_set), catalog.first_stage_model(feature_set)
-    workspaces: dict[str | None, Workspace] = {
-        None: Workspace(ColumnPlan.of_set(catalog, feature_set))
-    }
-    plan = workspaces[None].plan
+    plan = ColumnPlan.of_set(catalog, feature_set)
+    plans: dict[str | None, ColumnPlan] = {None: plan}
     identity = catalog.identity(feature_set)
     schema = warehouse.computed_schema(in_time=resolved.in_time)
     rows: list[dict[str, Any]] = []
@@ -170,18 +167,18 @@ def wide_grams(
             drives = read_drives(warehouse, file, plan)
             for drive in sorted(drives, key=lambda drive: str(drive.facts["drive_id"])):
                 fold = model.fold_of(str(drive.facts["drive_id"])) if model else None
-                if fold not in workspaces:
-                    workspaces[fold] = Workspace(ColumnPlan.of_set(catalog, feature_set, fold))
+                if fold not in plans:
+                    plans[fold] = ColumnPlan.of_set(catalog, feature_set, fold)
                 delay = (delays or {}).get(drive.facts["vehicle_id"])
                 metadata = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
                 metadata |= {"file": file.path, "day": file.day}
-                rows += _rows_of_drive(catalog.signals, workspaces[fold], resolved, drive, metadata)
+                rows += _rows_of_drive(catalog.signals, plans[fold], resolved, drive, metadata)
     return pa.Table.from_pylist(rows, schema=schema)
 
 
 def _rows_of_drive(
     signals: SignalCatalog,
-    workspace: Workspace,
+    plan: ColumnPlan,
     feature_set: FeatureSet,
     drive: DriveCounts,
     metadata: Mapping[str, Any],
@@ -190,9 +187,9 @@ def _rows_of_drive(
     try:
         if feature_set.change_ticks:
             delay = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
-            sums = change_sums(signals, workspace, drive, feature_set.change_ticks, delay)
+            sums = change_sums(signals, plan, drive, feature_set.change_ticks, delay)
         else:
-            sums = drive_sums(workspace, blocks, drive)
+            sums = drive_sums(plan, blocks, drive)
     except DataError as error:
         raise DataError(f"{metadata['file']}: drive {metadata['drive_id']}: {error}") from None
     return gram_rows(sums, feature_set.columns, blocks, metadata)
@@ -252,26 +249,26 @@ Pattern = tuple[int, int]
 
 
 def drive_sums(
-    workspace: Workspace, blocks: DriveBlocks, counts: DriveCounts
+    plan: ColumnPlan, blocks: DriveBlocks, counts: DriveCounts
 ) -> dict[Pattern, BlockSums]:
     """Return the sums of the rows of a drive by pattern; raises as `wide_grams`."""
-    _require_64_bits(len(counts.ticks), max(workspace.plan.limits))
+    _require_64_bits(len(counts.ticks), max(plan.limits))
     sums: dict[Pattern, BlockSums] = {}
-    for rows, values, clipped in workspace.blocks(counts):
+    for rows, values, clipped in plan.blocks(counts):
         _add_by_pattern(sums, values, clipped, blocks.numbers(counts.ticks[rows]))
     return sums
 
 
 def change_sums(
     signals: SignalCatalog,
-    workspace: Workspace,
+    plan: ColumnPlan,
     counts: DriveCounts,
     durations: Sequence[int],
     delay: int = 0,
 ) -> dict[Pattern, BlockSums]:
     """Return the sums of the changes of a drive by pattern; a block is a duration in ticks."""
-    _require_64_bits(len(counts.ticks), 2 * max(workspace.plan.limits))
-    fixes = Fixes(course_units(signals), workspace, counts, delay)
+    _require_64_bits(len(counts.ticks), 2 * max(plan.limits))
+    fixes = Fixes(course_units(signals), plan, counts, delay)
     sums: dict[Pattern, BlockSums] = {}
     for block, duration in enumerate(durations):
         rows, values, clipped = fixes.changes(duration)
@@ -325,11 +322,11 @@ class Fixes:
     """Rows of a drive that have a fix."""
 
     def __init__(
-        self, units: CourseUnits, workspace: Workspace, drive: DriveCounts, delay: int = 0
+        self, units: CourseUnits, plan: ColumnPlan, drive: DriveCounts, delay: int = 0
     ) -> None:
         """Find the fixes of a drive whose course is late by `delay` parts of a tick.
 
-        Course and yaw rate are the last columns of the workspace.
+        Course and yaw rate are the last columns of the plan.
         """
         self.units = units
         self.ticks = drive.ticks.astype(np.int64)
@@ -339,7 +336,7 @@ class Fixes:
         values: list[FloatArray] = []
         clipped: list[FloatArray] = []
         self.first_clipped = np.zeros(0)
-        for rows, block, block_clipped in workspace.blocks(drive):
+        for rows, block, block_clipped in plan.blocks(drive):
             self.yaw_rate[rows] = block[-1]
             begin, end = np.searchsorted(self.rows, (rows.start, rows.stop))
             fixed = self.rows[begin:end] - rows.start

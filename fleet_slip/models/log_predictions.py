@@ -12,7 +12,6 @@ import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize, require_extra
-from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import AlarmError, DataError, InputError, MissingColumnError, UsageError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.drive_sums import counts_of
@@ -162,8 +161,7 @@ def predict_logs(
     drives: list[PredictedDrive] = []
     log_of_drive: dict[str, Path] = {}
     rejected, suspicions, alarms = 0, list[str](), list[str]()
-    workspace = Workspace(predictor.plan)
-    predict_drive = partial(_predict_drive, predictor=predictor, workspace=workspace, cars=cars)
+    predict_drive = partial(_predict_drive, predictor=predictor, cars=cars)
     for log in logs:
         try:
             predicted, faults, unusable = _predict_log(log, mapping, predict_drive)
@@ -224,13 +222,12 @@ def _predict_drive(
     rows: pa.Table,
     reference_rad: FloatArray,
     predictor: Predictor,
-    workspace: Workspace,
     cars: CarCounts,
 ) -> PredictedDrive:
     """Predict the rows of one drive."""
     drive_id, vehicle_id = (rows[name][0].as_py() for name in ("drive_id", "vehicle_id"))
     counts = counts_of(rows, predictor.plan, None, cars.get(vehicle_id))
-    columns = {ESTIMATE: predictor(counts, workspace), REFERENCE: reference_rad}
+    columns = {ESTIMATE: predictor(counts), REFERENCE: reference_rad}
     table = pa.table(
         {
             "drive_id": pa.array([drive_id] * len(rows)).dictionary_encode(),

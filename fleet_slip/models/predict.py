@@ -21,8 +21,7 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.counts import round_chunks, valid_values
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import DriveCounts, Workspace
+from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.drive_sums import counts_of
@@ -62,16 +61,15 @@ class Predictor:
         )
         return cls(plan, manifest.intercept, coefficients, scales)
 
-    def __call__(self, drive: DriveCounts, workspace: Workspace | None = None) -> FloatArray:
+    def __call__(self, drive: DriveCounts) -> FloatArray:
         """Return the estimate at each row in rad, shape (rows,); NaN where a column is missing.
 
         Added up left to right, to the bits of a dot product in SQL. Raises `DataError` for a drive
         that cannot be looked back on.
         """
-        workspace = workspace or Workspace(self.plan)
         coefficients, scales = np.array(self.coefficients), np.array(self.scales)
         estimate: FloatArray = np.full(len(drive.ticks), self.intercept)
-        for rows, columns, _ in workspace.blocks(drive):
+        for rows, columns, _ in self.plan.blocks(drive):
             add_terms(columns, coefficients, scales, estimate[rows])
         return estimate
 
@@ -209,7 +207,6 @@ def predict(
     drives = _rows_of_each_drive(opened, rows) if plan.windows else [slice(0, rows)]
     drive = counts_of(pa.table({"tick": ticks, **counts}), plan, {})
     angle = np.empty(rows)
-    workspace = Workspace(plan)
     for at in drives if rows else ():
         first = at.start if isinstance(at, slice) else at[0]
         parameters = {
@@ -219,7 +216,7 @@ def predict(
             and (count := round_number(Fraction(float(values[first])), grain)) is not None
         }
         attributes = {name: values[first].as_py() for name, values in facts.items()}
-        angle[at] = predictor(drive.segment(at, attributes, parameters), workspace)
+        angle[at] = predictor(drive.segment(at, attributes, parameters))
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 

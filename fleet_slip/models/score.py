@@ -11,7 +11,6 @@ from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import pluralize, quote_argument
 from fleet_slip.calibration.car_calibration import calibrate
 from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.drive_columns import Workspace
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.drive_sums import counts_of, drives_of_stream
@@ -165,10 +164,9 @@ def _estimate_rows(
         guarded_query(database, predicate),
     ):
         stream = database.sql(text).to_arrow_reader(BATCH_ROWS)
-        workspace = Workspace(predictor.plan)
         for rows in drives_of_stream(stream):
             numbers = cars.get(rows["vehicle_id"][0].as_py())
-            estimate = predictor(counts_of(rows, predictor.plan, None, numbers), workspace)
+            estimate = predictor(counts_of(rows, predictor.plan, None, numbers))
             truth, slow = label_of(signals, rows)
             chosen = rows["chosen"].to_numpy(zero_copy_only=False).astype(np.bool_) & ~slow
             total += int(chosen.sum())

@@ -28,9 +28,8 @@ from fleet_slip.catalog.definitions import (
     parity,
 )
 from fleet_slip.catalog.features import FeatureFile, load_features_over
-from fleet_slip.columns.block_program import ColumnPlan
 from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
+from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.grams.cohort import load_cohort

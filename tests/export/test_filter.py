@@ -11,8 +11,7 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Blend, Combination, Definition, Observer
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import DriveCounts, as_counts, compute_columns
+from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, as_counts, compute_columns
 from fleet_slip.columns.lowering import Lowering, largest_in, plain_of, ranges_of
 from fleet_slip.columns.observer import ANGLE_RAD
 from fleet_slip.errors import RefusedError

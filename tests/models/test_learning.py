@@ -11,8 +11,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.catalog import FirstStageModel, integer_combination
 from fleet_slip.catalog.definitions import Combination
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import compute_columns
+from fleet_slip.columns.drive_columns import ColumnPlan, compute_columns
 from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
@@ -171,7 +170,7 @@ def test_a_drive_too_long_for_its_slope_is_refused(
 ) -> None:
     """On board a slope adds up no more from then on: the two would differ."""
     version = fleet.models.get("tiny")
-    monkeypatch.setattr("fleet_slip.columns.block_program.most_products", lambda _: 1000)
+    monkeypatch.setattr("fleet_slip.columns.drive_columns.most_products", lambda _: 1000)
     with pytest.raises(DataError, match="too many for windows"):
         fleet.evaluation.score(version)
 

@@ -13,8 +13,7 @@ import pyarrow.compute as pc
 import pytest
 
 from fleet_slip.catalog.course import MAX_CHANGE_RAD, TURNED, course_units
-from fleet_slip.columns.block_program import ColumnPlan
-from fleet_slip.columns.drive_columns import Workspace
+from fleet_slip.columns.drive_columns import ColumnPlan
 from fleet_slip.grams.compute import aggregate
 from fleet_slip.grams.drive_sums import Fixes, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
@@ -55,8 +54,8 @@ def plain_changes(table: pa.Table, late: int = 0, apart: int = APART) -> dict[in
 def test_the_changes_of_a_hostile_drive_are_those_of_plain_integers(late: int) -> None:
     table = hostile_drive("a", 6000, 7)
     plan = ColumnPlan.of_set(CATALOG, "course")
-    workspace, counts = Workspace(plan), counts_of(table, plan, {})
-    rows, columns, _ = Fixes(course_units(SIGNALS), workspace, counts, late).changes(APART)
+    counts = counts_of(table, plan, {})
+    rows, columns, _ = Fixes(course_units(SIGNALS), plan, counts, late).changes(APART)
     expected = plain_changes(table, late)
     assert len(expected) > 40
     assert counts.ticks[rows].tolist() == [0, *expected]
@@ -110,8 +109,8 @@ def test_the_label_is_the_change_of_the_side_slip_angle() -> None:
     )
     counts["yaw_rate"] = np.rint(r * 10_000).astype(np.int16)
     plan = ColumnPlan.of_set(CATALOG, "course")
-    workspace, loaded = Workspace(plan), counts_of(log_rows("a", counts), plan, {})
-    rows, columns, _ = Fixes(course_units(SIGNALS), workspace, loaded).changes(APART)
+    loaded = counts_of(log_rows("a", counts), plan, {})
+    rows, columns, _ = Fixes(course_units(SIGNALS), plan, loaded).changes(APART)
     rows, columns = rows[1:], columns[:, 1:]
     assert len(rows) == 460
     changed = slip[rows] - slip[rows - APART]

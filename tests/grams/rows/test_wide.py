@@ -20,9 +20,8 @@ from fleet_slip.catalog.definitions import (
     Gate,
     limit_of,
 )
-from fleet_slip.columns.block_program import BLOCK_ROWS, ColumnPlan
 from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
+from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams import compute as statement
 from fleet_slip.grams.check import grams_of
@@ -145,7 +144,7 @@ def counts_of_table(table: pa.Table) -> DriveCounts:
 @given(drives())
 def test_kernel_sql_and_plain_integers_agree_on_hostile_drives(table: pa.Table) -> None:
     plan = ColumnPlan.from_definitions(list(DEFINITIONS), {}, DEFINITIONS)
-    blocks = Workspace(plan).blocks(counts_of_table(table))
+    blocks = plan.blocks(counts_of_table(table))
     found = [(block.copy(), clips.copy()) for _, block, clips in blocks]
     kernel, clipped = (np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True))
     with duckdb.connect() as database:

@@ -7,8 +7,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from fleet_slip.columns.block_program import BLOCK_ROWS
-from fleet_slip.columns.drive_columns import DriveCounts, Workspace, compute_columns
+from fleet_slip.columns.drive_columns import BLOCK_ROWS, DriveCounts, compute_columns
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.models import MODELS, model_of
@@ -30,9 +29,8 @@ def drive_of(rows: int, seed: int) -> DriveCounts:
 
 
 def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
-    """One workspace for drives of several lengths, against a dot product over all columns."""
+    """One predictor for drives of several lengths, against a dot product over all columns."""
     predictor = Predictor.from_manifest(SIGNALS, MANIFEST)
-    workspace = Workspace(predictor.plan)
     for rows, seed in ((3 * BLOCK_ROWS + 7, 1), (BLOCK_ROWS, 2), (1, 3), (BLOCK_ROWS + 1, 4)):
         drive = drive_of(rows, seed)
         expected = np.full(rows, predictor.intercept)
@@ -41,7 +39,7 @@ def test_blocks_of_rows_have_the_bits_of_the_whole_drive() -> None:
             columns, predictor.coefficients, predictor.scales, strict=True
         ):
             expected += coefficient * (column * scale)
-        found = predictor(drive, workspace)
+        found = predictor(drive)
         assert np.array_equal(found, expected, equal_nan=True)
         assert np.isfinite(found).any() or rows == 1
 
