@@ -45,7 +45,6 @@ PALETTE: Mapping[str, Colour] = {
     "kalman": Colour("#bf4a00", "#ff8b4d"),
     "kalman_tuned": Colour("#7a5c48", "#d0a98c"),
     "unstable": Colour("#b3261e", "#ff7a70"),
-    "outage": Colour("#8a8f98", "#7d8590"),
 }
 
 FONT = "DejaVu Sans"

@@ -76,9 +76,9 @@ def rich_text(text: str, present: Collection[str] = ()) -> Markup:
 
 
 class Cell(str):
-    """A table cell, marked as good or as a miss."""
+    """A table cell, marked as good."""
 
-    mark: Literal["", "good", "miss"] = ""
+    mark: Literal["", "good"] = ""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,6 @@ class ReportTable:
     rows: Sequence[Sequence[str]]
     text_columns: int = 1
     note: str = ""
-    lead: str = ""
-    """Sentence before the table."""
 
 
 @dataclass(frozen=True)
