@@ -1,9 +1,9 @@
 """Published models: publish, list, compare, promote and export them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fleet_slip.api.calls import record_call
 from fleet_slip.errors import RefusedError
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from fleet_slip.models.select import Selection
     from fleet_slip.vehicle.parameters import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -111,13 +113,10 @@ class FleetModels:
         FleetSlipError
             What `FleetCohort.select` raises.
         """
-        from fleet_slip.models.publish import build_challenger, publish_challenger
+        from fleet_slip.models.publish import publish_challenger
 
         options = {"force": force, "candidate": candidate}
-        registry, selection = self.registry, self._selection(name, choice)
-        manifest = build_challenger(self.warehouse, registry, selection, name, **options)
-        manifest = self._with_filter(manifest, selection, with_filter)
-        return publish_challenger(registry, manifest, selection, **options)
+        return self._challenge(publish_challenger, name, choice, with_filter, **options)
 
     def preview(
         self,
@@ -129,17 +128,29 @@ class FleetModels:
         with_filter: "str | VehicleMeasures | None" = None,
     ) -> "DryRun":
         """Return what `publish` with these arguments would do, also a refusal; write nothing."""
-        from fleet_slip.models.publish import DryRun, build_challenger, would_publish
+        from fleet_slip.models.publish import DryRun, would_publish
 
         options = {"force": force, "candidate": candidate}
-        registry = self.registry
         try:
-            selection = self._selection(name, choice)
-            manifest = build_challenger(self.warehouse, registry, selection, name, **options)
-            manifest = self._with_filter(manifest, selection, with_filter)
-            return would_publish(registry, manifest, selection, **options)
+            return self._challenge(would_publish, name, choice, with_filter, **options)
         except RefusedError as error:
             return DryRun(name, False, str(error), refused=True)
+
+    def _challenge(
+        self,
+        publish: "Callable[..., T]",
+        name: str,
+        choice: "Selection | FleetCohort | None",
+        with_filter: "str | VehicleMeasures | None",
+        **options: bool,
+    ) -> T:
+        """Build the challenger of a choice and publish it, or return what would be published."""
+        from fleet_slip.models.publish import build_challenger
+
+        registry, selection = self.registry, self._selection(name, choice)
+        manifest = build_challenger(self.warehouse, registry, selection, name, **options)
+        manifest = self._with_filter(manifest, selection, with_filter)
+        return publish(registry, manifest, selection, **options)
 
     def _with_filter(
         self,

@@ -1,7 +1,7 @@
 """The pipelines `run`, `learn` and `nightly`: the training of a model, its steps and reports."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
@@ -34,7 +34,7 @@ from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, Night
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import step
 from fleet_slip.warehouse.predicate import hash_drive
-from fleet_slip.warehouse.table_views import connect_tables, gram_snapshots
+from fleet_slip.warehouse.table_views import connect_tables
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
@@ -121,43 +121,33 @@ class Training:
         return cohort.run_request(request, nested=True)
 
     def publish(
-        self, fleet: "Fleet", *, replace_marked: bool = False
+        self, fleet: "Fleet", *, candidate: bool = False, replace_marked: bool = False
     ) -> "tuple[Selection | None, Publication | None, str]":
         """Select and publish; return the selection, the publication and the refusal.
 
-        There is no selection if the champion is up to date.
+        There is no selection if the champion is up to date. With `replace_marked`, a champion that
+        was trained on erased drives is always replaced.
         """
+        from fleet_slip.operations.forget import marked_models
+
         if current := self.current_champion(fleet):
             return None, current, ""
         with step("select"):
             selection = self.select(fleet)
-        with step("publish"):
-            return selection, *self.publish_if_not_worse(
-                fleet, selection, replace_marked=replace_marked
-            )
-
-    def publish_if_not_worse(
-        self, fleet: "Fleet", selection: "Selection", *, replace_marked: bool
-    ) -> "tuple[Publication | None, str]":
-        """Return the publication, or None and the reason of the refusal.
-
-        With `replace_marked`, a champion that was trained on erased drives is always replaced.
-        """
-        from fleet_slip.operations.forget import marked_models
-
-        champion = fleet.models.registry.champion(self.name)
-        force = (
-            replace_marked
-            and champion is not None
-            and champion.reference in marked_models(fleet.warehouse)
-        )
+        champion = fleet.models.registry.champion(self.name) if replace_marked else None
+        force = champion is not None and champion.reference in marked_models(fleet.warehouse)
         try:
-            published = fleet.models.publish(
-                self.name, selection, force=force, with_filter=self.vehicle
-            )
+            with step("publish"):
+                published = fleet.models.publish(
+                    self.name,
+                    selection,
+                    force=force,
+                    candidate=candidate,
+                    with_filter=self.vehicle,
+                )
         except RefusedError as error:
-            return None, str(error)
-        return published, ""
+            return selection, None, str(error)
+        return selection, published, ""
 
 
 @dataclass(frozen=True)
@@ -185,24 +175,31 @@ class Trained(Answer):
         """The publication, or the reason of the refusal."""
         return self.publication or {"new": False, "reason": self.refusal}
 
-    def training_parts(self, everything: bool) -> Iterator[Part]:
-        """Render the result of each step."""
+    @property
+    def changed(self) -> bool:
+        """True if there was anything to do."""
+        return self.new
+
+    def training_parts(
+        self, subject: str, before: Iterable[Part], everything: bool
+    ) -> Iterator[Part]:
+        """Render the steps `before` the training and its own, or that there was nothing to do."""
+        if not self.changed:
+            champion = self.publication.version.reference if self.publication else self.refusal
+            yield Remark(
+                f"{subject}: nothing to do, {champion} is up to date ({self.seconds:.1f} s)"
+            )
+            return
+        yield from before
         for gram in self.grams:
-            name = "gram" if gram is self.grams[0] else f"gram {gram.feature_set.split('-')[0]}"
-            if gram.changed or gram in self.grams[:2]:
-                yield Remark(f"{name}: {pluralize(gram.rows_read, 'row')} read, {gram.total}")
+            yield Remark(
+                f"gram {gram.feature_set.split('-')[0]}: {pluralize(gram.rows_read, 'row')} read, "
+                f"{gram.total}"
+            )
         if self.selection:
             yield from self.selection.parts(everything, "--all")
-        if self.publication:
-            yield from self.publication.parts()
-        else:
-            yield Remark(self.refusal)
+        yield from self.publication.parts() if self.publication else (Remark(self.refusal),)
         yield Remark(f"done in {self.seconds:.1f} s")
-
-    def nothing_done(self, subject: str) -> Remark:
-        """Render the sentence for a call without new data."""
-        champion = self.publication.version.reference if self.publication else self.refusal
-        return Remark(f"{subject}: nothing to do, {champion} is up to date ({self.seconds:.1f} s)")
 
 
 @dataclass(frozen=True)
@@ -218,11 +215,7 @@ class RunReport(Trained):
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
         """Render the result of each step."""
-        if not self.changed:
-            yield self.nothing_done(self.campaign)
-            return
-        yield from self.simulation.parts()
-        yield from self.training_parts(everything)
+        yield from self.training_parts(self.campaign, self.simulation.parts(), everything)
 
     @property
     def gram(self) -> "GramReport":
@@ -278,20 +271,16 @@ class LearnReport(Trained):
 
     def parts(self, everything: bool = False) -> Iterator[Part]:
         """Render the result of each step, and the assumptions."""
-        suspicions: dict[tuple[str, tuple[str, ...]], str] = {}
-        for log in self.ingested:
-            for fault in log.suspicions:
-                suspicions.setdefault(
-                    (fault.kind, fault.signals), f"{log.file}: looks wrong: {fault}"
-                )
-        if self.changed:
-            counts = [log.counts for log in self.ingested if log.new]
-            drives, rows = sum(c.drives for c in counts), sum(c.ticks for c in counts)
-            yield Remark(f"ingested {pluralize(drives, 'drive')}, {pluralize(rows, 'row')}")
-            yield from map(Remark, suspicions.values())
-            yield from self.training_parts(everything)
-        else:
-            yield self.nothing_done(self.model)
+        counts = [log.counts for log in self.ingested if log.new]
+        drives, rows = sum(c.drives for c in counts), sum(c.ticks for c in counts)
+        ingested = f"ingested {pluralize(drives, 'drive')}, {pluralize(rows, 'row')}"
+        suspicions = {
+            (fault.kind, fault.signals): f"{log.file}: looks wrong: {fault}"
+            for log in reversed(self.ingested)
+            for fault in log.suspicions
+        }
+        steps = map(Remark, (ingested, *suspicions.values()))
+        yield from self.training_parts(self.model, steps, everything)
         if self.assumed:
             yield Remark(f"assumptions, since {self.mapping} has no other values:")
             yield from (Remark(f"  {value}") for value in self.assumed)
@@ -303,14 +292,17 @@ SAMPLE_FILES = 4
 """Log files that a night verifies. The next night verifies the next ones."""
 
 REQUIRED_STEPS = {
+    "ingest": (),
+    "retain": (),
+    "gram": (),
     "quality": ("gram",),
     "monitor": ("gram", "quality"),
     "publish": ("gram", "quality"),
     "verify": ("gram",),
 }
-"""Steps that must succeed before a step. No model is trained on drives that were not checked."""
+"""Steps in their order, with those that must succeed before. Unchecked drives train no model."""
 
-RECORDED_STEPS = {"ingest", "retain", "gram"}
+RECORDED_STEPS = {"ingest", "retain", "gram", "publish"}
 """Steps whose calls add themselves to the run record."""
 
 StepResult = tuple[State, str]
@@ -339,7 +331,6 @@ class NightlyPipeline:
     """Log files that were stored before the night."""
     faults: "tuple[SensorFault, ...]" = ()
     chart: "Chart | None" = None
-    drive_counts: dict[tuple[int | None, int | None], int] = field(default_factory=dict)
 
     def run(self) -> NightReport:
         """Execute and record the night."""
@@ -347,16 +338,8 @@ class NightlyPipeline:
         log = NightlyLog(self.fleet.root, self.training.name)
         self.baseline = log.begin(self.night, self._state())
         self.files_before = {file.path for file in self.fleet.warehouse.logs.snapshot().files}
-        for name, work in {
-            "ingest": self._ingest,
-            "retain": self._retain,
-            "gram": self._gram,
-            "quality": self._quality,
-            "monitor": self._monitor,
-            "publish": self._publish,
-            "verify": self._verify,
-        }.items():
-            self._execute(name, work)
+        for name in REQUIRED_STEPS:
+            self._execute(name, getattr(self, f"_{name}"))
         state = self._state()
         report = NightReport(
             model=self.training.name,
@@ -377,16 +360,16 @@ class NightlyPipeline:
         return report
 
     def _execute(self, name: str, work: Callable[[], StepResult]) -> None:
-        start = time.monotonic()
+        start, error = time.monotonic(), None
+        state: State
         if reason := self._blocked_by(name):
-            self.steps.append(NightStep(name, "left out", reason, 0.0))
-            return
-        error = None
-        try:
-            with nullcontext() if name in RECORDED_STEPS else step(name):
-                state, summary = work()
-        except FleetSlipError as failure:
-            state, summary, error = "failed", str(failure), failure
+            state, summary = "left out", reason
+        else:
+            try:
+                with nullcontext() if name in RECORDED_STEPS else step(name):
+                    state, summary = work()
+            except FleetSlipError as failure:
+                state, summary, error = "failed", str(failure), failure
         seconds = round(time.monotonic() - start, 3)
         self.steps.append(NightStep(name, state, summary, seconds, error))
 
@@ -399,38 +382,29 @@ class NightlyPipeline:
         if name == "verify" and not logs:
             return "There are no logs to verify."
         undone = [step.name for step in self.steps if step.state in ("failed", "left out")]
-        missing = [step for step in REQUIRED_STEPS.get(name, ()) if step in undone]
+        missing = [step for step in REQUIRED_STEPS[name] if step in undone]
         return f"{missing[0]} was not done." if missing else ""
 
     def _state(self) -> Baseline:
         """Return the present state of the data root."""
-        warehouse, champion = self.fleet.warehouse, None
+        warehouse, name = self.fleet.warehouse, self.training.name
+        champion = candidate = None
+        drives, query = 0, "SELECT count(DISTINCT drive_id) FROM grams"
         if self.fleet.root.exists():
-            champion = self.fleet.models.registry.champion(self.training.name)
+            registry = self.fleet.models.registry
+            champion = registry.champion(name)
+            candidate = registry.history(name).pointed_at(CANDIDATE)
+        if warehouse.grams.snapshot().rows:
+            with connect_tables(warehouse, query) as database:
+                drives = int(database.sql(query).fetchall()[0][0])
+        waits = candidate and (champion is None or candidate > champion.version)
         return Baseline(
             champion=champion.reference if champion else None,
-            drives=self._count_drives(),
+            drives=drives,
             rows=warehouse.logs.snapshot().rows,
             quarantined=warehouse.quarantine.snapshot().rows,
-            candidate=self._waiting_candidate() if self.fleet.root.exists() else None,
+            candidate=f"{name}@{candidate}" if waits else None,
         )
-
-    def _count_drives(self) -> int:
-        """Count the drives, again only if Gram rows or logs changed."""
-        grams, logs = gram_snapshots(self.fleet.warehouse)
-        state, query = (grams.version, logs.version), "SELECT count(DISTINCT drive_id) FROM grams"
-        if not grams.rows:
-            return 0
-        if state not in self.drive_counts:
-            with connect_tables(self.fleet.warehouse, query) as database:
-                self.drive_counts = {state: int(database.sql(query).fetchall()[0][0])}
-        return self.drive_counts[state]
-
-    def _waiting_candidate(self) -> str | None:
-        registry, name = self.fleet.models.registry, self.training.name
-        candidate, champion = registry.history(name).pointed_at(CANDIDATE), registry.champion(name)
-        is_newer = candidate and (champion is None or candidate > champion.version)
-        return f"{name}@{candidate}" if is_newer else None
 
     def _ingest(self) -> StepResult:
         from fleet_slip.ingest.mapping import load_mapping
@@ -443,10 +417,9 @@ class NightlyPipeline:
         try:
             logs = find_logs([self.inbox], mapping)
         except InputError:  # a night without new logs is normal
-            state: State = "done" if self.baseline.drives else "attention"
-            return state, "No log is in the folder."
+            return "done" if self.baseline.drives else "attention", "No log is in the folder."
         reports: list[IngestReport] = []
-        repeated = ""
+        problem = ""
         try:
             self.fleet.ingest(
                 self.inbox,
@@ -457,18 +430,40 @@ class NightlyPipeline:
                 progress=step_progress(self.progress, "ingest"),
             )
         except RepeatedError as error:  # all other files are ingested
-            repeated = str(error)
+            problem = f"Left out: {error}"
+        alarms = (f"{log.file}: looks wrong: {alarm}" for log in reports for alarm in log.alarms)
+        problem = problem or next(alarms, "")
         rows = self.fleet.warehouse.logs.snapshot().rows - self.baseline.rows
-        summary = f"{pluralize(max(rows, 0), 'new row')}."
-        if replaced := sum(report.drives_replaced for report in reports):
-            drives = pluralize(replaced, "drive")
-            summary = f"{summary} The mapping was corrected: {drives} replaced."
-        summary = f"{summary} {logs.describe_passed_over()}".rstrip()
-        if repeated:
-            return "attention", f"{summary} Left out: {repeated}"
-        for report in reports:
-            for alarm in report.alarms:
-                return "attention", f"{summary} {report.file}: looks wrong: {alarm}"
+        replaced = sum(report.drives_replaced for report in reports)
+        sentences = (
+            f"{pluralize(max(rows, 0), 'new row')}.",
+            f"The mapping was corrected: {pluralize(replaced, 'drive')} replaced." * bool(replaced),
+            logs.describe_passed_over(),
+            problem,
+        )
+        return "attention" if problem else "done", " ".join(filter(None, sentences))
+
+    def _retain(self) -> StepResult:
+        from fleet_slip.operations.forget import load_retention
+
+        warehouse = self.fleet.warehouse
+        retention = load_retention(self.retention, warehouse.configs)
+        before = date.today() - timedelta(days=retention.drives_days)
+        files = warehouse.logs.snapshot().files
+        days = [f.day for f in files if f.day is not None and f.path not in self.files_before]
+        if day := min((day for day in days if day < before), default=None):
+            return "attention", (
+                f"Nothing was erased: new drives of {day} already exceed the retention. Check "
+                "the clock of their logger; if it is right, run: fleet-slip forget --expired"
+            )
+        progress = step_progress(self.progress, "retain")
+        report = self.fleet.maintenance.apply_retention(self.retention, progress=progress)
+        summary = (
+            f"{pluralize(report.forgotten.drives, 'drive')} before {report.before} forgotten, "
+            f"{pluralize(len(report.vacuumed.files), 'old file')} removed."
+        )
+        if problem := report.problem:
+            return "attention", f"{summary} {problem}"
         return "done", summary
 
     def _gram(self) -> StepResult:
@@ -492,30 +487,29 @@ class NightlyPipeline:
         if champion is None:
             return "left out", "There was no champion yet."
         try:
-            self.chart = self.fleet.maintenance.monitor(champion, self.training.cohort)
+            chart = self.fleet.maintenance.monitor(champion, self.training.cohort)
         except DataError as error:
             return "left out", str(error)
-        new_days = [day for day in self.chart.days if not day.training]
-        drives = self.chart.drives_left_out
-        left_out = f" {pluralize(drives, 'drive')} without a log left out." if drives else ""
-        left_out += f" {self.chart.remark}" if self.chart.remark else ""
-        summary = f"{champion} on {pluralize(len(new_days), 'new day')}: "
-        if self.chart.alarms:
-            return "attention", f"{summary}beyond its limits on {self.chart.alarm}.{left_out}"
-        return "done", f"{summary}within its limits.{left_out}"
+        self.chart = chart
+        days = pluralize(sum(not day.training for day in chart.days), "new day")
+        limits = f"beyond its limits on {chart.alarm}" if chart.alarms else "within its limits"
+        without_log = f"{pluralize(chart.drives_left_out, 'drive')} without a log left out."
+        sentences = (
+            f"{champion} on {days}: {limits}.",
+            without_log * bool(chart.drives_left_out),
+            chart.remark,
+        )
+        return "attention" if chart.alarms else "done", " ".join(filter(None, sentences))
 
     def _publish(self) -> StepResult:
-        if current := self.training.current_champion(self.fleet):
-            return "done", f"{current.version.reference} is up to date."
-        selection = self.training.select(self.fleet)
-        publication, refusal = None, ""
-        if not self.candidate:
-            publication, refusal = self.training.publish_if_not_worse(
-                self.fleet, selection, replace_marked=False
-            )
+        selection, publication, refusal = self.training.publish(
+            self.fleet, candidate=self.candidate
+        )
         if publication is None:
             name = self.training.name
             publication = self.fleet.models.publish(name, selection, candidate=True)
+        elif selection is None:
+            return "done", f"{publication.version.reference} is up to date."
         reference = publication.version.reference
         is_new = reference != self.baseline.candidate
         state: State = "attention" if refusal and is_new else "done"
@@ -526,34 +520,5 @@ class NightlyPipeline:
         report = self.fleet.maintenance.check_grams(
             SAMPLE_FILES, begin=self.night.toordinal(), progress=progress
         )
-        return "done", (
-            f"{pluralize(report.rows, 'row')} of {pluralize(report.files, 'file')} and their "
-            "Gram rows verified."
-        )
-
-    def _oldest_new_day(self) -> date | None:
-        """Return the day of new drives that exceed the retention, None without such drives."""
-        from fleet_slip.operations.forget import load_retention
-
-        retention = load_retention(self.retention, self.fleet.warehouse.configs)
-        before = date.today() - timedelta(days=retention.drives_days)
-        files = self.fleet.warehouse.logs.snapshot().files
-        days = [f.day for f in files if f.day is not None and f.path not in self.files_before]
-        return min((day for day in days if day < before), default=None)
-
-    def _retain(self) -> StepResult:
-        if day := self._oldest_new_day():
-            return "attention", (
-                f"Nothing was erased: new drives of {day} already exceed the retention. Check "
-                "the clock of their logger; if it is right, run: fleet-slip forget --expired"
-            )
-        progress = step_progress(self.progress, "retain")
-        report = self.fleet.maintenance.apply_retention(self.retention, progress=progress)
-        forgotten, removed = report.forgotten.drives, len(report.vacuumed.files)
-        summary = (
-            f"{pluralize(forgotten, 'drive')} before {report.before} forgotten, "
-            f"{pluralize(removed, 'old file')} removed."
-        )
-        if problem := report.problem:
-            return "attention", f"{summary} {str(problem)[0].upper()}{str(problem)[1:]}"
-        return "done", summary
+        rows, files = pluralize(report.rows, "row"), pluralize(report.files, "file")
+        return "done", f"{rows} of {files} and their Gram rows verified."

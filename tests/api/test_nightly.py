@@ -170,7 +170,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("step", ["_retain", "_publish", "_waiting_candidate"])
+@pytest.mark.parametrize("step", ["_retain", "_publish", "_verify"])
 def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     place: Path, landing: Landing, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, step: str
 ) -> None:
