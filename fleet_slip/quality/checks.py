@@ -97,6 +97,10 @@ class Check:
         """Return True for a value of sound data."""
         return self.low <= value <= self.high
 
+    def test(self, value: float, *signals: str, **figures: Any) -> "list[Fault]":
+        """Return the fault of signals if a value is not that of sound data; else an empty list."""
+        return [] if self.passes(value) else [self.fault(*signals, **figures)]
+
     def fault(self, *signals: str, **figures: Any) -> Fault:
         """Return a fault of signals; `low` and `high` among the figures narrow the threshold."""
         values = {"low": self.low, "high": self.high, **figures}

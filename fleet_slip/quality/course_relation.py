@@ -75,28 +75,26 @@ class CourseRelation:
     @property
     def fault(self) -> Fault | None:
         """Return the first relation of cars that the course contradicts."""
-        scale = {"scale": self.scale}
-        max_noise = CHECKS["noise of the course"].high
-        if self.explained >= MIN_EXPLAINED:
-            max_noise = MAX_EXPLAINED_NOISE_MPS
-        if self.scale < CHECKS["sense of the course"].low:
-            return CHECKS["sense of the course"].fault(COURSE, **scale)
-        if abs(self.scale) < CHECKS["stuck course"].low:
-            return CHECKS["stuck course"].fault(COURSE, **scale)
-        if self.noise_mps > max_noise:
-            return CHECKS["noise of the course"].fault(COURSE, noise_mps=self.noise_mps)
-        if not CHECKS["scale of the course"].passes(self.scale):
-            return CHECKS["scale of the course"].fault(YAW_RATE, COURSE, **scale)
-        if self.slip + 2 * self.slip_error < CHECKS["heading in place of a course"].low:
-            return CHECKS["heading in place of a course"].fault(COURSE, slip=self.slip)
+        explains = self.explained >= MIN_EXPLAINED
+        is_tolerated = explains and self.noise_mps <= MAX_EXPLAINED_NOISE_MPS
+        values = {
+            "sense of the course": self.scale,
+            "stuck course": abs(self.scale),
+            "noise of the course": 0.0 if is_tolerated else self.noise_mps,
+            "scale of the course": self.scale,
+            "heading in place of a course": self.slip + 2 * self.slip_error,
+        }
+        for name, value in values.items():
+            signals = (YAW_RATE, COURSE) if name == "scale of the course" else (COURSE,)
+            for fault in CHECKS[name].test(value, *signals, **vars(self)):
+                return fault
         return None
 
     @property
     def misplaced(self) -> Fault | None:
         """Return a fault if the course is that of a place that is no car's centre of gravity."""
-        if CHECKS["place of the antenna"].passes(self.lever_m):
-            return None
-        return CHECKS["place of the antenna"].fault(COURSE, lever_m=self.lever_m)
+        check = CHECKS["place of the antenna"]
+        return next(iter(check.test(self.lever_m, COURSE, lever_m=self.lever_m)), None)
 
 
 def relate(moments: FloatArray, delay_s: float = 0.0) -> CourseRelation | None:
@@ -156,19 +154,18 @@ def check_course(signals: Signals) -> Iterator[Fault]:
     if correlation:
         if correlation < -MIN_CORRELATION:
             yield CHECKS["sense of the course"].fault(COURSE, scale=scale)
-        elif correlation < CHECKS["course of another car"].low:
-            yield CHECKS["course of another car"].fault(COURSE, correlation=correlation)
-        elif not CHECKS["unit of the course"].passes(scale):
-            yield CHECKS["unit of the course"].fault(COURSE, scale=scale)
+        check = CHECKS["course of another car"]
+        yield from check.test(correlation, COURSE, correlation=correlation)
+        yield from CHECKS["unit of the course"].test(scale, COURSE, scale=scale)
     fast = signals.get(SATELLITE_SPEED, np.zeros(0)) > MIN_COURSE_MPS
     share = 1 - float(np.isfinite(course[fast]).mean()) if fast.any() else 0.0
-    if share > CHECKS["repeated fixes"].high:
-        yield CHECKS["repeated fixes"].fault(COURSE, share=share)
+    yield from CHECKS["repeated fixes"].test(share, COURSE, share=share)
     relation = _relation(signals, turned)
     if relation and (fault := relation.fault or relation.misplaced):
         yield Fault(fault.kind, (COURSE,), fault.figure, fault.remedy)
-    elif relation and not CHECKS["scale of the gyroscope"].passes(relation.scale):
-        yield CHECKS["scale of the gyroscope"].fault(COURSE, scale=relation.scale)
+    elif relation:
+        check = CHECKS["scale of the gyroscope"]
+        yield from check.test(relation.scale, COURSE, scale=relation.scale)
 
 
 def _relation(signals: Signals, turned: FloatArray) -> CourseRelation | None:

@@ -1,10 +1,9 @@
 """The signals of a drive on a regular grid of ticks, fits among them, and moments of drives."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,9 +121,6 @@ def wrap_angle(angle: FloatArray) -> FloatArray:
 
 # Mean moments of drives in float64, for statistics that compare drives with one another.
 
-BATCH = 2**12
-"""Drives whose matrices are held together: some 1.4 KB each."""
-
 
 @dataclass(frozen=True)
 class MeanMoments:
@@ -161,9 +157,9 @@ class MeanMoments:
         scales = np.array([1.0, *(float(signals[name].scale) for name in self.signals)])
         return MeanMoments(self.signals, self.matrices * np.outer(scales, scales))
 
-    def __len__(self) -> int:
-        """Return the number of drives."""
-        return len(self.matrices)
+    def take(self, drives: Any) -> "MeanMoments":
+        """Return the moments of some drives, by mask or number."""
+        return MeanMoments(self.signals, self.matrices[drives])
 
     def position(self, signal: str) -> int:
         """Return the index of a signal in u."""
@@ -188,46 +184,3 @@ class MeanMoments:
         product = std[:, :, None] * std[:, None, :]
         empty = np.zeros_like(product)
         return np.asarray(np.divide(covariances, product, out=empty, where=product > 0))
-
-
-@dataclass(frozen=True)
-class DriveBatches:
-    """The mean moments of some drives of a table, in batches.
-
-    Attributes
-    ----------
-    table
-        Gram rows, which are half as large as the matrices.
-    rows
-        Positions of the drives in the table.
-    """
-
-    table: "GramTable"
-    rows: NDArray[np.intp]
-
-    @classmethod
-    def from_table(cls, table: "GramTable", mask: BoolArray | None = None) -> "DriveBatches":
-        """Take all drives of a table, or those of a mask."""
-        return cls(table, np.arange(len(table)) if mask is None else np.flatnonzero(mask))
-
-    def __len__(self) -> int:
-        """Return the number of drives."""
-        return len(self.rows)
-
-    def __iter__(self) -> Iterator[MeanMoments]:
-        """Yield the moments of the drives in their order."""
-        for first in range(0, len(self), BATCH):
-            yield MeanMoments.from_table(self.table.take(self.rows[first : first + BATCH]))
-
-    @cached_property
-    def mean(self) -> FloatArray:
-        """The mean matrix, summed in the order of the drives; all drives have equal weight."""
-        size = len(self.table.signals) + 1
-        total = np.zeros((size, size))
-        for batch in self:
-            total = np.concatenate([total[None], batch.matrices]).sum(axis=0)
-        return np.asarray(total / len(self))
-
-    def evaluate(self, figures: Callable[[MeanMoments], FloatArray]) -> FloatArray:
-        """Return the figures of all drives, computed by batch; the first axis is the drive."""
-        return np.concatenate([figures(batch) for batch in self])

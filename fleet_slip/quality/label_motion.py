@@ -12,8 +12,8 @@ import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.quality.checks import CHECKS, Fault
-from fleet_slip.quality.delays import estimate_delay
 from fleet_slip.quality.drive_signals import MIN_TICKS, Signals, fit, speed_mps
+from fleet_slip.quality.turning import estimate_delay
 
 ROAD_WHEELS = ("steer_fl", "steer")
 FAST_MPS, SLOW_MPS = 8.0, 20.0

@@ -1,6 +1,6 @@
-"""Signals of a drive, predicted from one another, compared with other drives of its cohort.
+"""Signals and labels of a drive, compared with those of other drives.
 
-Each signal is predicted from the others by the cohort's least squares. Three figures of a drive
+Each signal of a drive is predicted from the others by the cohort's least squares. Three figures
 describe its relation to the prediction: the mean of the residual (offset), the slope through the
 origin of the signal on its prediction (gain), and the logarithm of the residual's standard
 deviation (noise). Each is compared with the cohort's drives by median and median absolute
@@ -11,20 +11,25 @@ agree with theirs: structured residuals (Gertler, Fault Detection and Diagnosis 
 Systems, 1998).
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
+from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.quality.checks import CHECKS, Fault
-from fleet_slip.quality.drive_signals import DriveBatches, MeanMoments
+from fleet_slip.quality.drive_signals import MeanMoments
 from fleet_slip.regression.gram import GramTable
-from fleet_slip.resources import Configs
+from fleet_slip.resources import Configs, read_sql
+from fleet_slip.warehouse.database import open_scratch
 
 # The thresholds of `configs/monitor.toml`.
 
@@ -125,21 +130,22 @@ class Prediction:
     @classmethod
     def fit(
         cls,
-        reference: DriveBatches,
+        reference: MeanMoments,
         targets: Sequence[int],
         predictors: Sequence[int],
         limits: QualityThresholds,
     ) -> "Prediction":
         """Fit on sound drives; all have equal weight."""
-        total = reference.mean
+        total = reference.matrices.mean(axis=0)
         at = np.array(targets, dtype=np.intp)
         weights = np.zeros((len(at), len(total)))
         for row, target in enumerate(at.tolist()):
             used = [0, *(p for p in predictors if p != target)]
             weights[row, used] = solve(total[np.ix_(used, used)], total[used, target])
         bare = cls(at, weights, np.zeros((len(at), 3)), np.ones((len(at), 3)))
-        figures = reference.evaluate(bare.figures)
-        median, scale = _median_and_scale(figures)
+        figures = bare.figures(reference)
+        median = np.median(figures, axis=0)
+        scale = MAD_TO_STD * np.median(np.abs(figures - median), axis=0)
         floors = [limits.offset_floor_counts, limits.gain_floor, limits.noise_floor]
         return cls(at, weights, median, np.maximum(scale, floors))
 
@@ -162,12 +168,16 @@ class Prediction:
         scores[:, :, :2] = np.abs(scores[:, :, :2])
         return np.asarray(scores)
 
+    def worst(self, moments: MeanMoments) -> FloatArray:
+        """Return the largest score of each drive."""
+        return np.asarray(self.scores(moments).max(axis=(1, 2)))
+
 
 @dataclass(frozen=True)
 class Peers:
     """Predictions of a cohort: from all other signals, and without each of them."""
 
-    reference: DriveBatches
+    reference: MeanMoments
     label: str
     limits: QualityThresholds
 
@@ -179,10 +189,10 @@ class Peers:
     @cached_property
     def without(self) -> dict[str, Prediction]:
         """For each signal: every signal but that one, from the others but that one."""
-        return {name: self._prediction(without=name) for name in self.reference.table.signals}
+        return {name: self._prediction(without=name) for name in self.reference.signals}
 
     def _prediction(self, without: str | None) -> Prediction:
-        columns = self.reference.table.signals
+        columns = self.reference.signals
         signals = [name for name in columns if name != without]
 
         def position(name: str) -> int:
@@ -195,32 +205,20 @@ class Peers:
             self.limits,
         )
 
-    def suspects(self, drives: DriveBatches) -> BoolArray:
-        """Return a mask of the drives with a figure beyond the limit."""
-        worst = drives.evaluate(lambda batch: self.worst(self.full, batch))
-        return np.asarray(worst > self.limits.limit)
-
-    def worst(self, prediction: Prediction, moments: MeanMoments) -> FloatArray:
-        """Return the largest score of each drive."""
-        return np.asarray(prediction.scores(moments).max(axis=(1, 2)))
-
-    def explain(self, drives: DriveBatches) -> list[Fault]:
+    def explain(self, moments: MeanMoments) -> list[Fault]:
         """Return the fault of each drive: the repair that brings other figures within the limit.
 
         A repair exchanges two signals, or leaves one out. Without a repair the fault is
         unexplained.
         """
-        return [fault for batch in drives for fault in self._explain(batch)]
-
-    def _explain(self, moments: MeanMoments) -> list[Fault]:
         signals = moments.signals
         pairs = [pair for pair in PAIRS if set(pair) <= set(signals)]
-        exchanged = [self.worst(self.full, moments.exchanged(*pair)) for pair in pairs]
-        without = [self.worst(self.without[name], moments) for name in signals]
+        exchanged = [self.full.worst(moments.exchanged(*pair)) for pair in pairs]
+        without = [self.without[name].worst(moments) for name in signals]
         scores = self.full.scores(moments).max(axis=2)
         figures = self.full.figures(moments)
         faults = []
-        for drive in range(len(moments)):
+        for drive in range(len(moments.matrices)):
             after = [float(worst[drive]) for worst in exchanged]
             if after and min(after) <= self.limits.limit:
                 faults.append(CHECKS["exchanged signals"].fault(*pairs[int(np.argmin(after))]))
@@ -258,27 +256,17 @@ class Peers:
 
 
 def settle(
-    table: GramTable, in_order: BoolArray, label: str, limits: QualityThresholds
+    moments: MeanMoments, in_order: BoolArray, label: str, limits: QualityThresholds
 ) -> tuple[Peers, BoolArray]:
     """Fit peers on sound drives without suspects, until these stay the same; return both."""
     suspects = ~in_order
     for _ in range(ROUNDS):
-        peers = Peers(DriveBatches.from_table(table, ~suspects), label, limits)
-        beyond = peers.suspects(DriveBatches.from_table(table)) | ~in_order
+        peers = Peers(moments.take(~suspects), label, limits)
+        beyond = (peers.full.worst(moments) > limits.limit) | ~in_order
         if (beyond == suspects).all() or (~beyond).sum() < limits.min_drives:
             break
         suspects = beyond
     return peers, suspects & in_order
-
-
-def _median_and_scale(figures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return median and scaled MAD of each figure over the drives, one by one to save memory."""
-    median, scale = np.empty(figures.shape[1:]), np.empty(figures.shape[1:])
-    for at in np.ndindex(*figures.shape[1:]):
-        column = figures[(slice(None), *at)]
-        median[at] = np.median(column)
-        scale[at] = MAD_TO_STD * np.median(np.abs(column - median[at]))
-    return median, scale
 
 
 def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
@@ -291,3 +279,230 @@ def solve(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
 def _quadratic(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
     """Return v'Mv for each matrix and each vector."""
     return np.asarray(np.einsum("dti,ti->dt", vectors @ matrices, vectors))
+
+
+# Labels that contradict those of other drives: sign, factor and zero.
+#
+# In one drive the car, its tyres and the road hide a label that is half as large again. But a
+# mapping or a logger that changes does so for many cars at once: the median over the drives of a
+# day shows what no single drive does. So each drive's label is compared with the prediction by the
+# relation of all drives, and the medians of a day, and of a file, with those of all others.
+
+# Reversed labels. A few drives with a reversed label are unlike their peers. Among halves, as after
+# a car was logged again with another sign, no drive is usual. But each drive follows one relation
+# between the signals and the label, or its opposite. So signs and relation are estimated in turns:
+# least squares over all drives with their signs, then the sign that agrees with it.
+
+SIGN_ROUNDS = 20
+MIN_EXPLAINED = 0.5
+"""Share of the label's variance that the relation must explain, else signs mean nothing."""
+
+
+def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> dict[int, Fault]:
+    """Return otherwise sound drives whose label contradicts that of the others, with the fault.
+
+    The smaller group is reversed. Of two halves it is the one without the first drive: drives are
+    in the order of their names, which begin with the day.
+    """
+    if label not in table.signals or len(table.signals) < 2 or in_order.sum() < 2:
+        return {}
+    drives = MeanMoments.from_table(table.take(in_order))
+    gains = _gains(drives, table.signals.index(label))
+    if gains is None:
+        return {}
+    return {
+        int(drive): CHECKS["sign among labels"].fault(label, gain=gain)
+        for drive, gain in zip(np.flatnonzero(in_order), gains, strict=True)
+        if gain < CHECKS["sign among labels"].low
+    }
+
+
+def _gains(drives: MeanMoments, label: int) -> FloatArray | None:
+    """Return the gain of each drive's label on the common relation; None without one."""
+    inputs, with_label, variances = _label_moments(drives, label)
+    starts = [np.ones(len(inputs)), _leading_signs(inputs.sum(axis=0), with_label)]
+    fits = [_fit_signs(inputs, with_label, start) for start in starts]
+    explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in fits]
+    signs, _, gains = fits[int(np.argmax(explained))]
+    if not max(explained) > MIN_EXPLAINED * float(variances.sum()):
+        return None
+    majority = np.sign(signs.sum()) or signs[0]
+    return np.asarray(gains * majority)
+
+
+def _fit_signs(
+    inputs: FloatArray, with_label: FloatArray, signs: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return signs that agree with the relation fitted with them, the relation, and the gains."""
+    total = inputs.sum(axis=0)
+    for _ in range(SIGN_ROUNDS):
+        weights = solve(total, signs @ with_label)
+        gains = with_label @ weights / _predicted(inputs, weights)
+        agreeing = np.where(gains < 0, -1.0, 1.0)
+        if (agreeing == signs).all():
+            break
+        signs = agreeing
+    return signs, weights, gains
+
+
+def _label_moments(drives: MeanMoments, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return each drive's covariances of inputs, those with the label, and the label's variance."""
+    covariances = drives.covariances()
+    at = np.delete(np.arange(covariances.shape[1]), label)
+    return covariances[:, at[:, None], at], covariances[:, at, label], covariances[:, label, label]
+
+
+def _predicted(inputs: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the variance of each drive's prediction."""
+    variances = np.einsum("i,dij,j->d", weights, inputs, weights)
+    return np.asarray(np.maximum(variances, np.finfo(np.float64).tiny))
+
+
+def _leading_signs(inputs: FloatArray, with_label: FloatArray) -> FloatArray:
+    """Return the sign of each drive's projection on the leading direction."""
+    scale = np.sqrt(np.maximum(np.diagonal(inputs), np.finfo(np.float64).tiny))
+    directions = with_label / scale
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions / np.where(lengths > 0, lengths, 1.0)
+    _, vectors = np.linalg.eigh(directions.T @ directions)
+    return np.where(directions @ vectors[:, -1] < 0, -1.0, 1.0)
+
+
+MIN_CARS = 4
+"""Of a day or file, and of the others: a median of fewer cars shows their differences."""
+
+OFFSET, GAIN = 0, 1
+"""Columns of a drive's figures: the mean residual in counts, and the logarithm of the gain."""
+
+MIN_GAIN = 1e-3
+"""Of a label that does not follow its prediction at all, so that it has a logarithm."""
+
+
+def find_odd_days(
+    signals: SignalCatalog,
+    table: GramTable,
+    in_order: BoolArray,
+    groups: Sequence[IntArray],
+    cars: IntArray,
+    limits: QualityThresholds,
+) -> dict[int, Fault]:
+    """Return the drives of days or files whose labels are unlike the others', with the fault.
+
+    `groups` are numberings of the drives of the table, such as by day. The most unlike group is
+    removed and the others are compared again. A group of more than half of the drives is usual.
+    """
+    label = signals.label
+    if label not in table.signals or len(table.signals) < 2:
+        return {}
+    # The gain comes first: it decides where a group differs in both.
+    scale = float(signals[label].scale)
+    max_offset_rad = math.radians(CHECKS["zero of a day or file"].high)
+    bounds = {GAIN: math.log(CHECKS["scale of a day or file"].high), OFFSET: max_offset_rad / scale}
+    faults: dict[int, Fault] = {}
+    usual, moments = in_order.copy(), MeanMoments.from_table(table)
+    while usual.sum() >= limits.min_drives:
+        figures = _figures(moments.take(usual), table.signals.index(label))
+        if figures is None:
+            break
+        chosen = [group[usual] for group in groups]
+        odd = list(_odd_groups(figures, chosen, cars[usual], label, bounds, limits.limit))
+        if not odd:
+            rows = np.flatnonzero(usual)
+            alone = _odd_drives(figures, label, bounds, limits.limit)
+            return faults | {int(rows[drive]): fault for drive, fault in alone.items()}
+        _, mask, fault = max(odd, key=itemgetter(0))
+        rows = np.flatnonzero(usual)[mask]
+        faults |= dict.fromkeys(rows.tolist(), fault)
+        usual[rows] = False
+    return faults
+
+
+def _figures(drives: MeanMoments, label: int) -> FloatArray | None:
+    """Return offset and gain of each drive's label; None if the others hardly explain labels."""
+    inputs, with_label, variances = _label_moments(drives, label)
+    weights = solve(inputs.sum(axis=0), with_label.sum(axis=0))
+    explained, predicted = with_label @ weights, _predicted(inputs, weights)
+    least = np.finfo(np.float64).tiny
+    if np.median(explained**2 / np.maximum(predicted * variances, least)) < MIN_EXPLAINED:
+        return None
+    gains = explained / predicted
+    means = drives.matrices[:, 0, 1:]
+    offsets = means[:, label] - np.delete(means, label, axis=1) @ weights
+    return np.stack([offsets, np.log(np.maximum(gains, MIN_GAIN))], axis=1)
+
+
+def _odd_drives(
+    figures: FloatArray, label: str, bounds: dict[int, float], limit: float
+) -> dict[int, Fault]:
+    """Return single drives that differ by twice the bounds of a group."""
+    differences = figures - np.median(figures, axis=0)
+    scale = MAD_TO_STD * np.median(np.abs(differences), axis=0)
+    faults: dict[int, Fault] = {}
+    for column in reversed(bounds):
+        is_odd = np.abs(differences[:, column]) > max(2 * bounds[column], limit * scale[column])
+        for drive in np.flatnonzero(is_odd).tolist():
+            faults[drive] = _fault(label, column, float(differences[drive, column]), "drives")
+    return faults
+
+
+def _fault(label: str, column: int, difference: float, reference: str) -> Fault:
+    if column == GAIN:
+        gain = math.exp(difference)
+        return CHECKS["scale of a day or file"].fault(label, gain=gain, others=reference)
+    return CHECKS["zero of a day or file"].fault(label, offset=difference, others=reference)
+
+
+def _odd_groups(
+    figures: FloatArray,
+    groups: Sequence[IntArray],
+    cars: IntArray,
+    label: str,
+    bounds: dict[int, float],
+    limit: float,
+) -> Iterator[tuple[float, BoolArray, Fault]]:
+    """Yield the standard errors by which a group is odd, its drives, and the fault.
+
+    Medians of the group and of all others are compared, with the standard error of a median.
+    """
+    has_cars = len(np.unique(cars)) > 1
+    for mask in (numbers == number for numbers in groups for number in np.unique(numbers)):
+        sides = mask, ~mask
+        sizes = [len(np.unique(cars[side])) if has_cars else int(side.sum()) for side in sides]
+        if 2 * mask.sum() > len(mask) or min(sizes) < MIN_CARS:
+            continue
+        medians = [np.median(figures[side], axis=0) for side in sides]
+        variance = np.full(2, np.finfo(np.float64).tiny)
+        for side, median, size in zip(sides, medians, sizes, strict=True):
+            scale = MAD_TO_STD * np.median(np.abs(figures[side] - median), axis=0)
+            variance += math.pi / 2 * scale**2 / size
+        differences = medians[0] - medians[1]
+        scores = np.abs(differences) / np.sqrt(variance)
+        for column, bound in bounds.items():
+            if abs(differences[column]) > bound and scores[column] > limit:
+                fault = _fault(label, column, float(differences[column]), "days")
+                to_group, to_others = (np.abs(figures[:, column] - m[column]) for m in medians)
+                yield float(scores[column]), mask & (to_group < to_others), fault
+                break
+
+
+# Drives of one car that overlap in time: a car drives once, so that their rows count twice.
+
+
+def find_repeated(drives: pa.Table) -> dict[str, Fault]:
+    """Return the fault of each drive during which another one of its car was under way.
+
+    `drives` has the columns that `jobs/repeated_drives.sql` reads, a row or more for each drive.
+    """
+    parameters = {
+        "received": RECEIVED,
+        "least_s": CHECKS["drives at once"].high,
+        "sample_time_s": float(SAMPLE_TIME_S),
+    }
+    with open_scratch() as database:
+        database.register("drives", drives)
+        query = read_sql("jobs", "repeated_drives.sql")
+        overlaps = database.execute(query, parameters).fetchall()
+    return {
+        drive: CHECKS["drives at once"].fault(overlap_s=overlap_s, other=other)
+        for drive, overlap_s, other in overlaps
+    }

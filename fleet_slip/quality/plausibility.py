@@ -17,7 +17,6 @@ from fleet_slip.catalog.course import SATELLITE_SPEED
 from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.course_relation import check_course
-from fleet_slip.quality.delays import find_delays
 from fleet_slip.quality.drive_signals import (
     MIN_CORRELATION,
     MIN_TICKS,
@@ -39,6 +38,7 @@ from fleet_slip.quality.label_motion import check_label, is_yaw_rate_reversed
 from fleet_slip.quality.turning import (
     MIN_MEAN_RATIO,
     WITNESSES,
+    find_delays,
     find_reversed_or_swapped,
     find_swapped_axes,
 )
@@ -203,18 +203,6 @@ def _decide(fault: Fault, signals: Signals, moving: BoolArray, label: str) -> Fa
 
 STEERING_RATIO = 15.0
 ROAD_WHEELS = ("steer_fl", "steer")
-FACTORS = {57.3: "degrees and radians", 9.81: "g and m/s^2", 3.6: "km/h and m/s"}
-WHEEL_FACTORS = {9.55: "rpm and rad/s", 57.3: "degrees and radians", 3.6: "km/h and m/s"}
-"""Factors between units. A wheel's speed may be in km/h or m/s as well."""
-
-
-def _hint(ratio: float, factors: dict[float, str]) -> str:
-    """Return the units that differ by about a ratio, in brackets."""
-    large = max(ratio, 1 / ratio)
-    factor = min(factors, key=lambda factor: abs(math.log(factor / large)))
-    if not 0.6 < factor / large < 1.7:
-        return ""
-    return f" ({factor:g} is between {factors[factor]})"
 
 
 def _ratio(values: FloatArray, expected: FloatArray, rows: BoolArray) -> float | None:
@@ -233,9 +221,8 @@ def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
         return
     for name in (name for name in WHEELS if name in signals):
         ratio = _ratio(signals[name] * RADIUS_M, wheels, moving)
-        if ratio and not CHECKS["speed of one wheel"].passes(ratio):
-            hint = _hint(ratio, WHEEL_FACTORS)
-            yield CHECKS["speed of one wheel"].fault(name, ratio=ratio, hint=hint)
+        if ratio:
+            yield from CHECKS["speed of one wheel"].test(ratio, name, ratio=ratio)
     for name in (name for name in SPEEDS_OF_CAR if name in signals):
         is_receiver = name == SATELLITE_SPEED
         check = CHECKS["speed of the receiver" if is_receiver else "speeds of the car"]
@@ -248,8 +235,7 @@ def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
                 named = [name]
             elif of_wheels == of_speed:
                 named = [*named, name]
-            hint = _hint(ratio, WHEEL_FACTORS)
-            yield check.fault(*named, name=name, ratio=ratio, hint=hint)
+            yield check.fault(*named, name=name, ratio=ratio)
 
 
 def _turns_at(speed: FloatArray, signals: Signals, moving: BoolArray) -> bool:
@@ -287,14 +273,12 @@ def _compared(
 def _sizes(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Fault]:
     """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
     for names, expected, slope, correlation in _compared(signals, speed, moving):
-        if names == ("ax",) and correlation < CHECKS["sign of ax"].low:
-            yield CHECKS["sign of ax"].fault(*names, correlation=correlation)
-            continue
         ratio = slope if correlation > 0 else -slope
-        check = CHECKS["size of a signal"]
-        if abs(correlation) > MIN_CORRELATION and not check.passes(ratio):
-            hint = _hint(ratio, FACTORS)
-            yield check.fault(*names, ratio=ratio, expected=expected, hint=hint)
+        if names == ("ax",) and not CHECKS["sign of ax"].passes(correlation):
+            yield CHECKS["sign of ax"].fault(*names, correlation=correlation)
+        elif abs(correlation) > MIN_CORRELATION:
+            check = CHECKS["size of a signal"]
+            yield from check.test(ratio, *names, ratio=ratio, expected=expected)
 
 
 MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05

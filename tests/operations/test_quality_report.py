@@ -22,8 +22,7 @@ from fleet_slip.operations.quality_report import (
     find_wrong_labels,
 )
 from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.label_consistency import find_repeated
-from fleet_slip.quality.peers import thresholds
+from fleet_slip.quality.peers import find_repeated, thresholds
 from fleet_slip.regression.gram import Gram
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.warehouse.predicate import parse_predicate

@@ -5,9 +5,9 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.quality.checks import Fault
-from fleet_slip.quality.delays import estimate_delay
 from fleet_slip.quality.drive_signals import WHEELS
 from fleet_slip.quality.plausibility import check_plausibility
+from fleet_slip.quality.turning import estimate_delay
 from tests.support.catalog import SIGNALS
 from tests.support.textbook_car import Car, winding_car
 
@@ -91,9 +91,7 @@ def test_wheels_in_a_wrong_unit_are_compared_with_another_speed() -> None:
     slow = {**car, "vx": speed} | {wheel: car[wheel] / 9.55 for wheel in WHEELS}
     (fault,) = check_plausibility(SIGNALS, slow)
     assert (fault.kind, fault.signals) == ("scaled", WHEELS)
-    assert (
-        "vx is 9.55 times the speed of the wheels (9.55 is between rpm and rad/s)" in fault.figure
-    )
+    assert fault.figure == "vx is 9.55 times the speed of the wheels"
     (fault,) = check_plausibility(SIGNALS, {**car, "vx": 3.6 * speed})
     assert fault.signals == ("vx",)
     alone = {name: values for name, values in slow.items() if name not in {"ay", "sideslip"}}

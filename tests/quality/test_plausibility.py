@@ -102,22 +102,12 @@ def test_of_wheels_and_axes_that_contradict_the_fewest_are_at_fault() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "factor", "hint"),
-    [
-        ("yaw_rate", 57.3, "degrees and radians"),
-        ("ay", 1 / 9.81, "g and m/s^2"),
-        ("ax", 9.81, "g and m/s^2"),
-        ("wheel_rl", 3.6, "km/h and m/s"),
-    ],
+    ("name", "factor"), [("yaw_rate", 57.3), ("ay", 1 / 9.81), ("ax", 9.81), ("wheel_rl", 3.6)]
 )
-def test_a_unit_that_lies(name: str, factor: float, hint: str) -> None:
+def test_a_unit_that_lies(name: str, factor: float) -> None:
     car = a_car()
-    found = [
-        s
-        for s in check_plausibility(SIGNALS, {**car, name: factor * car[name]})
-        if s.kind == "scaled"
-    ]
-    assert any(name in one.signals and hint in one.figure for one in found)
+    found = check_plausibility(SIGNALS, {**car, name: factor * car[name]})
+    assert any(name in one.signals for one in found if one.kind == "scaled")
 
 
 STEPS = {"ax": 0.08, "ay": 0.08, "yaw_rate": 0.005, "steering_wheel": 0.026, "sideslip": 0.002}
