@@ -12,13 +12,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
-from hashlib import sha256
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fleet_slip.base import canonical_json, pluralize, sha256_of
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.signals import MEASURED, RECEIVED, SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, RECEIVED
 from fleet_slip.errors import DataError, NotComputedError, NotScreenedError
 from fleet_slip.grams.update import ensure_grams
 from fleet_slip.operations.quality_report import SensorFault, examine_drives
@@ -50,9 +48,6 @@ NAME = "drive"
 
 PIECE = 100_000
 """Drives that are compared with one another, or a quarter more: some 10 s and 600 MiB."""
-
-FEW_FILES = 20
-"""Gram files of which each is asked by itself whether it has measured drives: milliseconds."""
 
 CHECK_ROWS = 20_000_000
 """Maximum number of log rows that are reduced to check drives: they take seconds."""
@@ -140,23 +135,6 @@ class SensorScreen:
         return tuple(SensorFault(*row, faults[name]) for name, row in drives if name in faults)
 
 
-class _Piece(NamedTuple):
-    """Days whose drives are examined together; `rows` are hashes of their Gram rows."""
-
-    first: date
-    last: date
-    drives: int
-    rows: list[int]
-
-    def and_then(self, other: "_Piece") -> "_Piece":
-        drives, rows = self.drives + other.drives, self.rows + other.rows
-        return _Piece(self.first, other.last, drives, rows)
-
-    def predicate(self, signals: SignalCatalog) -> Predicate:
-        days = f"day BETWEEN DATE '{self.first}' AND DATE '{self.last}'"
-        return parse_predicate(signals, days)
-
-
 def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     """Check the drives of a cohort like `quality`; return the cohort without the faulty ones.
 
@@ -171,18 +149,8 @@ def screen_computed_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     predicate = measured if is_on_rows else requested & measured
     grams, logs = gram_snapshots(warehouse)
     missing = _count_unreduced(warehouse, grams, logs, predicate)
-    results: list[Mapping[str, Any]] = []
-    for piece in _pieces(warehouse, predicate) if _has_measured(grams) else []:
-        about = {"cohort": predicate.text, "from": piece.first, "root": warehouse.root.uri}
-        limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
-        state = [piece.rows, sha256(f"{CHECKS}{canonical_json(limits)}".encode()).hexdigest()]
-        name = sha256(canonical_json({k: str(v) for k, v in about.items()}).encode()).hexdigest()
-        cached = cache_folder("examined") / f"{name[:32]}.json"
-        result = _read_cache(cached, state)
-        result = result or _check_piece(warehouse, predicate & piece.predicate(signals))
-        content = {**result, "state": state}
-        keep_json(cached, {**content, "sha256": sha256_of(canonical_json(content))})
-        results.append(result)
+    pieces = _pieces(warehouse, predicate) if grams.files else []
+    results = [_check_piece(warehouse, predicate, *piece) for piece in pieces]
     faults = {
         name: Fault(kind, tuple(names), figure)
         for result in results
@@ -208,8 +176,30 @@ def screen_drives(warehouse: Warehouse, cohort: str) -> SensorScreen:
     return screen
 
 
-def _check_piece(warehouse: Warehouse, predicate: Predicate) -> Mapping[str, Any]:
-    report = examine_drives(warehouse, predicate)
+def _pieces(warehouse: Warehouse, predicate: Predicate) -> list[tuple[date, date, list[int]]]:
+    """Divide a cohort into pieces: the first and last day, and hashes of the Gram rows."""
+    with GramReader(warehouse) as reader:
+        opened = reader.opened(PLAIN, predicate)
+        statement = opened.statement("examined_days.sql", predicate)
+        with guarded_query(opened.database, predicate):
+            return opened.database.execute(statement, {"piece": PIECE}).fetchall()
+
+
+def _check_piece(
+    warehouse: Warehouse, predicate: Predicate, first: date, last: date, rows: list[int]
+) -> Mapping[str, Any]:
+    """Return the faults of the drives of some days, and how many were checked; from a cache."""
+    about = f"{predicate.text}\n{first}\n{warehouse.root.uri}"
+    cached = cache_folder("examined") / f"{sha256_of(about)[:32]}.json"
+    limits = thresholds(warehouse.configs).quality.model_dump(mode="json")
+    state = [rows, sha256_of(f"{CHECKS}{canonical_json(limits)}")]
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        content = json.loads(cached.read_bytes())
+        checksum = content.pop("sha256")
+        if content["state"] == state and checksum == sha256_of(canonical_json(content)):
+            return dict(content)
+    days = f"day BETWEEN DATE '{first}' AND DATE '{last}'"
+    report = examine_drives(warehouse, predicate & parse_predicate(warehouse.catalog.signals, days))
     faults = {
         hash_drive(NAME, finding.drive_id): [
             finding.fault.kind,
@@ -218,43 +208,9 @@ def _check_piece(warehouse: Warehouse, predicate: Predicate) -> Mapping[str, Any
         ]
         for finding in report.findings
     }
-    return {"faults": faults, "checked": report.drives}
-
-
-def _read_cache(file: Path, state: list[Any]) -> Mapping[str, Any] | None:
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        content = json.loads(file.read_bytes())
-        checksum = content.pop("sha256")
-        if content["state"] == state and checksum == sha256_of(canonical_json(content)):
-            return dict(content)
-    return None
-
-
-def _has_measured(grams: Snapshot) -> bool:
-    """Return True if there may be Gram rows of measured drives. Does not search many files."""
-    if len(grams.files) > FEW_FILES:
-        return True
-    read = (grams.table.read_combinations(file.path, ["source"]) for file in grams.files)
-    sources = {source for rows in read for source in rows["source"].to_pylist()}
-    return not sources.isdisjoint((MEASURED, RECEIVED))
-
-
-def _pieces(warehouse: Warehouse, predicate: Predicate) -> list[_Piece]:
-    """Divide a cohort's days, so that new days change the last piece alone."""
-    with GramReader(warehouse) as reader:
-        opened = reader.opened(PLAIN, predicate)
-        statement = opened.statement("examined_days.sql", predicate)
-        with guarded_query(opened.database, predicate):
-            days = opened.database.execute(statement).fetchall()
-    pieces: list[_Piece] = []
-    for day in (_Piece(day, day, drives, [rows]) for day, drives, rows in days if drives):
-        if pieces and pieces[-1].drives < PIECE:
-            pieces[-1] = pieces[-1].and_then(day)
-        else:
-            pieces.append(day)
-    if len(pieces) > 1 and 4 * pieces[-1].drives < PIECE:
-        pieces[-2:] = [pieces[-2].and_then(pieces[-1])]
-    return pieces
+    content = {"faults": faults, "checked": report.drives, "state": state}
+    keep_json(cached, {**content, "sha256": sha256_of(canonical_json(content))})
+    return content
 
 
 def _count_unreduced(
