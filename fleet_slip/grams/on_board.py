@@ -54,7 +54,7 @@ from fleet_slip.grams.gram_files import (
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.ingest.formats.parquet_footer import DELTA_BYTE_ARRAY, RowGroup, read_page_headers
+from fleet_slip.ingest.formats.parquet_footer import RowGroup, read_page_headers
 from fleet_slip.ingest.formats.tables import read_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark
@@ -346,87 +346,52 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
     return report
 
 
+_NOTE = {"job": "receive"}
+_SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping suggest LOG"
+VALUE_BYTES = 8
+
+
 def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
     stream = pa.BufferReader(content)
     try:
         _require_decodable(file, content, read_footer(stream, file))
-        parquet = pq.ParquetFile(stream)
-        columns = _documented_columns(file, parquet.schema_arrow)
+        schema = pq.ParquetFile(stream).schema_arrow
+        columns = [name for name in COLUMNS.names if name in schema.names]
+        if missing := set(COLUMNS.names).difference(columns, OPTIONAL):
+            raise InputError(
+                f"{file}: not a table of Gram rows, column {min(missing)} is missing. {_SEE}"
+            )
         # Texts stay in dictionaries until their total length is known: one can be in every row.
-        texts = [
-            name
-            for name in TEXTS
-            if name in columns and not pa.types.is_null(parquet.schema_arrow.field(name).type)
-        ]
+        texts = [name for name in TEXTS if name in columns and schema.field(name).type != pa.null()]
         parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
         batches = list(_decode(file, parquet.iter_batches(BATCH_ROWS_READ, columns=columns)))
-    except (pa.ArrowException, OSError, ValueError, IndexError):
+    except (pa.ArrowException, OSError, ValueError, LookupError):
         raise InputError(f"{file}: not a table of Gram rows (docs/export.md). {_SEE}") from None
     if not batches:
         raise InputError(f"{file}: has no Gram rows.")
     return pa.concat_tables(batches).combine_chunks()
 
 
-_NOTE = {"job": "receive"}
-_SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping suggest LOG"
+def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -> None:
+    """Raise `InputError` for pages that decode to too many bytes, or that have no checksum.
 
-
-def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
-    """Return the columns of `COLUMNS` in a file. Raises `InputError` for missing ones."""
-    for field in COLUMNS:
-        if field.name not in {*schema.names, *OPTIONAL}:
+    Reads the headers of all pages, since the footer can state other sizes. Without a checksum a
+    flipped bit of a product remains undetected.
+    """
+    if sum(group.rows for group in groups) > MAX_ROWS:
+        raise _too_large(file)
+    chunks = (chunk for group in groups for chunk in group.chunks if chunk.column in COLUMNS.names)
+    decoded = 0
+    for page in (page for chunk in chunks for page in read_page_headers(content, chunk)):
+        if not page.has_checksum:
             raise InputError(
-                f"{file}: not a table of Gram rows, column {field.name} is missing. {_SEE}"
+                f"{file}: its pages have no checksums. Write it with them, as by "
+                "pyarrow.parquet.write_table(..., write_page_checksum=True)."
             )
-        indices = schema.get_all_field_indices(field.name)
-        if len(indices) > 1:
-            raise InputError(f"{file}: has two columns {field.name}. Leave one of them out.")
-        for kind in (schema.field(index).type for index in indices):
-            if not _is_convertible(kind, field.type):
-                raise InputError(
-                    f"{file}: column {field.name} has the type {quote_name(kind)[:80]}; write it "
-                    f"as {field.type} (docs/export.md)."
-                )
-    return [name for name in COLUMNS.names if name in schema.names]
-
-
-def _is_convertible(kind: pa.DataType, to: pa.DataType) -> bool:
-    types = pa.types
-    if types.is_list(to):
-        is_list = types.is_list(kind) or types.is_large_list(kind)
-        return bool(is_list and types.is_integer(kind.value_type))
-    if to == pa.string():
-        kind = kind.value_type if types.is_dictionary(kind) else kind
-        return bool(types.is_string(kind) or types.is_large_string(kind) or types.is_null(kind))
-    is_same = types.is_date if types.is_date(to) else types.is_integer
-    return bool(is_same(kind) or types.is_null(kind))
-
-
-def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
-    """Yield the rows of batches with normalized names. Raises `InputError` for too long texts."""
-    first, text_bytes = 1, 0
-    for batch in batches:
-        batch.validate(full=True)  # texts are UTF-8
-        columns = {name: batch[name] for name in batch.schema.names}
-        for name in (name for name in TEXTS if name in columns):
-            texts = columns[name].cast(pa.dictionary(pa.int32(), pa.string()))
-            if name in NAMES:
-                names = [normalize_name(text) for text in texts.dictionary.to_pylist()]
-                for index, text in enumerate(names):
-                    if text and (fault := find_name_fault(text)):
-                        row = pc.index(texts.indices, index).as_py()
-                        _refuse(
-                            file, first + row, batch["drive_id"][row], f"has a {name} that {fault}"
-                        )
-                texts = pa.DictionaryArray.from_arrays(texts.indices, pa.array(names, pa.string()))
-            lengths = pc.binary_length(texts.dictionary).take(texts.indices)
-            text_bytes += pc.sum(lengths).as_py() or 0
-            if text_bytes > MAX_TEXT_BYTES:
-                raise _too_large(file)
-            columns[name] = texts.dictionary_decode()
-        yield in_schema(pa.table(columns), COLUMNS)
-        first += len(batch)
+        decoded += max(page.size_bytes, page.values * VALUE_BYTES)
+        if decoded > MAX_DECODED_BYTES:
+            raise _too_large(file)
 
 
 def _too_large(file: Path) -> InputError:
@@ -436,43 +401,46 @@ def _too_large(file: Path) -> InputError:
     )
 
 
-def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -> None:
-    """Raise `InputError` for pages that decode to too many bytes, or that have no checksum.
-
-    Reads the headers of all pages, since the footer can state other sizes. Without a checksum a
-    flipped bit of a product remains undetected.
-    """
-    if any(chunk.is_in_other_file for group in groups for chunk in group.chunks):
-        raise ValueError("columns in another file")
-    if sum(group.rows for group in groups) > MAX_ROWS:
-        raise _too_large(file)
-    decoded, pages = 0, 0
-    for group in groups:
-        for chunk in (chunk for chunk in group.chunks if chunk.column in COLUMNS.names):
-            values = 0
-            for page in read_page_headers(content, chunk):
-                if not page.has_checksum:
-                    raise InputError(
-                        f"{file}: its pages have no checksums. Write it with them, as by "
-                        "pyarrow.parquet.write_table(..., write_page_checksum=True)."
-                    )
-                if page.encoding == DELTA_BYTE_ARRAY:
-                    raise InputError(
-                        f"{file}: column {chunk.column} has the encoding DELTA_BYTE_ARRAY. Write "
-                        "it with the default encodings of pyarrow."
-                    )
-                decoded += max(page.size_bytes, page.values * VALUE_BYTES)
-                values += 0 if page.is_dictionary else page.values
-                pages += 1
-                if decoded > MAX_DECODED_BYTES or pages > MAX_PAGES:
+def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows of batches with normalized names. Raises `InputError` for too long texts."""
+    first, text_bytes = 1, 0
+    for batch in batches:
+        batch.validate(full=True)  # texts are UTF-8
+        columns = {}
+        for field in (field for field in COLUMNS if field.name in batch.schema.names):
+            is_text = field.name in TEXTS
+            kind = pa.dictionary(pa.int32(), pa.string()) if is_text else field.type
+            try:
+                column = batch[field.name].cast(kind)
+            except pa.ArrowException:
+                raise InputError(
+                    f"{file}: column {field.name} has the type "
+                    f"{quote_name(batch[field.name].type)[:80]}; write it as {field.type} "
+                    "(docs/export.md)."
+                ) from None
+            if field.name in NAMES:
+                column = _normalize_names(file, batch, field.name, column, first)
+            if is_text:
+                lengths = pc.binary_length(column.dictionary).take(column.indices)
+                text_bytes += pc.sum(lengths).as_py() or 0
+                if text_bytes > MAX_TEXT_BYTES:
                     raise _too_large(file)
-            if values != chunk.values:  # the reader would continue behind the pages
-                raise ValueError("the footer and the pages state different numbers of values")
+                column = column.dictionary_decode()
+            columns[field.name] = column
+        yield in_schema(pa.table(columns), COLUMNS)
+        first += len(batch)
 
 
-VALUE_BYTES = 8
-MAX_PAGES = 2**18
-"""Maximum number of pages of a file; reading a header takes some 10 µs."""
+def _normalize_names(
+    file: Path, batch: pa.RecordBatch, column: str, texts: pa.DictionaryArray, first: int
+) -> pa.DictionaryArray:
+    """Return the names of drives or cars without spaces around them, composed."""
+    names = [normalize_name(text) for text in texts.dictionary.to_pylist()]
+    for index, name in enumerate(names):
+        if name and (fault := find_name_fault(name)):
+            row = pc.index(texts.indices, index).as_py()
+            _refuse(file, first + row, batch["drive_id"][row], f"has a {column} that {fault}")
+    return pa.DictionaryArray.from_arrays(texts.indices, pa.array(names, pa.string()))
 
 
 def _gram_rows(

@@ -109,6 +109,12 @@ class NightReport(Answer):
         Errors of the previous champion on each day since its training, if there are enough days.
     """
 
+    DOCUMENT = (
+        "model night exit_code verdict drives new_drives rows new_rows new_rows_quarantined "
+        "champion champion_before=before.champion candidate steps faults new_faults=new_faulty "
+        "alarms seconds"
+    )
+
     model: str
     night: date
     root: str
@@ -133,23 +139,44 @@ class NightReport(Answer):
         )
 
     @property
+    def new_faulty(self) -> list[str]:
+        """The names of these drives."""
+        return [fault.drive_id for fault in self.new_faults]
+
+    @property
+    def alarms(self) -> list[str]:
+        """The days on which the previous champion was beyond its limits."""
+        return [str(day.day) for day in self.chart.alarms] if self.chart else []
+
+    @property
+    def new_drives(self) -> int:
+        """The drives of the night."""
+        return self.drives - self.before.drives
+
+    @property
+    def new_rows(self) -> int:
+        """The log rows of the night."""
+        return self.rows - self.before.rows
+
+    @property
+    def new_rows_quarantined(self) -> int:
+        """The rejected rows of the night."""
+        return self.quarantined - self.before.quarantined
+
+    @property
     def problem(self) -> FleetSlipError | None:
         """The first failure, else what needs attention; None after a good night."""
         night = f"the night of {self.night}"
-        alarms = [f"{step.name}: {step.summary}" for step in self._with_state("attention")]
-        problem: FleetSlipError
+        problem: FleetSlipError | None = None
         if failures := [(step.name, step.error) for step in self.steps if step.error]:
             name, error = failures[0]
             problem = type(error)(f"{night}: {name} failed: {error}")
-        elif alarms:
-            problem = AlarmError(f"{night}: {' '.join(alarms)}")
-        else:
-            return None
-        problem.headline = f"{night}: {self.verdict}"
+        elif alarms := [step for step in self.steps if step.state == "attention"]:
+            summaries = (f"{step.name}: {step.summary}" for step in alarms)
+            problem = AlarmError(f"{night}: {' '.join(summaries)}")
+        if problem:
+            problem.headline = f"{night}: {self.verdict}"
         return problem
-
-    def _with_state(self, state: State) -> list[NightStep]:
-        return [step for step in self.steps if step.state == state]
 
     @property
     def exit_code(self) -> int:
@@ -159,20 +186,15 @@ class NightReport(Answer):
     @property
     def verdict(self) -> str:
         """The outcome in a few words."""
-        failed = [step.name for step in self._with_state("failed")]
-        alarms = [step.name for step in self._with_state("attention")]
-        clauses = [f"{' and '.join(failed)} failed"] if failed else []
-        if alarms:
-            verb = "calls" if len(alarms) == 1 else "call"
-            clauses.append(f"{' and '.join(alarms)} {verb} for attention")
+        states = {"failed": "failed", "attention": "calls for attention"}
+        clauses = [f"{s.name} {states[s.state]}" for s in self.steps if s.state in states]
         return ", ".join(clauses) or "all went well"
 
     @property
     def gained(self) -> str:
         """The new drives, rows and rejected rows."""
-        rows, drives = self.rows - self.before.rows, self.drives - self.before.drives
-        rejected = self.quarantined - self.before.quarantined
-        new = f"{pluralize(drives, 'drive')}, {pluralize(rows, 'row')}"
+        new = f"{pluralize(self.new_drives, 'drive')}, {pluralize(self.new_rows, 'row')}"
+        rejected = self.new_rows_quarantined
         return f"{new}; in quarantine: {pluralize(rejected, 'row')}" if rejected else new
 
     def as_past(self) -> dict[str, Any]:
@@ -207,28 +229,6 @@ class NightReport(Answer):
     def moved(self) -> bool:
         """True if the night replaced a champion."""
         return self.before.champion not in (None, self.champion)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the document that `nightly --json` prints."""
-        return {
-            "model": self.model,
-            "night": self.night,
-            "exit_code": self.exit_code,
-            "verdict": self.verdict,
-            "drives": self.drives,
-            "new_drives": self.drives - self.before.drives,
-            "rows": self.rows,
-            "new_rows": self.rows - self.before.rows,
-            "new_rows_quarantined": self.quarantined - self.before.quarantined,
-            "champion": self.champion,
-            "champion_before": self.before.champion,
-            "candidate": self.candidate,
-            "steps": [step.as_dict() for step in self.steps],
-            "faults": [fault.as_dict() for fault in self.faults],
-            "new_faults": [fault.drive_id for fault in self.new_faults],
-            "alarms": [str(day.day) for day in self.chart.alarms] if self.chart else [],
-            "seconds": self.seconds,
-        }
 
 
 def write_summary(report: NightReport, folder: Path) -> list[Path]:

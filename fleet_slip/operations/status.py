@@ -3,12 +3,10 @@
 import contextlib
 import shlex
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from typing import Any
-
-import pyarrow as pa
 
 from fleet_slip.base import pluralize
 from fleet_slip.errors import (
@@ -21,7 +19,6 @@ from fleet_slip.errors import (
     StorageError,
     printable,
 )
-from fleet_slip.limits import memory_bytes
 from fleet_slip.models.registry import Registry
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -36,8 +33,6 @@ from fleet_slip.warehouse.gram_reader import find_backlog
 from fleet_slip.warehouse.warehouse import Warehouse
 
 SECONDS_PER_HOUR = 3600
-MIN_MEMORY_BYTES = 2**30
-"""The largest command that was measured, `verify` of files of a million rows, takes 828 MiB."""
 _FULL = "disk {:.1%} free, below {:.0%}"
 
 RETURNED_SHOWN = 5
@@ -140,7 +135,7 @@ def status_of(
 
     Data older than `max_age_hours`, and log files that old without Gram rows, are a problem; so are
     a command whose last run failed or was killed, a disk that is nearly full, a champion that
-    cannot be loaded, less than 1 GiB of memory, and an object store that lets a file be made twice.
+    cannot be loaded, and an object store that lets a file be made twice.
     `jobs/last_runs.sql` excludes failures by mistakes of a user. Raises `StorageError` if there is
     no data root.
     """
@@ -158,12 +153,16 @@ def status_of(
     changed = list(find_changed_lines(warehouse.root, since))
     last_runs = () if changed else tuple(_last_runs(warehouse.root, since))
     age = _age_hours(tables["logs"].committed_at, now)
+    waiting = {file.path for file in backlog}
+    files = logs.table.folder.files() if waiting else ()
+    written = [file.modified_ns for file in files if file.path in waiting]
+    backlog_age = _age_hours(_from_ms(min(written) // 10**6 if written else None), now)
     least = thresholds(warehouse.configs).status.min_free_fraction
     problems = [
-        *_stale(age, _oldest_hours(logs, {f.path for f in backlog}, now), max_age_hours),
+        *(_stale(age, backlog_age, max_age_hours) if max_age_hours is not None else ()),
         *_returned(warehouse, tuple(snapshots.values())),
         *_failed(last_runs),
-        *_unfit(warehouse.root),
+        *_unsafe_store(warehouse.root),
         *([_FULL.format(free, least)] if free is not None and free < least else []),
         *dict.fromkeys([*damaged, *find_lost(warehouse.root)]),
         *(f"{path}: {problem}" for path, problem in changed),
@@ -184,23 +183,6 @@ def status_of(
     )
 
 
-def _unfit(root: Folder) -> Iterator[str]:
-    """Yield unmet requirements of the jobs: memory, and an object store that creates files once."""
-    if memory_bytes() < MIN_MEMORY_BYTES:
-        yield "this process may have less than 1 GiB of memory, which large commands take"
-    if root.free_bytes() is not None:
-        return  # a local disk keeps a file from being made twice
-    probe = f"{TEMPORARY_PREFIX}probe-{uuid.uuid4().hex}"
-    try:
-        if root.create(probe, b"one") and root.create(probe, b"two"):
-            yield f"{root}: this store creates files twice: commits can be lost. Use another"
-    except FleetSlipError:
-        return  # a monitor may have the right to read alone
-    finally:
-        with contextlib.suppress(FleetSlipError):
-            root.delete(probe)
-
-
 def _table(snapshot: Snapshot) -> TableStatus:
     with storage_errors(snapshot.table.folder):
         last = snapshot.delta.history(limit=1) if snapshot.delta else []
@@ -211,16 +193,6 @@ def _table(snapshot: Snapshot) -> TableStatus:
         rows=snapshot.rows,
         size_bytes=snapshot.size_bytes,
     )
-
-
-def _oldest_hours(logs: Snapshot, paths: set[str], now: datetime) -> float | None:
-    """Return how long ago the oldest of some files was written."""
-    if logs.delta is None or not paths:
-        return None
-    with storage_errors(logs.table.folder):
-        actions = pa.table(logs.delta.get_add_actions()).to_pylist()
-    moments = [action["modification_time"] for action in actions if action["path"] in paths]
-    return _age_hours(_from_ms(min(moments, default=None)), now)
 
 
 def _age_hours(moment: datetime | None, now: datetime) -> float | None:
@@ -271,17 +243,13 @@ def _champions(
     return tuple(champions), damaged
 
 
-def _stale(age: float | None, backlog_age: float | None, limit: float | None) -> list[str]:
-    if limit is None:
-        return []
-    problems = []
+def _stale(age: float | None, backlog_age: float | None, limit: float) -> Iterator[str]:
     if age is None:
-        problems.append("no data has ever been committed")
+        yield "no data has ever been committed"
     elif age > limit:
-        problems.append(f"no data has been committed for {age:.1f} h, more than {limit:g} h")
+        yield f"no data has been committed for {age:.1f} h, more than {limit:g} h"
     if backlog_age is not None and backlog_age > limit:
-        problems.append(f"a log file has had no Gram rows for {backlog_age:.1f} h")
-    return problems
+        yield f"a log file has had no Gram rows for {backlog_age:.1f} h"
 
 
 def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[str]:
@@ -300,14 +268,22 @@ def _returned(warehouse: Warehouse, snapshots: Sequence[Snapshot]) -> Iterator[s
         )
 
 
-def _failed(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    problems = []
+def _failed(runs: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     for run in runs:
         when = f"{run['command']} of {run['started_at']:%Y-%m-%d %H:%M}"
         if run["state"] == "failed":
             why = f" ({HIDDEN}: a name that is not recorded)" if HIDDEN in str(run["error"]) else ""
-            code, error = run["exit_code"], run["error"]
-            problems.append(f"{when} failed with exit code {code}: {error}{why}")
+            yield f"{when} failed with exit code {run['exit_code']}: {run['error']}{why}"
         elif run["state"] in ("killed", "interrupted"):
-            problems.append(f"{when} was {run['state']}")
-    return problems
+            yield f"{when} was {run['state']}"
+
+
+def _unsafe_store(root: Folder) -> Iterator[str]:
+    """Yield a problem for an object store that lets a file be made twice."""
+    if root.free_bytes() is not None:
+        return  # a local disk
+    probe = f"{TEMPORARY_PREFIX}probe-{uuid.uuid4().hex}"
+    with contextlib.suppress(FleetSlipError):  # a monitor may have the right to read alone
+        if root.create(probe, b"one") and root.create(probe, b"two"):
+            yield f"{root}: this store creates files twice: commits can be lost. Use another"
+        root.delete(probe)

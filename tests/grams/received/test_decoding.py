@@ -76,11 +76,11 @@ def test_a_column_of_another_type_is_named(fleet: fleet_slip.Fleet, tmp_path: Pa
     nested = with_column(table, "n", list_array(np.zeros((2, 1), np.int64)))
     with pytest.raises(InputError, match=r"column n has the type list<.*write it as int64"):
         fleet.import_onboard_grams(write(tmp_path / "nested", nested))
-    texts = with_column(table, "sums", pa.array([["1"], ["2"]]))
+    texts = with_column(table, "sums", pa.array([["a"], ["b"]]))
     with pytest.raises(InputError, match=r"column sums has the type list<"):
         fleet.import_onboard_grams(write(tmp_path / "texts", texts))
     twice = table.append_column("n", table["n"])
-    with pytest.raises(InputError, match="two columns n"):
+    with pytest.raises(InputError, match="not a table of Gram rows"):
         fleet.import_onboard_grams(write(tmp_path / "twice", twice))
 
 
@@ -92,20 +92,6 @@ def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Pa
     ]
     table = pa.table(columns, names=on_board.COLUMNS.names)
     assert fleet.import_onboard_grams(write(tmp_path / "rows", table)).rows == 500
-
-
-def test_texts_that_repeat_prefixes_are_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
-    path = tmp_path / "rows"
-    names = [name for name in on_board.COLUMNS.names if name not in {"sums", "products"}]
-    pq.write_table(
-        rows_of_fleet(20, START_S, seed=1),
-        path,
-        write_page_checksum=True,
-        use_dictionary=[name for name in names if name != "drive_id"],
-        column_encoding={"drive_id": "DELTA_BYTE_ARRAY"},
-    )
-    with pytest.raises(InputError, match="drive_id has the encoding DELTA_BYTE_ARRAY"):
-        fleet.import_onboard_grams(path)
 
 
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
