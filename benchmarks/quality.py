@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.operations.quality_report import QualityReport, examine, find_wrong_labels
+from fleet_slip.operations.sensor_screen import QualityReport, examine, find_wrong_labels
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect

@@ -24,15 +24,13 @@ from fleet_slip.storage.runs import step
 
 if TYPE_CHECKING:
     from fleet_slip.calibration.car_calibration import Calibration
-    from fleet_slip.grams.check import CheckReport
     from fleet_slip.models.registry import ModelVersion
-    from fleet_slip.operations.find_drives import VacuumReport
     from fleet_slip.operations.forget import ForgetReport, RetentionReport
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality_report import QualityReport
-    from fleet_slip.operations.rewriting import CompactionReport, MigrationReport
+    from fleet_slip.operations.rewriting import CompactionReport, MigrationReport, VacuumReport
+    from fleet_slip.operations.sensor_screen import QualityReport
     from fleet_slip.operations.status import WarehouseStatus
-    from fleet_slip.operations.verify import Verification
+    from fleet_slip.operations.verify import CheckReport, Verification
     from fleet_slip.warehouse.erasure_log import ErasureSubject
     from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -100,7 +98,7 @@ class FleetMaintenance:
         QuestionError, DataError
             As `FleetCohort`.
         """
-        from fleet_slip.operations.quality_report import examine_drives
+        from fleet_slip.operations.sensor_screen import examine_drives
 
         return examine_drives(self.warehouse, cohort)
 
@@ -210,8 +208,7 @@ class FleetMaintenance:
         ClusterError
             If the cluster cannot be used.
         """
-        from fleet_slip.grams.check import check_grams
-        from fleet_slip.operations.verify import verify
+        from fleet_slip.operations.verify import check_grams, verify
 
         accepted = self.accept_losses(accept_loss) if accept_loss else ()
         steps = progress_of_steps(progress)
@@ -258,7 +255,7 @@ class FleetMaintenance:
         DataError
             If there is nothing to check.
         """
-        from fleet_slip.grams.check import check_grams
+        from fleet_slip.operations.verify import check_grams
 
         return check_grams(self.warehouse, files, total_progress(progress), begin)
 
@@ -314,8 +311,7 @@ class FleetMaintenance:
         ConflictError
             If other processes keep changing files.
         """
-        from fleet_slip.operations.find_drives import RETENTION_HOURS, vacuum
-        from fleet_slip.operations.rewriting import TARGET_ROWS, compact
+        from fleet_slip.operations.rewriting import RETENTION_HOURS, TARGET_ROWS, compact, vacuum
 
         hours = RETENTION_HOURS if retention_hours is None else retention_hours
         if dry_run:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.publish import Publication
     from fleet_slip.models.select import Selection
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality_report import SensorFault
+    from fleet_slip.operations.sensor_screen import SensorFault
     from fleet_slip.simulation.simulate import SimulationReport
     from fleet_slip.vehicle.parameters import VehicleMeasures
 

@@ -8,15 +8,19 @@ jobs that have not read the new logs. Files of such jobs are deleted by them or 
 """
 
 import shutil
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date, timedelta
 
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
 
 from fleet_slip.base import Progress, no_progress, pluralize
+from fleet_slip.catalog.counts import digest_counts
+from fleet_slip.catalog.features import PLAIN
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import (
     AlarmError,
@@ -27,41 +31,247 @@ from fleet_slip.errors import (
     RefusedError,
     StorageError,
 )
-from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.grams.gram_files import gram_digests, hash_names, read_rows
+from fleet_slip.grams.on_board import onboard_feature_sets
 from fleet_slip.grams.update import reconcile
 from fleet_slip.models.registry import Registry
-from fleet_slip.operations.find_drives import (
-    RETENTION_HOURS,
-    Located,
-    VacuumReport,
-    digests_of,
-    drives_by_file,
-    drives_of,
-    find_remains,
-    find_replaced,
-    find_unreferenced,
-    half_written,
-    locate,
-    path_below,
-    quarantined_of,
-    remove_uncommitted,
-    tables_with,
-    vacuum,
-)
 from fleet_slip.operations.rewriting import (
+    RETENTION_HOURS,
     Rewriting,
-    erase_onboard_rows,
-    erase_rows,
+    VacuumReport,
+    find_replaced,
+    find_temporary_files,
+    find_unreferenced,
+    path_below,
     rewrite,
+    vacuum,
+    without_rows,
 )
 from fleet_slip.quality.checks import implausible_day
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
+from fleet_slip.storage.folder import SPILL_PREFIX, StoredFile
 from fleet_slip.storage.runs import runs_under_way
-from fleet_slip.storage.table import retrying, rows_in
+from fleet_slip.storage.table import Snapshot, Table, retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.gram_reader import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
+
+# Rows of a subject in tables and files.
+
+
+def rows_of(rows: pa.Table, subject: ErasureSubject) -> pa.ChunkedArray:
+    """Return which rows of `logs` or `grams` are of a subject."""
+    if subject.kind == "before":
+        is_before = pc.less(rows["day"], pa.scalar(date.fromisoformat(subject.value)))
+        kept_days = pa.array(sorted(subject.kept_days), pa.date32())
+        return pc.and_not(is_before, pc.is_in(rows["day"], kept_days))
+    names = rows[subject.column].cast(pa.string())
+    return pc.is_in(names, pa.array(subject.select(names.unique().to_pylist()), pa.string()))
+
+
+def quarantined_of(
+    rows: pa.Table, subject: ErasureSubject, drives: Collection[str]
+) -> pa.ChunkedArray:
+    """Return a mask of the quarantine's rows of a subject or of its drives.
+
+    Rows rejected before a cut at a gap have the name of the uncut drive.
+    """
+    ids = rows["drive_id"].cast(pa.string())
+    if subject.kind == "drive":
+        drives = {*drives, subject.value, *subject.select(ids.unique().to_pylist())}
+    concerned = {
+        name
+        for name in ids.unique().to_pylist()
+        if name and any(drive == name or drive.startswith(f"{name}-") for drive in drives)
+    }
+    of_drives = pc.is_in(ids, pa.array(sorted(concerned), pa.string()))
+    if subject.kind != "vehicle":
+        return of_drives
+    return pc.or_(of_drives, rows_of(rows, subject))
+
+
+@dataclass(frozen=True)
+class Located:
+    """A subject's `drives` by log file, and the `reduced` log files, which have plain Gram rows."""
+
+    reduced: frozenset[str]
+    drives: Mapping[str, frozenset[str]]
+
+
+def locate(grams: Snapshot, subject: ErasureSubject) -> Located:
+    """Look for a subject's drives in the Gram rows."""
+    reduced: set[str] = set()
+    drives: dict[str, set[str]] = {}
+    columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
+    for file in grams.files:
+        rows = grams.table.read(file.path, columns)
+        is_plain = pc.equal(rows["feature_set"], PLAIN)
+        reduced.update(rows["file"].filter(is_plain).unique().to_pylist())
+        matches = rows.filter(rows_of(rows, subject))
+        for path, drive in zip(
+            matches["file"].to_pylist(), matches["drive_id"].to_pylist(), strict=True
+        ):
+            drives.setdefault(path, set()).add(drive)
+    return Located(frozenset(reduced), {path: frozenset(names) for path, names in drives.items()})
+
+
+def drives_by_file(
+    logs: Snapshot, subject: ErasureSubject, located: Located
+) -> dict[str, frozenset[str]]:
+    """Return the drives concerned by log file, opening only files without Gram rows."""
+    by_file = {}
+    for file in logs.files:
+        drives = located.drives.get(file.path, frozenset())
+        if file.path not in located.reduced:
+            names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
+            names = names.append_column("day", pa.repeat(file.day, names.num_rows))
+            drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
+        if drives:
+            by_file[file.path] = drives
+    return by_file
+
+
+def tables_with(
+    warehouse: Warehouse,
+    subject: ErasureSubject,
+    drives: Collection[str] = (),
+    located: Located | None = None,
+) -> dict[str, set[str]]:
+    """Return the tables that have rows of a subject or of its drives, and the drives of these."""
+    located = located or locate(warehouse.grams.snapshot(), subject)
+    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
+    tables: dict[str, set[str]] = {}
+    for name, by_file in (("grams", located.drives), ("logs", in_logs)):
+        if by_file:
+            tables[name] = set().union(*by_file.values())
+    for file in warehouse.quarantine.snapshot().files:
+        refused = find_in_file(warehouse, warehouse.quarantine, file.path, subject, drives)
+        if refused is not None:
+            tables.setdefault("quarantine", set()).update(refused)
+    return tables
+
+
+def drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
+    """Return a subject's drives in all tables."""
+    return frozenset().union(*tables_with(warehouse, subject, (), located).values())
+
+
+def remove_uncommitted(
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
+) -> None:
+    """Delete files with rows of a subject that were never committed: the fence refuses them now.
+
+    Log files are deleted last: only they may name a car's drives. Drives before a day may still be
+    committed, and are left.
+    """
+    leftovers: list[StoredFile] = []
+    for table in warehouse.tables if subject.kind != "before" else ():
+        removals = table.snapshot().removals
+        for file in find_unreferenced(table):
+            if file.path in removals:
+                continue
+            with suppress(StorageError):  # half a file, or just deleted
+                matches = find_in_file(warehouse, table, file.path, subject, drives)
+                if matches is not None:
+                    drives = {*drives, *matches}
+                    leftovers.append(file)
+    for file in reversed(leftovers):
+        file.folder.remove(file)
+
+
+def find_in_file(
+    warehouse: Warehouse,
+    table: Table,
+    path: str,
+    subject: ErasureSubject,
+    drives: Collection[str],
+) -> set[str] | None:
+    """Return a subject's drives in a file, None if no row is of the subject."""
+    rows = table.read(path, ["drive_id", "vehicle_id"])
+    is_quarantine = table is warehouse.quarantine
+    mask = quarantined_of(rows, subject, drives) if is_quarantine else rows_of(rows, subject)
+    matches = rows["drive_id"].filter(mask)
+    return set(matches.drop_null().to_pylist()) if len(matches) else None
+
+
+def find_remains(
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str]
+) -> Iterator[str]:
+    """Yield the files that are in no table and have rows of a subject, or cannot be read.
+
+    Files with drives before a day may be landing: these are not judged.
+    """
+    for table in warehouse.tables if subject.kind != "before" else ():
+        for file in find_unreferenced(table):
+            try:
+                if find_in_file(warehouse, table, file.path, subject, drives) is not None:
+                    yield path_below(warehouse, file)
+            except StorageError:
+                if any(file == other for other in find_unreferenced(table)):  # not just deleted
+                    yield f"{path_below(warehouse, file)} (unreadable)"
+
+
+def half_written(warehouse: Warehouse) -> list[StoredFile]:
+    """Return the temporary files that may have rows of any drive."""
+    tables = {table.folder.name for table in warehouse.tables}
+    return [
+        file
+        for file in find_temporary_files(warehouse)
+        if file.path.startswith(SPILL_PREFIX)
+        or (file.path.split("/")[0] in tables and "_delta_log" not in file.path)
+    ]
+
+
+def digests_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> Iterator[str]:
+    """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
+    grams = warehouse.grams.snapshot()
+    for file in grams.files:
+        names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
+        if pc.any(selected := rows_of(names, subject)).as_py():
+            rows = read_rows(warehouse.grams, file).filter(selected)
+            on_board = pc.is_in(
+                rows["feature_set"],
+                pa.array(list(onboard_feature_sets(warehouse.catalog)), pa.string()),
+            )
+            yield from gram_digests(rows.filter(on_board))[0]
+    logs = warehouse.logs.snapshot()
+    drives = drives_by_file(logs, subject, located)
+    for file in logs.files:
+        if file.path not in drives:
+            continue
+        signals = [name for name in warehouse.catalog.signals.signals if name in file.null_counts]
+        rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
+        ids = rows["drive_id"].cast(pa.string())
+        for name in sorted(drives[file.path]):
+            rows_of_drive = rows.filter(pc.equal(ids, name)).combine_chunks()
+            [batch] = rows_of_drive.to_batches()
+            counts = {signal: batch[signal] for signal in signals}
+            car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
+            yield digest_counts(car, str(file.day), ticks, counts)
+
+
+@retrying
+def erase_rows(table: Table, is_removed: Callable[[pa.Table], pa.ChunkedArray]) -> None:
+    """Commit a table without some rows."""
+    snapshot = table.snapshot()
+    change, removed_rows = without_rows(snapshot, snapshot.files, is_removed)
+    if removed_rows:
+        snapshot.commit_or_discard(change)
+
+
+@retrying
+def erase_onboard_rows(grams: Table, subject: ErasureSubject) -> int:
+    """Commit the Gram rows without those that cars sent; return the rows that they count."""
+    snapshot = grams.snapshot()
+    files = [file for file in snapshot.files if is_onboard_file(file)]
+    change, removed_rows = without_rows(snapshot, files, lambda rows: rows_of(rows, subject))
+    if removed_rows:
+        snapshot.commit_or_discard(change)
+    return sum(pc.sum(rows["n"]).as_py() for rows in removed_rows)
+
+
+# Erasure.
 
 PENDING_SHOWN = 5
 """Maximum number of files and runs named in the error; --json lists all."""

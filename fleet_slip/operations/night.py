@@ -19,7 +19,7 @@ from fleet_slip.warehouse.predicate import hash_drive
 
 if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart
-    from fleet_slip.operations.quality_report import SensorFault
+    from fleet_slip.operations.sensor_screen import SensorFault
 
 NIGHTS_FOLDER = "nights"
 """Folder of numbered documents: one when a night begins, one when it ends."""

@@ -5,6 +5,7 @@ bytes depend on the drives only.
 """
 
 import dataclasses
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
@@ -19,13 +20,17 @@ from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 
 from fleet_slip.arrays import IntArray
-from fleet_slip.base import Progress, no_progress
+from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.update import commit_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
-from fleet_slip.operations.find_drives import rows_of
 from fleet_slip.rendering import Answer, Part, Remark
+<<<<<<< HEAD
+=======
+from fleet_slip.storage.documents import document_folders
+from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
+>>>>>>> 8d98bcf1 (Merge the modules of verification, erasure and the sensor screen)
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -38,8 +43,7 @@ from fleet_slip.storage.table import (
     retrying,
     scales_of,
 )
-from fleet_slip.warehouse.erasure_log import ErasureSubject
-from fleet_slip.warehouse.gram_reader import is_onboard_file, rows_of_set
+from fleet_slip.warehouse.gram_reader import BEING_WRITTEN_HOURS, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -174,26 +178,6 @@ def without_rows(
     return Change(add, remove, note={"job": "forget"}), removed_rows
 
 
-@retrying
-def erase_rows(table: Table, is_removed: Callable[[pa.Table], pa.ChunkedArray]) -> None:
-    """Commit a table without some rows."""
-    snapshot = table.snapshot()
-    change, removed_rows = without_rows(snapshot, snapshot.files, is_removed)
-    if removed_rows:
-        snapshot.commit_or_discard(change)
-
-
-@retrying
-def erase_onboard_rows(grams: Table, subject: ErasureSubject) -> int:
-    """Commit the Gram rows without those that cars sent; return the rows that they count."""
-    snapshot = grams.snapshot()
-    files = [file for file in snapshot.files if is_onboard_file(file)]
-    change, removed_rows = without_rows(snapshot, files, lambda rows: rows_of(rows, subject))
-    if removed_rows:
-        snapshot.commit_or_discard(change)
-    return sum(pc.sum(rows["n"]).as_py() for rows in removed_rows)
-
-
 # Removal of drives that others replace.
 #
 # They may come again: their files' transactions are withdrawn. Their Gram rows go with the files.
@@ -324,8 +308,114 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
         yield pack
 
 
+<<<<<<< HEAD
 # Brings the tables of a data root to the signal catalog: every table gets the columns that came
 # later. No file is touched: there they are null.
+=======
+# Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
+#
+# A file stays while a version of the last `retention_hours` refers to it, for queries; while it is
+# younger; an hour at least if no version had it, for jobs about to commit; and where a table has no
+# Delta log.
+
+RETENTION_HOURS = 168
+"""Also the longest that can be kept: Delta checkpoints forget removed files after a week."""
+
+
+@dataclass(frozen=True)
+class VacuumReport:
+    """The removed files, or in a dry run those to remove."""
+
+    files: tuple[str, ...]
+    size_bytes: int
+    dry_run: bool
+
+    @property
+    def remark(self) -> Remark:
+        """How much was removed."""
+        done = "would be removed" if self.dry_run else "removed"
+        return Remark(f"{pluralize(len(self.files), 'file')} with {self.size_bytes:,} bytes {done}")
+
+
+def vacuum(
+    warehouse: Warehouse, retention_hours: float = RETENTION_HOURS, *, dry_run: bool = False
+) -> VacuumReport:
+    """Remove the files that nothing has referred to for some hours."""
+    warehouse.require()
+    expired = find_expired(warehouse, retention_hours)
+    if not dry_run:
+        expired = [file for file in expired if file.folder.remove(file)]
+    return VacuumReport(
+        files=tuple(path_below(warehouse, file) for file in expired),
+        size_bytes=sum(file.size_bytes for file in expired),
+        dry_run=dry_run,
+    )
+
+
+def find_expired(warehouse: Warehouse, retention_hours: float) -> list[StoredFile]:
+    """Return the files that `vacuum` removes: older than some hours, and in no version of these."""
+    candidates, uncommitted = [], find_temporary_files(warehouse)
+    for table in warehouse.tables:
+        files = find_unreferenced(table)
+        snapshot = table.snapshot()
+        if snapshot.version is None:  # its Delta log may have been lost, and these be its data
+            continue
+        expired = snapshot.removed_before(retention_hours)
+        candidates += [file for file in files if file.path in expired]
+        uncommitted += [file for file in files if file.path not in snapshot.removals]
+    candidates += [file for file in uncommitted if file.age_hours >= BEING_WRITTEN_HOURS]
+    return [file for file in candidates if file.age_hours >= retention_hours]
+
+
+def find_unreferenced(table: Table) -> list[StoredFile]:
+    """Return the data files below a table that its current version does not refer to."""
+    # Listed before the log is read: a file that is committed meanwhile is not taken for a leftover.
+    files = [
+        file
+        for file in table.folder.files()
+        if file.path.endswith(".parquet")
+        and not file.path.startswith("_delta_log/")
+        and not file.name.startswith(TEMPORARY_PREFIX)
+    ]
+    active = {file.path for file in table.snapshot().files}
+    return [file for file in files if file.path not in active]
+
+
+def find_temporary_files(warehouse: Warehouse) -> list[StoredFile]:
+    """Return temporary files of killed jobs: ours, DuckDB's, and the Delta library's."""
+    return [
+        file
+        for file in warehouse.root.files()
+        if file.name.startswith(TEMPORARY_PREFIX)
+        or file.path.startswith(SPILL_PREFIX)
+        or _OF_DELTA.fullmatch(file.path)
+    ]
+
+
+def find_replaced(warehouse: Warehouse) -> list[StoredFile]:
+    """Return the files that commits removed from their tables, of any age."""
+    return [
+        file
+        for table in warehouse.tables
+        for file in find_unreferenced(table)
+        if file.path in table.snapshot().removals
+    ]
+
+
+_OF_DELTA = re.compile(r"[^/]+/_delta_log/[^/]*#[^/]*")
+"""Temporary names of the Delta library, in a file system."""
+
+
+def path_below(warehouse: Warehouse, file: StoredFile) -> str:
+    """Return the path of a file below the data root."""
+    return str(file).removeprefix(f"{warehouse.root}/")
+
+
+# Brings the tables of a data root to this program and to the signal catalog, step by step.
+#
+# 1. Documents of earlier formats are rewritten, and their folders anchored.
+# 2. Every table gets the columns that came later. No file is touched: there they are null.
+>>>>>>> 8d98bcf1 (Merge the modules of verification, erasure and the sensor screen)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import Signal, SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import ConfigError, QuestionError
-from fleet_slip.grams import check
+from fleet_slip.operations import verify as check
 from fleet_slip.resources import folder
 from tests.support.catalog import SIGNALS, configs_with
 from tests.support.commands import RunCommand

@@ -14,8 +14,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.grams.update import update_grams
-from fleet_slip.operations.find_drives import find_expired, find_unreferenced, vacuum
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, find_expired, find_unreferenced, vacuum
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder

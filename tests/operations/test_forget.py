@@ -18,15 +18,16 @@ from fleet_slip.grams import update
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.update import update_grams
-from fleet_slip.operations.find_drives import (
+from fleet_slip.operations.forget import (
     Located,
+    Retention,
     drives_by_file,
+    forget,
     locate,
     quarantined_of,
-    vacuum,
+    retain,
 )
-from fleet_slip.operations.forget import Retention, forget, retain
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, vacuum
 from fleet_slip.operations.verify import verify
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.storage.local import LocalFolder

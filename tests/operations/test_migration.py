@@ -14,9 +14,9 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.rewriting import migrate
+from fleet_slip.operations.verify import check_grams
 from fleet_slip.resources import folder
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse

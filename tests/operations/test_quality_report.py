@@ -14,8 +14,8 @@ import pytest
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.grams.update import update_grams
-from fleet_slip.operations import quality_report
-from fleet_slip.operations.quality_report import (
+from fleet_slip.operations import sensor_screen
+from fleet_slip.operations.sensor_screen import (
     QualityReport,
     examine,
     examine_drives,
@@ -177,7 +177,7 @@ def test_drives_in_order_raise_no_alarm() -> None:
 def choose_limits(monkeypatch: pytest.MonkeyPatch, **changes: int) -> None:
     limits = thresholds(SHIPPED_CONFIGS).quality.model_copy(update=changes)
     chosen = thresholds(SHIPPED_CONFIGS).model_copy(update={"quality": limits})
-    monkeypatch.setattr(quality_report, "thresholds", lambda _: chosen)
+    monkeypatch.setattr(sensor_screen, "thresholds", lambda _: chosen)
 
 
 def test_vehicle_models_are_examined_one_after_the_other(

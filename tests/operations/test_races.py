@@ -23,9 +23,8 @@ from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
 from fleet_slip.operations import rewriting
-from fleet_slip.operations.find_drives import find_expired
 from fleet_slip.operations.forget import forget, marked_models
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, find_expired
 from fleet_slip.operations.verify import verify
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign

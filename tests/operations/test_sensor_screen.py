@@ -12,8 +12,8 @@ from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotScreenedError, RefusedError
 from fleet_slip.models import training_checks
 from fleet_slip.models.acceptance import load_thresholds
-from fleet_slip.operations import quality_report, sensor_screen
-from fleet_slip.operations.quality_report import QualityReport
+from fleet_slip.operations import sensor_screen
+from fleet_slip.operations.sensor_screen import QualityReport
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.warehouse.predicate import (
     Predicate,
@@ -212,7 +212,7 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
     landed: Path, fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    real = quality_report.examine_drives
+    real = sensor_screen.examine_drives
 
     def counted(warehouse: Warehouse, predicate: Predicate) -> QualityReport:
         asked.append(predicate.text)

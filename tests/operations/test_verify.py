@@ -15,16 +15,13 @@ import pytest
 
 from fleet_slip.api.fleet_maintenance import FleetMaintenance
 from fleet_slip.errors import QuestionError, StorageError
-from fleet_slip.grams import check
-from fleet_slip.grams.check import check_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import CHAMPION, Registry
 from fleet_slip.operations import verify as verification
-from fleet_slip.operations.find_drives import vacuum
 from fleet_slip.operations.forget import forget
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, vacuum
 from fleet_slip.operations.status import status_of
-from fleet_slip.operations.verify import repair, verify
+from fleet_slip.operations.verify import check_grams, repair, verify
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
@@ -327,7 +324,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def test_a_check_beside_a_job_that_takes_files_away_finds_no_damage(
     job: Callable[[Warehouse], Any], moment: str, three: Warehouse, meanwhile: Callable[..., None]
 ) -> None:
-    meanwhile(check, moment, lambda: job(three))
+    meanwhile(verification, moment, lambda: job(three))
     assert check_grams(three, 3).drives >= 2
 
 
@@ -347,7 +344,9 @@ def test_damage_is_damage_beside_other_jobs_too(
     (path_of(three.logs.folder) / gone.path).unlink()
     rng = np.random.default_rng(1)
     meanwhile(
-        check, "wide_grams", lambda: land(three, "more", log_rows("x", random_counts(rng, 9)))
+        verification,
+        "wide_grams",
+        lambda: land(three, "more", log_rows("x", random_counts(rng, 9))),
     )
     with pytest.raises(StorageError, match=gone.path.rpartition("/")[2]):
         check_grams(three, 3)
@@ -361,6 +360,6 @@ def test_a_check_of_tables_that_never_rest_ends(
         three.grams.fence()
         raise StorageError("a file is gone")
 
-    meanwhile(check, "wide_grams", spoil, once=False)
+    meanwhile(verification, "wide_grams", spoil, once=False)
     with pytest.raises(StorageError, match="a file is gone"):
         check_grams(three, 3)

@@ -17,8 +17,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.grams.update import update_grams
-from fleet_slip.operations.find_drives import vacuum
-from fleet_slip.operations.rewriting import compact
+from fleet_slip.operations.rewriting import compact, vacuum
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder

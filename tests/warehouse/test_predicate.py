@@ -14,7 +14,7 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import cohort_of_rows, score
 from fleet_slip.operations.monitor import monitor
-from fleet_slip.operations.quality_report import examine_drives
+from fleet_slip.operations.sensor_screen import examine_drives
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.database import open_database
 from fleet_slip.warehouse.predicate import guarded_query, parse_predicate

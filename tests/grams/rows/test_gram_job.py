@@ -14,9 +14,9 @@ from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
 from fleet_slip.grams import gram_files
-from fleet_slip.grams.check import check_grams, differing_drives, grams_of
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.update import update_grams
+from fleet_slip.operations.verify import check_grams, differing_drives, grams_of
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
