@@ -26,11 +26,7 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.update import commit_ahead, reconcile
 from fleet_slip.ingest.recordings import Fingerprints, SourceRef, TableName, is_from
 from fleet_slip.rendering import Answer, Part, Remark
-<<<<<<< HEAD
-=======
-from fleet_slip.storage.documents import document_folders
 from fleet_slip.storage.folder import SPILL_PREFIX, TEMPORARY_PREFIX, StoredFile
->>>>>>> 8d98bcf1 (Merge the modules of verification, erasure and the sensor screen)
 from fleet_slip.storage.table import (
     ALL_STATISTICS,
     SCALE,
@@ -308,10 +304,6 @@ def _packs(files: Iterable[TableFile], target_rows: int) -> Iterable[list[TableF
         yield pack
 
 
-<<<<<<< HEAD
-# Brings the tables of a data root to the signal catalog: every table gets the columns that came
-# later. No file is touched: there they are null.
-=======
 # Removes files that nothing refers to any more: replaced ones, and leftovers of killed jobs.
 #
 # A file stays while a version of the last `retention_hours` refers to it, for queries; while it is
@@ -411,11 +403,8 @@ def path_below(warehouse: Warehouse, file: StoredFile) -> str:
     return str(file).removeprefix(f"{warehouse.root}/")
 
 
-# Brings the tables of a data root to this program and to the signal catalog, step by step.
-#
-# 1. Documents of earlier formats are rewritten, and their folders anchored.
-# 2. Every table gets the columns that came later. No file is touched: there they are null.
->>>>>>> 8d98bcf1 (Merge the modules of verification, erasure and the sensor screen)
+# Brings the tables of a data root to the signal catalog: every table gets the columns that came
+# later. No file is touched: there they are null.
 
 
 @dataclass(frozen=True)
