@@ -32,9 +32,15 @@ from fleet_slip.grams.update import ensure_grams
 from fleet_slip.ingest.recordings import SourceRef
 from fleet_slip.quality.checks import CHECKS, Fault
 from fleet_slip.quality.course_relation import relate
-from fleet_slip.quality.drive_signals import DriveBatches
-from fleet_slip.quality.label_consistency import find_odd_days, find_repeated, find_reversed_labels
-from fleet_slip.quality.peers import QualityThresholds, settle, thresholds
+from fleet_slip.quality.drive_signals import MeanMoments
+from fleet_slip.quality.peers import (
+    QualityThresholds,
+    find_odd_days,
+    find_repeated,
+    find_reversed_labels,
+    settle,
+    thresholds,
+)
 from fleet_slip.quality.plausibility import inspect_drives
 from fleet_slip.quality.turning import check_moments
 from fleet_slip.regression.gram import GramTable
@@ -314,11 +320,11 @@ def _unlike_peers(
     label: str, table: GramTable, group: BoolArray, in_order: BoolArray, limits: QualityThresholds
 ) -> dict[int, Fault]:
     """Return the faults of the drives of a group that differ from its others."""
-    peers_table = table.take(group)
-    peers, suspects = settle(peers_table, in_order[group], label, limits)
+    moments = MeanMoments.from_table(table.take(group))
+    peers, suspects = settle(moments, in_order[group], label, limits)
     if not suspects.any():
         return {}
-    faults = peers.explain(DriveBatches.from_table(peers_table, suspects))
+    faults = peers.explain(moments.take(suspects))
     return dict(zip(np.flatnonzero(group)[suspects].tolist(), faults, strict=True))
 
 
