@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property, lru_cache
@@ -10,27 +10,32 @@ from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, hash_fold, sha256_of
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
-from fleet_slip.catalog.course import AUXILIARY, YAW_RATE, course_units
+from fleet_slip.catalog.course import YAW_RATE, course_units
 from fleet_slip.catalog.definitions import (
     COUNT_BITS,
     Combination,
     Definition,
-    Made,
-    Product,
-    Slope,
     limit_of,
     parity,
     plain_column,
 )
-from fleet_slip.catalog.features import PLAIN, FeatureFile, FeatureSetEntry, load_features
+from fleet_slip.catalog.features import (
+    PLAIN,
+    Calibrated,
+    EstimateColumn,
+    Feature,
+    FeatureFile,
+    FeatureSet,
+    FeatureSetEntry,
+    TimeColumn,
+    load_features,
+)
 from fleet_slip.catalog.signals import (
-    SAMPLE_TIME_S,
     Identifier,
     Signal,
     SignalCatalog,
     load_signals,
 )
-from fleet_slip.catalog.time_columns import Calibrated, EstimateColumn, Feature, TimeColumn
 from fleet_slip.config import Config, read_named_file
 from fleet_slip.errors import QuestionError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
@@ -103,50 +108,32 @@ class FirstStageModel(Config):
         return fit.model_copy(update={"line": self.digest})
 
 
-@dataclass
-class EstimateSubstitution:
-    """Replaces the estimate in definitions by the model's fit without a fold."""
+def substitute_estimate(
+    part: Any, estimate: str, fit: Combination, copies: dict[int, Any] | None = None
+) -> Any:
+    """Return a definition with a fit in place of the estimate of that name, wherever it occurs.
 
-    model: FirstStageModel
-    fold: str | None
-    _copies: dict[int, Made] = field(default_factory=dict)
-    """By the identity of the original: columns that share a part share its copy."""
-
-    def __call__(self, definition: Definition) -> Definition:
-        """Return a definition with the fit in place of the estimate."""
-        changes: dict[str, object] = {}
-        if definition.gate:
-            gate = definition.gate
-            changes["gate"] = gate.model_copy(update={"by": self(gate.by)})
-        if definition.made is not None:
-            key = id(definition.made)
-            if key not in self._copies:
-                self._copies[key] = (
-                    self.model.in_fold(self.fold)
-                    if definition.of == self.model.estimate
-                    else self._copy(definition.made)
-                )
-            changes["made"] = self._copies[key]
-        return definition.model_copy(update=changes) if changes else definition
-
-    def _copy(self, composite: Made) -> Made:
-        if isinstance(composite, Product):
-            return composite.model_copy(update={"of": tuple(map(self, composite.of))})
-        if isinstance(composite, Combination):
-            terms = tuple((factor, self(column)) for factor, column in composite.terms)
-            return composite.model_copy(update={"terms": terms})
-        if not isinstance(composite, Slope):  # a filter reads no estimate
-            return composite
-        equations = [
-            equation.model_copy(
-                update={
-                    "y": self(equation.y),
-                    "x": tuple(x if isinstance(x, int) else self(x) for x in equation.x),
-                }
-            )
-            for equation in composite.equations
-        ]
-        return composite.model_copy(update={"equations": tuple(equations)})
+    `copies` has the copy of each part by its identity: columns that share a part share its copy.
+    """
+    copies = {} if copies is None else copies
+    if isinstance(part, tuple):
+        return tuple(substitute_estimate(item, estimate, fit, copies) for item in part)
+    if not isinstance(part, Config):
+        return part
+    if id(part) not in copies:
+        values = {name: getattr(part, name) for name in type(part).model_fields}
+        is_estimate = isinstance(part, Definition) and part.made and part.of == estimate
+        new = (
+            {"made": fit}
+            if is_estimate
+            else {
+                name: substitute_estimate(value, estimate, fit, copies)
+                for name, value in values.items()
+            }
+        )
+        changes = {name: value for name, value in new.items() if value != values[name]}
+        copies[id(part)] = part.model_copy(update=changes) if changes else part
+    return copies[id(part)]
 
 
 def integer_combination(
@@ -165,65 +152,6 @@ def integer_combination(
     scaled = [round(value * 2**bits) for value in (intercept, *coefficients)]
     terms = tuple((c, column) for c, column in zip(scaled[1:], columns, strict=True) if c)
     return Combination(intercept=scaled[0], terms=terms, divisor=2**bits)
-
-
-@dataclass(frozen=True)
-class FeatureSet:
-    """The columns of one kind of Gram row, and the division of a drive's rows.
-
-    Attributes
-    ----------
-    label
-        Name of the label signal, the last column.
-    signals, features, windows, calibrated
-        Names of the columns, families replaced by their members.
-    of
-        Set whose columns these are the changes of; None for a set of its own columns.
-    block_ticks
-        Length of a block of time, in ticks; None if rows are not divided by time.
-    change_s
-        Times over which columns change, in s; empty if columns stand for themselves.
-    as_logged
-        True if the delay of the course is not corrected.
-    """
-
-    label: str
-    description: str = ""
-    signals: tuple[str, ...] = ()
-    features: tuple[str, ...] = ()
-    windows: tuple[str, ...] = ()
-    calibrated: tuple[str, ...] = ()
-    of: str | None = None
-    block_ticks: int | None = None
-    change_s: tuple[Decimal, ...] = ()
-    as_logged: bool = False
-
-    @property
-    def change_ticks(self) -> tuple[int, ...]:
-        """Numbers of ticks over which columns change; empty if columns stand for themselves."""
-        return tuple(int(Fraction(time_s) / SAMPLE_TIME_S) for time_s in self.change_s)
-
-    @property
-    def change_text(self) -> str:
-        """The times over which columns change, for messages."""
-        *earlier, last = (f"{time_s:f}" for time_s in self.change_s)
-        return f"{', '.join(earlier)} and {last} s" if earlier else f"{last} s"
-
-    @property
-    def in_time(self) -> bool:
-        """True if the delays of receivers are corrected in the Gram rows."""
-        return bool(self.change_ticks) and not self.as_logged
-
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """Names of the inputs of a model of this set."""
-        return (*self.signals, *self.features, *self.windows, *self.calibrated)
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """The columns of a Gram row, in order; calibrated ones are derived from them."""
-        beside = AUXILIARY if self.change_ticks else ()
-        return (*self.signals, *self.features, *self.windows, *beside, self.label)
 
 
 class FirstStageModels(Protocol):
@@ -329,8 +257,11 @@ class Catalog:
         definitions = {window: self.time_columns[window].definition for window in windows}
         if model is None:
             return definitions
-        substitute = EstimateSubstitution(model, fold)
-        return {window: substitute(definition) for window, definition in definitions.items()}
+        fit, copies = model.in_fold(fold), dict[int, Any]()
+        return {
+            window: substitute_estimate(definition, model.estimate, fit, copies)
+            for window, definition in definitions.items()
+        }
 
     def first_stage_model(self, name: str) -> FirstStageModel | None:
         """Return the first-stage model of a set `SET_DIGEST`; None for other sets.
@@ -374,7 +305,11 @@ class Catalog:
         Raises `QuestionError` for an unknown one.
         """
         if name == PLAIN:
-            return FeatureSet(self.signals.label, "The logged signals", self.signals.inputs)
+            return FeatureSet.model_construct(
+                label=self.signals.label,
+                description="The logged signals",
+                signals=self.signals.inputs,
+            )
         base = name.rpartition("_")[0] if self.first_stage_model(name) else name
         if base not in self.sets:
             names = ", ".join((PLAIN, *self.sets))
@@ -385,18 +320,8 @@ class Catalog:
     def resolve(self, entry: FeatureSetEntry) -> FeatureSet:
         """Return a feature set as the file states it with its families replaced by members."""
         members = [member for window in entry.windows for member in self.members(window)]
-        feature_set = FeatureSet(
-            self.signals.label,
-            entry.description,
-            entry.signals,
-            entry.features,
-            tuple(dict.fromkeys(members)),
-            entry.calibrated,
-            entry.of,
-            entry.block_ticks,
-            entry.change_s,
-            entry.as_logged,
-        )
+        content = {**dict(entry), "windows": tuple(dict.fromkeys(members))}
+        feature_set = FeatureSet.model_construct(label=self.signals.label, **content)
         if entry.of is None:
             return feature_set
         return self._add_changing_columns(feature_set, self.feature_set(entry.of))
@@ -413,13 +338,8 @@ class Catalog:
             names = dict.fromkeys((*getattr(source, kind), *getattr(feature_set, kind)))
             return tuple(name for name in names if self._changes(name))
 
-        return replace(
-            feature_set,
-            signals=columns("signals"),
-            features=columns("features"),
-            windows=columns("windows"),
-            calibrated=columns("calibrated"),
-        )
+        kinds = ("signals", "features", "windows", "calibrated")
+        return feature_set.model_copy(update={kind: columns(kind) for kind in kinds})
 
     def _changes(self, name: str) -> bool:
         if name not in self.time_columns:
@@ -452,7 +372,7 @@ class Catalog:
         longest = max(feature_set.change_ticks) // 2
         if feature_set.of:
             source = self.feature_set(feature_set.of)
-            feature_set = replace(feature_set, features=source.features)
+            feature_set = feature_set.model_copy(update={"features": source.features})
         return tuple(
             column
             for column in feature_set.inputs

@@ -29,7 +29,8 @@ from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 
 if TYPE_CHECKING:
-    from fleet_slip.catalog.catalog import Catalog, FeatureSet
+    from fleet_slip.catalog.catalog import Catalog
+    from fleet_slip.catalog.features import FeatureSet
     from fleet_slip.catalog.signals import SignalCatalog
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.draft import Draft

@@ -283,9 +283,9 @@ class ColumnProgram:
                 elif largest_in(step, number, ranges) >= _EXACT:
                     wide.add(number)
         recursion = Recursion.of_steps(steps)
-        others = [number for number in range(len(steps)) if number not in recursion.members]
-        before = tuple(number for number in others if number not in recursion.dependent)
-        after = tuple(number for number in others if number in recursion.dependent)
+        outside = [number for number in range(len(steps)) if number not in recursion.members]
+        before = tuple(number for number in outside if number not in recursion.dependent)
+        after = tuple(number for number in outside if number in recursion.dependent)
         last_reader = {
             i: number for number in (*before, *after) for i in operands_of(steps[number])
         }

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.catalog.catalog import FeatureSet
 from fleet_slip.catalog.course import (
     COURSE,
     COURSE_LATE,
@@ -21,6 +20,7 @@ from fleet_slip.catalog.course import (
     course_units,
     split_late,
 )
+from fleet_slip.catalog.features import FeatureSet
 from fleet_slip.catalog.signals import HALF_TURN, SignalCatalog
 from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts
 from fleet_slip.errors import DataError, StorageError

@@ -41,9 +41,8 @@ from fleet_slip.catalog.course import (
     course_units,
 )
 from fleet_slip.catalog.definitions import limit_of
-from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.features import PLAIN, Feature
 from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S, Signal
-from fleet_slip.catalog.time_columns import Feature
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.drive_sums import DriveBlocks

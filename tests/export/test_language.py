@@ -29,7 +29,7 @@ from fleet_slip.catalog.definitions import (
     Product,
     Slope,
 )
-from fleet_slip.catalog.time_columns import Feature
+from fleet_slip.catalog.features import Feature
 from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.export.compile import (
     Sample,
