@@ -25,8 +25,7 @@ from benchmarks.harness import add_options, durations, simulated
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import gram_statement
-from fleet_slip.grams.gram_files import write_rows
-from fleet_slip.grams.update import update_grams
+from fleet_slip.grams.update import update_grams, write_rows
 from fleet_slip.models.request import load_model_list
 from fleet_slip.models.select import select
 from fleet_slip.storage.local import LocalFolder

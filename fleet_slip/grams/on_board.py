@@ -46,7 +46,7 @@ from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S,
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.drive_sums import DriveBlocks
-from fleet_slip.grams.gram_files import (
+from fleet_slip.grams.update import (
     files_to_rewrite,
     gram_digests,
     in_schema,

@@ -19,9 +19,14 @@ from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config, load_config
 from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.grams.cohort import Cohort, load_cohort
-from fleet_slip.grams.folding import FOLD_KEYS, FoldKey, assign_folds
-from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.grams.cohort import (
+    FOLD_KEYS,
+    Cohort,
+    FoldKey,
+    assign_folds,
+    hash_names,
+    load_cohort,
+)
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
 from fleet_slip.models.search import search_procedure

@@ -22,7 +22,7 @@ from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import Identifier
 from fleet_slip.config import Config, load_config, refuse_renamed
 from fleet_slip.errors import QuestionError, UsageError
-from fleet_slip.grams.folding import PARTS, Folding, FoldKey, make_folding
+from fleet_slip.grams.cohort import PARTS, Folding, FoldKey, make_folding
 from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
 from fleet_slip.regression.inference import ClusterUnit
 from fleet_slip.regression.orders import METHODS

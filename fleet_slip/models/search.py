@@ -6,8 +6,7 @@ from typing import Any
 
 from fleet_slip.base import Record
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.cohort import Cohort, drive_folds
-from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.cohort import Cohort, Folding, drive_folds
 from fleet_slip.models.request import Search, SelectionRequest
 from fleet_slip.regression.choice import (
     CROSS_VALIDATION,

@@ -20,15 +20,17 @@ from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, DataError, NotComputedError, QuestionError
 from fleet_slip.grams.cohort import (
+    FOLD_KEYS,
     FULL,
+    PARTS,
     Cohort,
     CompleteCases,
     DownweightedDrive,
+    Folding,
     age_weights,
     load_cohort,
     robust_weights,
 )
-from fleet_slip.grams.folding import FOLD_KEYS, PARTS, Folding
 from fleet_slip.models.request import (
     DEFAULT_MODELS,
     GIVEN,

@@ -10,9 +10,7 @@ import pyarrow as pa
 from fleet_slip.catalog.catalog import FirstStageModel, integer_combination
 from fleet_slip.catalog.definitions import Combination, Definition
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import assign_folds
-from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.grams.cohort import assign_folds, hash_names, load_cohort
 from fleet_slip.grams.update import ensure_grams
 from fleet_slip.models.request import (
     DEFAULT_MODELS,

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.grams.cohort import remark_left_out
-from fleet_slip.grams.folding import BANDS, PARTS
+from fleet_slip.grams.cohort import BANDS, PARTS, remark_left_out
 from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.rendering import Part, Remark, TextTable

@@ -17,7 +17,7 @@ from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import YAW_RATE
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import RefusedError
-from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.grams.cohort import hash_names
 from fleet_slip.models.acceptance import load_thresholds, missing_evidence
 from fleet_slip.models.manifest import Manifest, TrainedDrives
 from fleet_slip.quality.checks import Fault

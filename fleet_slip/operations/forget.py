@@ -31,9 +31,9 @@ from fleet_slip.errors import (
     RefusedError,
     StorageError,
 )
-from fleet_slip.grams.gram_files import gram_digests, hash_names, read_rows
+from fleet_slip.grams.cohort import hash_names
 from fleet_slip.grams.on_board import onboard_feature_sets
-from fleet_slip.grams.update import reconcile
+from fleet_slip.grams.update import gram_digests, read_rows, reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.rewriting import (
     RETENTION_HOURS,

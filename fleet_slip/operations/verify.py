@@ -32,9 +32,8 @@ from fleet_slip.errors import (
 )
 from fleet_slip.grams.compute import by_sql, has_statement
 from fleet_slip.grams.drive_sums import wide_grams
-from fleet_slip.grams.gram_files import recorded_delays
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
-from fleet_slip.grams.update import reconcile, transaction_name
+from fleet_slip.grams.update import reconcile, recorded_delays, transaction_name
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.rewriting import find_temporary_files, find_unreferenced, path_below
 from fleet_slip.regression.gram import Gram

@@ -9,9 +9,8 @@ from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
 
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams import folding
-from fleet_slip.grams.cohort import drive_folds
-from fleet_slip.grams.folding import EACH, FoldCount, Folding, assign_folds
+from fleet_slip.grams import cohort as folding
+from fleet_slip.grams.cohort import EACH, FoldCount, Folding, assign_folds, drive_folds
 from fleet_slip.models.request import CandidateModel, Search, SelectionRequest, parse_tolerance
 from fleet_slip.models.search import (
     ALL_SUBSETS,

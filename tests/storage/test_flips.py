@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from fleet_slip.errors import FleetSlipError, StorageError
-from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.grams.cohort import Folding, load_cohort
 from fleet_slip.grams.compute import aggregate
-from fleet_slip.grams.folding import Folding
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score

@@ -14,8 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.grams.cohort import Cohort
-from fleet_slip.grams.gram_files import hash_names
+from fleet_slip.grams.cohort import Cohort, hash_names
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.warehouse.predicate import parse_predicate

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import QuestionError
-from fleet_slip.grams.cohort import load_cohort, sum_days
-from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.cohort import Folding, load_cohort, sum_days
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import cohort_of_rows, score

@@ -15,13 +15,14 @@ from fleet_slip.grams.cohort import (
     MAX_LOST_SHARE,
     Cohort,
     DriveWeights,
+    Folding,
+    FoldKey,
     drive_folds,
+    hash_names,
     load_cohort,
     robust_weights,
     weighted,
 )
-from fleet_slip.grams.folding import Folding, FoldKey
-from fleet_slip.grams.gram_files import hash_names
 from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.inference import DriveMoments

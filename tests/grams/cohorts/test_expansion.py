@@ -12,8 +12,7 @@ from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.calibrated_columns import expand
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import Folding
+from fleet_slip.grams.cohort import Folding, load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.predict import predict
 from fleet_slip.models.score import score

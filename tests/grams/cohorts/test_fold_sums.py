@@ -9,8 +9,7 @@ import pytest
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError, FleetSlipError
-from fleet_slip.grams.cohort import Cohort, load_cohort, sum_days
-from fleet_slip.grams.folding import FoldCount, Folding, FoldKey
+from fleet_slip.grams.cohort import Cohort, FoldCount, Folding, FoldKey, load_cohort, sum_days
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.select import run_selection, select

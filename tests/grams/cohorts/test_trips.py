@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.signals import LONGEST_PAUSE_S
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import EACH
+from fleet_slip.grams.cohort import EACH, load_cohort
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.resources import read_sql
 from tests.support.measured import SIGNALS, a_mapping, csv_text

@@ -13,7 +13,7 @@ import fleet_slip
 from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
-from fleet_slip.grams import gram_files
+from fleet_slip.grams import update
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.verify import check_grams, differing_drives, grams_of
@@ -114,8 +114,8 @@ def test_gram_rows_of_a_file_that_is_gone_are_dropped(warehouse: Warehouse) -> N
 def test_merging_and_rewriting_take_few_rows_at_a_time(
     warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(gram_files, "FILE_ROWS", 5)
-    monkeypatch.setattr(gram_files, "SMALL_FILES_MAX", 4)
+    monkeypatch.setattr(update, "FILE_ROWS", 5)
+    monkeypatch.setattr(update, "SMALL_FILES_MAX", 4)
     rng = np.random.default_rng(6)
     for number in range(9):
         drives = [log_rows(f"d{number}-{i}", random_counts(rng, 3)) for i in range(3)]

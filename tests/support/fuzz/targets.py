@@ -24,8 +24,7 @@ from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import load_config
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.grams.folding import FoldKey
+from fleet_slip.grams.cohort import FoldKey, load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import Mapping, load_mapping
 from fleet_slip.models.manifest import require_model_name
