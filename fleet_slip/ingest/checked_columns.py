@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import polars as pl
 
-from fleet_slip.arrays import BoolArray
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
 from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
@@ -339,12 +338,8 @@ MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""
 
 
-class CheckedBlock(NamedTuple):
-    """Some rows of a file: the good ones, the bad ones, and how many were read until its end."""
-
-    rows: pl.DataFrame
-    refused: pl.DataFrame
-    read: int
+CheckedRows: TypeAlias = tuple[pl.DataFrame, pl.DataFrame]
+"""The good rows of a batch, and the refused ones."""
 
 
 class RowChecker:
@@ -366,7 +361,7 @@ class RowChecker:
         self.rows = self.left_out = 0
         self.keys = DriveKeys()
 
-    def blocks(self) -> Iterator[CheckedBlock]:
+    def blocks(self) -> Iterator[CheckedRows]:
         """Yield the rows of each batch. Raises `InputError`."""
         for batch in read_batches(self._file, self._mapping):
             yield self._check(batch)
@@ -378,7 +373,7 @@ class RowChecker:
                 f"mapping {self._mapping.name!r}: {describe(self._mapping.where)}."
             )
 
-    def _check(self, batch: pl.DataFrame) -> CheckedBlock:
+    def _check(self, batch: pl.DataFrame) -> CheckedRows:
         raw = _without_nan(batch.rename({name: RAW + name for name in batch.columns}))
         try:
             fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
@@ -401,7 +396,7 @@ class RowChecker:
             )
         if self._mapping.time.rate_hz is not None:
             rows = rows.with_columns((pl.col("row") / self._mapping.time.rate_hz).alias("time"))
-        return CheckedBlock(rows, refused, self.rows)
+        return rows, refused
 
 
 def _without_nan(batch: pl.DataFrame) -> pl.DataFrame:
@@ -472,14 +467,15 @@ LARGE_FILE_BYTES = 2**22
 
 
 def is_grouped(file: Path, mapping: Mapping) -> bool:
-    """Return True if the rows of each drive of a large file are together. Reads these columns only.
+    """Return True if the rows of each drive are together. Reads these columns only.
 
-    Then a drive ends with its last row, and need not wait in a temporary file for the end of the
-    log. False for several time bases, and for a file whose faults `RowChecker` reports.
+    False for small files, several time bases, and a file whose faults `RowChecker` reports.
     """
     columns = _key_columns(mapping)
+    if not columns:
+        return True
     several_bases = mapping.time.own_clock or len(mapping.time_bases()) > 1
-    if not columns or several_bases or size_of(file) < LARGE_FILE_BYTES:
+    if several_bases or size_of(file) < LARGE_FILE_BYTES:
         return False
     keys, latest = DriveKeys(), -1
     with suppress(InputError):
@@ -538,12 +534,9 @@ def _split(
     return valued.filter(~is_refused).select(columns), pl.concat(pieces)
 
 
-def describe_refused(rows: pl.DataFrame, mask: BoolArray | None, reason: str) -> pl.DataFrame:
-    """Return rows as bad ones, because of their time: those of a mask, or all."""
-    if mask is not None and not mask.any():
-        return no_rows()
-    bad = rows if mask is None else rows.filter(pl.Series(mask))
-    return _refused(bad, reason, "time", pl.col("time"))
+def describe_refused(rows: pl.DataFrame, reason: str) -> pl.DataFrame:
+    """Return rows as bad ones, because of their time."""
+    return _refused(rows, reason, "time", pl.col("time"))
 
 
 def _refused(rows: pl.DataFrame, reason: str, signal: str | None, value: pl.Expr) -> pl.DataFrame:

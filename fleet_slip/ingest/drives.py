@@ -1,267 +1,23 @@
-"""Cuts checked rows into drives: uninterrupted segments, collected until they end."""
+"""Cuts checked rows into drives: uninterrupted segments, each in memory until it ends."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
-from typing import NamedTuple
+from itertools import pairwise
 
 import numpy as np
 import polars as pl
 
-from fleet_slip.arrays import BoolArray, FloatArray, IntArray
-from fleet_slip.ingest.checked_columns import describe_refused, no_rows
-from fleet_slip.ingest.columns import TimeBase
+from fleet_slip.arrays import BoolArray
+from fleet_slip.ingest.checked_columns import describe_refused
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 
 MAX_DRIVE_S = 2**19 * STEP_S
-"""A longer stretch is cut after this time, some 87 minutes, so that a drive fits into memory."""
-
-
-_GROUP = np.dtype(
-    [
-        ("last", "f8"),  # time of the last row
-        ("time", "f8"),  # of the last one that is not isolated
-        ("latest", "f8"),  # the latest time of the stretch
-        ("start", "f8"),  # its first time
-        ("segment", "i8"),  # number of the open segment
-        ("piece", "i8"),  # index of the segment in its stretch
-    ]
-)
-_UNSEEN = np.array((np.nan, np.nan, np.nan, np.nan, -1, -1), dtype=_GROUP)
-
-
-class CutRows(NamedTuple):
-    """The rows of a block with their `segment`, the misplaced rows, and the segments that ended.
-
-    The order of ended segments does not depend on blocks.
-    """
-
-    rows: pl.DataFrame
-    refused: pl.DataFrame
-    ended: list[int]
-
-
-class DriveCutter:
-    """Assigns every row to a segment, which becomes a drive, and rejects rows out of order.
-
-    A group, such as a car, has stretches, and these have segments. A step in time larger than
-    `split_gap_s`, forward or back, begins a stretch, and `longest_s` ends a segment. A row that far
-    from both neighbours is `isolated`, so that one wrong time stamp does not cut a drive.
-    `time_duplicate` and `time_backwards` are rows not later than all earlier rows of their stretch.
-    The result does not depend on the blocks: a row that needs the next one waits for it.
-    """
-
-    def __init__(
-        self, base: TimeBase, longest_s: float = MAX_DRIVE_S, *, is_grouped: bool = False
-    ) -> None:
-        """Set the gap that ends a drive, and the maximum duration of a segment.
-
-        If the file `is_grouped`, the rows of each group are together: the next group ends it.
-        """
-        self._gap_s = base.split_gap_s + TIME_EPSILON_S
-        self._longest_s, self._is_grouped = longest_s, is_grouped
-        self._waiting: pl.DataFrame | None = None
-        self._segments = 0
-        self._state = np.empty(0, dtype=_GROUP)
-        """The state of each group."""
-
-    def cut(self, rows: pl.DataFrame, *, last: bool) -> CutRows:
-        """Return the rows of a block, those of a segment together; `last` ends all segments."""
-        if not last and self._waiting is None and self._continues(rows):
-            number = int(self._state["segment"][rows["group"][0]])
-            segment = pl.lit(number, pl.Int64).alias("segment")
-            return CutRows(rows.with_columns(segment), no_rows(), [])
-        several = "base" in rows.columns
-        if self._waiting is not None:
-            rows = pl.concat([self._waiting, rows])
-        if rows.is_empty():
-            nothing = rows.with_columns(pl.lit(0, pl.Int64).alias("segment"))
-            return CutRows(nothing, no_rows(), self._end_before(self._state.size) if last else [])
-        if several:
-            rows = rows.sort("group", "time", maintain_order=True)
-        elif not rows["group"].is_sorted():
-            rows = rows.sort("group", maintain_order=True)
-        group = rows["group"]
-        new_groups = int(group[-1]) + 1 - self._state.size
-        if new_groups > 0:
-            self._state = np.concatenate([self._state, np.full(new_groups, _UNSEEN, dtype=_GROUP)])
-        alone, waiting, decided_at = self._isolated(rows, last=last)
-        self._waiting = rows.filter(pl.Series(waiting)) if waiting.any() else None
-        refused = [describe_refused(rows, alone, "isolated")]
-        unsettled = alone | waiting
-        if unsettled.any():
-            rows, decided_at = rows.filter(pl.Series(~unsettled)), decided_at[~unsettled]
-        rows, before, ended = self._number_segments(rows, decided_at)
-        if not several:
-            time = rows["time"].to_numpy()
-            twice, backwards = time == before, time < before
-            refused += [
-                describe_refused(rows, twice, "time_duplicate"),
-                describe_refused(rows, backwards, "time_backwards"),
-            ]
-            if (disordered := twice | backwards).any():
-                rows = rows.filter(pl.Series(~disordered))
-        if last:
-            ended += self._end_before(self._state.size)
-        elif self._is_grouped:
-            ended = sorted(ended + self._end_before(int(group[-1])))
-        misplaced = pl.concat(refused) if any(bad.height for bad in refused) else no_rows()
-        return CutRows(rows, misplaced, ended)
-
-    def _continues(self, rows: pl.DataFrame) -> bool:
-        """Return True if all rows continue the open segment of one group, in the order of time.
-
-        Most blocks do; then the state is updated.
-        """
-        if not rows.height or "base" in rows.columns:
-            return False
-        group, time = rows["group"], rows["time"].to_numpy()
-        if group[0] >= self._state.size or group.min() != group.max():
-            return False
-        state = self._state[group[0]]
-        step_s = np.diff(time, prepend=state["latest"])
-        is_steady = step_s.min() > 0 and step_s.max() <= self._gap_s  # False for NaN
-        piece = (time[-1] - state["start"]) // self._longest_s
-        is_ordered = state["last"] == state["time"] == state["latest"]
-        if not is_steady or not is_ordered or piece != state["piece"]:
-            return False
-        for name in ("last", "time", "latest"):
-            self._state[name][group[0]] = time[-1]
-        return True
-
-    def _isolated(
-        self, rows: pl.DataFrame, *, last: bool
-    ) -> tuple[BoolArray, BoolArray, FloatArray]:
-        """Return which rows are isolated, which wait for the next, and which row decides that."""
-        group, time = rows["group"].to_numpy(), rows["time"].to_numpy()
-        first, end = _ends(group)
-        before = self._previous("last", time, group, first)
-        is_far = ~(np.abs(time - before) <= self._gap_s)
-        far_next = np.append(is_far[1:], True)
-        far_next[end] = True
-        alone = is_far & far_next
-        waiting = np.zeros(alone.size, dtype=np.bool_)
-        if not last:
-            may_wait = end[-1:] if self._is_grouped else end
-            waiting[may_wait] = alone[may_wait]
-            alone[may_wait] = False
-        self._state["last"][group[end]] = np.where(waiting[end], before[end], time[end])
-        # Rows of several time bases can be ordered by their times only.
-        number = time if "base" in rows.columns else rows["row"].to_numpy().astype(np.float64)
-        decided_at = np.append(number[1:], np.inf)
-        decided_at[end] = np.inf
-        return alone, waiting, np.where(is_far, decided_at, number)
-
-    def _number_segments(
-        self, rows: pl.DataFrame, decided_at: FloatArray
-    ) -> tuple[pl.DataFrame, FloatArray, list[int]]:
-        """Return the rows with segments, the latest earlier time of their stretch, ended segments.
-
-        Ended segments are in the order in which their end is detected. Example for one group,
-        with `split_gap_s` = 1 and `longest_s` = 2: times 0, 1, 2, 3, 9 are in the segments
-        0, 0, 1, 1, 2, since the first one ends after 2 s, and 9 follows a gap.
-        """
-        group, time, state = rows["group"].to_numpy(), rows["time"].to_numpy(), self._state
-        first, end = _ends(group)
-        is_first = np.zeros(time.size, dtype=np.bool_)
-        is_first[first] = True
-
-        # 1. A stretch begins after a gap; its start, and the latest time in it up to each row.
-        step_s = time - self._previous("time", time, group, first)
-        begins = ~(np.abs(step_s) <= self._gap_s)
-        before = self._previous("latest", time, group, first)
-        before[begins] = np.nan
-        latest = time
-        if not (begins | (time > before)).all():
-            latest, before = _latest(time, before, begins | is_first)
-        heads = np.flatnonzero(begins | is_first)
-        start_s = np.where(begins[heads], time[heads], state["start"][group[heads]])
-        start_s = np.repeat(start_s, np.diff(heads, append=time.size))
-
-        # 2. A long stretch has several segments, which are numbered in the order of rows.
-        piece = ((latest - start_s) // self._longest_s).astype(np.int64)
-        begins |= piece != self._previous("piece", piece, group, first)
-        heads = np.flatnonzero(begins | is_first)
-        is_new, is_first_head = begins[heads], is_first[heads]
-        open_segment = state["segment"][group[heads]]
-        segment = np.where(is_new, self._segments + np.cumsum(is_new) - 1, open_segment)
-        self._segments += int(is_new.sum())
-
-        # 3. A new segment of a group ends the one before.
-        before_head = np.where(is_first_head, open_segment, np.roll(segment, 1))
-        ends = is_new & (before_head >= 0)
-        order = np.lexsort((group[heads[ends]], decided_at[heads[ends]]))
-        ended: list[int] = before_head[ends][order].tolist()
-
-        segment = np.repeat(segment, np.diff(heads, append=time.size))
-        now = {"time": time, "latest": latest, "start": start_s, "segment": segment, "piece": piece}
-        for name, values in now.items():
-            state[name][group[end]] = values[end]
-        return rows.with_columns(pl.Series("segment", segment)), before, ended
-
-    def _previous(
-        self, name: str, values: FloatArray | IntArray, group: IntArray, first: IntArray
-    ) -> FloatArray:
-        """Return the value at the row before in each group; for its first row, of the state."""
-        before = np.roll(values, 1).astype(np.float64)
-        before[first] = self._state[name][group[first]]
-        return before
-
-    def _end_before(self, group: int) -> list[int]:
-        """End the open segments of all groups before a group; return them by group."""
-        open_segment = self._state["segment"][:group]
-        is_open = open_segment >= 0
-        ended: list[int] = open_segment[is_open].tolist()
-        open_segment[is_open] = -1
-        return ended
-
-
-def sample_intervals_s(rows: pl.DataFrame) -> dict[int, float]:
-    """Return the median time between two rows of each time base; the only one is number 0."""
-    several = "base" in rows.columns
-    bases = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
-    intervals_s = {}
-    for (number,), base in bases.items():
-        step_s, segment = np.diff(base["time"].to_numpy()), base["segment"].to_numpy()
-        median = pl.Series(step_s[segment[1:] == segment[:-1]]).median()
-        intervals_s[number] = median if isinstance(median, float) and median else STEP_S
-    return intervals_s
-
-
-def _ends(group: IntArray) -> tuple[IntArray, IntArray]:
-    """Return where each group's rows begin, and the last of them."""
-    if not group.size:
-        nothing = np.empty(0, dtype=np.int64)
-        return nothing, nothing
-    changes = np.flatnonzero(np.diff(group)) + 1
-    return np.append(0, changes), np.append(changes - 1, group.size - 1)
-
-
-def _latest(
-    time: FloatArray, before: FloatArray, heads: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the latest time up to each row of its stretch, and before it (NaN for the first)."""
-    seeded = np.where(heads & ~np.isnan(before), np.maximum(time, before), time)
-    frame = pl.DataFrame({"time": seeded, "stretch": np.cumsum(heads)})
-    latest = frame.select(pl.col("time").cum_max().over("stretch"))["time"].to_numpy()
-    return latest, np.where(heads, before, np.roll(latest, 1))
-
-
-# The rows of open drives, few of them in memory.
-
-MAX_OPEN_VALUES = 2**23
-"""Maximum values of open drives in memory, 64 MiB; the others are in a temporary file.
-
-A drive of 87 minutes at 100 Hz with 14 signals fits: drives whose rows are together are not
-spilled. Of hundreds of open drives it is a quarter, as each takes memory of its own.
-"""
-MANY_SEGMENTS = 64
-"""Segments that end at once, for which blocks are joined: each is one piece then."""
-MAX_SINGLE_PIECES, BUNDLED_GROUPS = 512, 128
-"""Maximum number of segments that are spilled one by one; beyond it groups are bundled."""
+"""A longer drive is cut after this time, some 87 minutes, so that it fits into memory."""
+MAX_DRIVE_ROWS = 2**19
+"""Rows of a time base in one drive: logs faster than 100 Hz have shorter drives."""
 
 
 @dataclass(frozen=True)
@@ -271,6 +27,7 @@ class DriveRows:
     Each of several bases has the signals with values in it.
     """
 
+    group: int
     bases: dict[int, pl.DataFrame]
 
     @cached_property
@@ -287,6 +44,12 @@ class DriveRows:
     def end_s(self) -> float:
         """The last time."""
         return max(float(rows["time"][-1]) for rows in self.bases.values())
+
+    @cached_property
+    def intervals_s(self) -> dict[int, float]:
+        """The median time between two rows of each base; that of a tick for a single row."""
+        steps_s = {base: rows["time"].diff().median() for base, rows in self.bases.items()}
+        return {b: step if isinstance(step, float) else STEP_S for b, step in steps_s.items()}
 
     @cached_property
     def frame(self) -> pl.DataFrame:
@@ -307,113 +70,177 @@ class DriveRows:
         return samples if samples["time"].is_sorted() else samples.sort("time", maintain_order=True)
 
 
-class OpenDrives:
-    """The rows of open segments, few of them in memory.
+class DriveCutter:
+    """Cuts the rows of one group after another, such as cars, and rejects rows out of order.
 
-    If hundreds of segments are open at once, their rows are spilled in bundles of groups, and no
-    segment is yielded before the end of the file.
+    A step in time larger than `split_gap_s`, forward or back, begins a drive. A row that far from
+    both neighbours is `isolated`, so that one wrong time stamp does not cut a drive.
+    `time_duplicate` and `time_backwards` are rows not later than all rows since the last such step.
+    The result does not depend on the blocks: a row that needs the next one waits for it.
     """
 
-    def __init__(self) -> None:
-        """Begin without rows."""
-        self._blocks: list[pl.DataFrame] = []
-        self._values = 0
-        self._spool = Spool()
-        self._bundled = False
-        self._ended: list[int] = []
-        self._group_of: dict[int, int] = {}
-        """The group of each segment with spilled rows."""
+    def __init__(self, split_gap_s: float, reject: Callable[[pl.DataFrame], None]) -> None:
+        """Set the gap that ends a drive, and a function that takes rejected rows."""
+        self._gap_s, self._reject = split_gap_s + TIME_EPSILON_S, reject
+        self._begin_group(-1)
 
-    def add(self, rows: pl.DataFrame) -> None:
-        """Keep rows with their segment, those of a segment together."""
-        if rows.height:
-            self._blocks.append(rows)
-            self._values += rows.height * rows.width
+    def _begin_group(self, group: int) -> None:
+        self._group = group
+        self._waiting: pl.DataFrame | None = None
+        self._pieces: dict[int, list[pl.DataFrame]] = defaultdict(list)
+        """Rows of the open drive by time base."""
+        self._rows_by_base: dict[int, int] = defaultdict(int)
+        self._start_s = self._last_s = self._latest_s = np.nan
+        self._last_placed_s = np.nan
+        """Time of the last row that is not isolated; `_last_s` is that of any row."""
 
-    def take(self, segments: Sequence[int], *, last: bool) -> Iterator[DriveRows]:
-        """Yield the rows of segments and release them; `last` for the end of the file."""
-        if not self._bundled:
-            yield from self._take(segments)
+    def cut(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+        """Yield the drives that end in a block, in which the rows of each group are together."""
+        if rows.is_empty():
             return
-        self._ended += segments
-        if last:
-            yield from self._unbundled()
+        is_one_group = rows["group"][0] == rows["group"][-1]
+        groups = [rows] if is_one_group else rows.partition_by("group", maintain_order=True)
+        for of_group in groups:
+            if of_group["group"][0] != self._group:
+                yield from self.end_group()
+                self._begin_group(of_group["group"][0])
+            yield from self._continue_group(of_group)
 
-    def _take(self, segments: Sequence[int]) -> Iterator[DriveRows]:
-        runs = self._release(segments) if self._blocks else {}
-        for segment in segments:
-            self._group_of.pop(segment, None)
-            spilled = map(pl.read_ipc_stream, self._spool.take(segment))
-            in_memory = (rows.slice(head, height) for rows, head, height in runs.pop(segment, ()))
-            if pieces := [*spilled, *in_memory]:
-                yield DriveRows(_by_base(pieces))
+    def end_group(self) -> Iterator[DriveRows]:
+        """Yield the open drive, after the last row of a group."""
+        if self._waiting is not None:
+            self._reject(describe_refused(self._waiting, "isolated"))
+        yield from self._end_drive()
 
-    def _release(self, segments: Sequence[int]) -> dict[int, list[tuple[pl.DataFrame, int, int]]]:
-        """Take segments out of memory; return the place of each one's rows in blocks."""
-        if len(segments) > MANY_SEGMENTS:
-            self._blocks = [pl.concat(self._blocks).sort("segment", maintain_order=True)]
-        runs = defaultdict[int, list[tuple[pl.DataFrame, int, int]]](list)
-        blocks, self._blocks, self._values = self._blocks, [], 0
-        for rows in blocks:
-            number = rows["segment"].to_numpy()
-            first, end = _ends(number)
-            height, is_taken = end + 1 - first, np.isin(number[first], segments)
-            for head, n in zip(first[is_taken], height[is_taken], strict=True):
-                runs[int(number[head])].append((rows, int(head), int(n)))
-            if not is_taken.any():
-                self.add(rows)
-            elif not is_taken.all():
-                self.add(rows.filter(pl.Series(np.repeat(~is_taken, height))))
-        return runs
-
-    def _unbundled(self) -> Iterator[DriveRows]:
-        """Yield the rows of all segments, bundle by bundle, and in each as the segments ended."""
-        self._spill_rows(bundled=True)
-        bundles = defaultdict[int, list[int]](list)
-        for segment in self._ended:
-            bundles[self._group_of.get(segment, 0) // BUNDLED_GROUPS].append(segment)
-        for bundle, segments in sorted(bundles.items()):
-            for piece in self._spool.take(("bundle", bundle)):
-                self.add(pl.read_ipc_stream(piece))
-                if self._values > MAX_OPEN_VALUES // 4:
-                    self._spill_rows(bundled=False)
-            if self._blocks:  # a piece has a segment in several places
-                self._blocks = [pl.concat(self._blocks).sort("segment", maintain_order=True)]
-            yield from self._take(segments)
-
-    def spill(self) -> None:
-        """Spill the rows if they are many. Raises `InputError` if the disk is full."""
-        if self._values <= MAX_OPEN_VALUES // 4:
+    def _continue_group(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+        if self._waiting is not None:
+            rows, self._waiting = pl.concat([self._waiting, rows]), None
+        time_s = rows["time"].to_numpy()
+        is_far = self._is_far(time_s, self._last_s)
+        is_isolated = is_far & np.append(is_far[1:], True)
+        if is_isolated[-1]:  # the next row decides
+            rows, self._waiting = rows.head(-1), rows.tail(1)
+            is_isolated, time_s = is_isolated[:-1], time_s[:-1]
+        if rows.is_empty():
             return
-        segments = pl.concat([rows["segment"] for rows in self._blocks])
-        if np.ptp(segments.to_numpy()) >= MAX_SINGLE_PIECES:
-            self._bundled |= segments.n_unique() > MAX_SINGLE_PIECES
-        if self._bundled or self._values > MAX_OPEN_VALUES:
-            self._spill_rows(bundled=self._bundled)
-
-    def _spill_rows(self, *, bundled: bool) -> None:
-        """Spill all rows, by bundles or by segments."""
-        if not self._blocks:
+        self._last_s = time_s[-1]
+        rows = self._without(rows, is_isolated, "isolated")
+        time_s = rows["time"].to_numpy()
+        if not time_s.size:
             return
-        rows = pl.concat(self._blocks)
-        self._blocks, self._values = [], 0
-        heads = rows.select("segment", "group").unique("segment")
-        self._group_of.update(zip(heads["segment"], heads["group"], strict=True))
-        key = (pl.col("group") // BUNDLED_GROUPS if bundled else pl.col("segment")).alias("key")
-        pieces = rows.with_columns(key).partition_by("key", as_dict=True, include_key=False)
-        for (number,), piece in pieces.items():
-            content = BytesIO()
-            piece.write_ipc_stream(content, compression="lz4")
-            self._spool.add(("bundle", number) if bundled else number, content.getvalue())
+        is_far = self._is_far(time_s, self._last_placed_s)
+        self._last_placed_s = time_s[-1]
+        starts = np.flatnonzero(is_far)
+        for start, end in pairwise(np.unique([0, *starts, time_s.size])):
+            if is_far[start]:
+                yield from self._end_drive()
+                self._latest_s = np.nan
+            yield from self._continue_drive(rows.slice(start, end - start))
+
+    def _is_far(self, time_s: np.ndarray, before_s: float) -> BoolArray:
+        """Return which rows are far from the one before; the first row of all is."""
+        is_far: BoolArray = ~(np.abs(np.diff(time_s, prepend=before_s)) <= self._gap_s)
+        return is_far
+
+    def _without(self, rows: pl.DataFrame, is_refused: BoolArray, reason: str) -> pl.DataFrame:
+        """Reject the rows of a mask; return the others."""
+        if not is_refused.any():
+            return rows
+        mask = pl.Series(is_refused)
+        self._reject(describe_refused(rows.filter(mask), reason))
+        return rows.filter(~mask)
+
+    def _continue_drive(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+        """Add rows that follow without a gap. Yields drives that would last too long."""
+        if "base" not in rows.columns:  # the times of several bases are checked base by base
+            time_s = rows["time"].to_numpy()
+            latest_s = np.fmax.accumulate(np.append(self._latest_s, time_s))
+            self._latest_s = latest_s[-1]
+            is_backwards, is_twice = time_s < latest_s[:-1], time_s == latest_s[:-1]
+            rows = self._without(rows, is_backwards, "time_backwards")
+            rows = self._without(rows, is_twice[~is_backwards], "time_duplicate")
+        while rows.height:
+            number = self._fitting_rows(rows)
+            if number:
+                self._add(rows.head(number))
+            rows = rows.slice(number)
+            if rows.height:
+                yield from self._end_drive()
+
+    def _fitting_rows(self, rows: pl.DataFrame) -> int:
+        """Return how many of some rows are part of the open drive; of a new one the first is."""
+        begins = not self._pieces
+        if begins:
+            self._start_s = rows["time"][0]
+        fitting = max(int(rows["time"].search_sorted(self._start_s + MAX_DRIVE_S)), begins)
+        if "base" not in rows.columns:
+            return min(fitting, MAX_DRIVE_ROWS - self._rows_by_base[0])
+        number = rows.select(pl.int_range(pl.len()).over("base")).to_series()
+        before = rows["base"].replace_strict(self._rows_by_base, default=0, return_dtype=pl.Int64)
+        beyond = (number + before >= MAX_DRIVE_ROWS).arg_true()
+        return int(beyond[0]) if len(beyond) and beyond[0] < fitting else fitting
+
+    def _add(self, rows: pl.DataFrame) -> None:
+        """Add rows to the open drive, those of each base without its empty columns."""
+        several = "base" in rows.columns
+        pieces = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
+        for (base,), piece in pieces.items():
+            filled = [column for column in piece if column.null_count() < piece.height]
+            self._pieces[base].append(pl.DataFrame(filled))
+            self._rows_by_base[base] += piece.height
+
+    def _end_drive(self) -> Iterator[DriveRows]:
+        if self._pieces:
+            pieces = sorted(self._pieces.items())
+            bases = {base: pl.concat(frames, how="diagonal") for base, frames in pieces}
+            yield DriveRows(self._group, bases)
+        self._pieces, self._rows_by_base = defaultdict(list), defaultdict(int)
 
 
-def _by_base(pieces: list[pl.DataFrame]) -> dict[int, pl.DataFrame]:
-    """Return the rows of each time base, with the columns that have values in it."""
-    if "base" not in pieces[0].columns:
-        return {0: pl.concat(pieces)}
-    bases = defaultdict[int, list[pl.DataFrame]](list)
-    for piece in pieces:
-        for rows in piece.drop("segment").partition_by("base", maintain_order=True):
-            filled = rows.select(column for column in rows if column.null_count() < rows.height)
-            bases[rows["base"][0]].append(filled)
-    return {base: pl.concat(bases[base], how="diagonal") for base in sorted(bases)}
+# The rows of drives that alternate, such as those of several cars, are sorted first.
+
+MAX_VALUES_IN_MEMORY = 2**22
+"""Values in memory, 32 MiB; those of other rows are in a temporary file."""
+BLOCK_BYTES = 2**23
+"""Bytes of a group that are read at once."""
+
+
+def sort_by_group(blocks: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+    """Yield all rows by group, those of a group in their order. Raises `InputError`."""
+    in_memory: list[pl.DataFrame] = []
+    spool, groups, values = Spool(), set[int](), 0
+    for block in blocks:
+        in_memory.append(block)
+        values += block.height * block.width
+        if values > MAX_VALUES_IN_MEMORY:
+            groups |= _spill(pl.concat(in_memory), spool)
+            in_memory, values = [block.clear()], 0
+    rows = pl.concat(in_memory)
+    if not groups:
+        yield rows.sort("group", maintain_order=True)
+        return
+    for group in sorted(groups | _spill(rows, spool)):
+        content = bytearray()
+        for piece in spool.take(group):
+            content += piece
+            if len(content) > BLOCK_BYTES:
+                yield _rows_of(content, rows.schema)
+                content = bytearray()
+        if content:
+            yield _rows_of(content, rows.schema)
+
+
+def _spill(rows: pl.DataFrame, spool: Spool) -> set[int]:
+    """Write the rows of each group, all columns as floats, and NaN for null; return the groups."""
+    rows = rows.sort("group", maintain_order=True)
+    values = rows.cast(pl.Float64).to_numpy(order="c")
+    heads = np.flatnonzero(np.diff(values[:, rows.columns.index("group")], prepend=-1))
+    groups = rows["group"].gather(heads).to_list()
+    for group, (start, end) in zip(groups, pairwise([*heads, len(values)]), strict=True):
+        spool.add(group, values[start:end].tobytes())
+    return set(groups)
+
+
+def _rows_of(content: bytearray, schema: pl.Schema) -> pl.DataFrame:
+    values = np.frombuffer(content).reshape(-1, len(schema))
+    return pl.DataFrame(values, schema.names()).fill_nan(None).cast(dict(schema))

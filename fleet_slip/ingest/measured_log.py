@@ -10,11 +10,10 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import date
 from io import BytesIO
-from itertools import accumulate, chain
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
 
@@ -22,20 +21,8 @@ from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.checked_columns import (
-    CheckedBlock,
-    RowChecker,
-    describe_refused,
-    is_grouped,
-    no_rows,
-)
-from fleet_slip.ingest.drives import (
-    MAX_DRIVE_S,
-    DriveCutter,
-    DriveRows,
-    OpenDrives,
-    sample_intervals_s,
-)
+from fleet_slip.ingest.checked_columns import RowChecker, describe_refused, is_grouped
+from fleet_slip.ingest.drives import DriveCutter, DriveRows, sort_by_group
 from fleet_slip.ingest.file_groups import FileGroup, open_log
 from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
@@ -76,11 +63,6 @@ class IngestCounts:
     drives: int = 0
     drives_resampled: int = 0
     ticks: int = 0
-
-
-RATE_ROWS, MAX_RATE_ROWS = 2**17, 2**21
-"""The fewest and the most first rows of a file whose median step is the usual time between rows."""
-MIN_STEPS = 1000
 
 
 REFUSED_ROWS = 2**18
@@ -152,9 +134,7 @@ class MeasuredLog:
         self.longest: MeasuredDrive | None = None
         self._rejected = RejectedRows()
         self._samples, self._values = Counter[str](), Counter[str]()
-        self._open = OpenDrives()
         self._drives_of_group: Counter[int] = Counter()
-        self._intervals_s: dict[int, float] = {}
         self._changed = date.fromtimestamp(file.stat().st_mtime)
         self._implausible_days: list[tuple[date, str]] = []
         self._trips: dict[int, tuple[str, float]] = {}
@@ -170,61 +150,30 @@ class MeasuredLog:
         Their order depends on the file and the mapping only.
         """
         grouped = is_grouped(self.file, self.mapping)
-        with closing(read_ahead(self.checker.blocks())) as blocks:
-            early, intervals_s = self._usual_intervals(blocks)
-            self._intervals_s = intervals_s
-            longest_s = MAX_DRIVE_S * min([1.0, *(s / STEP_S for s in intervals_s.values())])
-            cutter = DriveCutter(self.mapping.time, longest_s, is_grouped=grouped)
-            for block in chain(early, blocks):
-                yield from self._ended(cutter, block, intervals_s)
-            no_more = CheckedBlock(block.rows.clear(), no_rows(), block.read)
-            yield from self._ended(cutter, no_more, intervals_s, last=True)
+        cutter = DriveCutter(self.mapping.time.split_gap_s, self._rejected.add)
+        with closing(read_ahead(self._checked_rows())) as blocks:
+            for block in blocks if grouped else sort_by_group(blocks):
+                yield from self._drives(cutter.cut(block))
+            yield from self._drives(cutter.end_group())
         self.counts.quarantined = self._rejected.by_reason()
         self._require_usable()
 
-    def _usual_intervals(
-        self, blocks: Iterator[CheckedBlock]
-    ) -> tuple[list[CheckedBlock], dict[int, float]]:
-        """Return the first blocks, and the usual time between samples of each time base in them.
-
-        It is computed from a number of first rows that does not depend on the size of blocks. For a
-        base without rows among them it is that of its first drive.
-        """
-        early: list[CheckedBlock] = []
-        enough = RATE_ROWS
-        for block in blocks:
-            early.append(block)
-            while _reach(early) >= enough:
-                first = _trial(self.mapping, early, enough)
-                has_steps = first["segment"].is_duplicated().sum() > MIN_STEPS
-                if has_steps or enough >= MAX_RATE_ROWS:
-                    return early, sample_intervals_s(first)
-                enough += RATE_ROWS
-        return early, sample_intervals_s(_trial(self.mapping, early, _reach(early)))
-
-    def _ended(
-        self,
-        cutter: DriveCutter,
-        block: CheckedBlock,
-        intervals_s: dict[int, float],
-        *,
-        last: bool = False,
-    ) -> Iterator[MeasuredDrive]:
-        """Yield the drives that ended in a block, and keep its rejected rows."""
+    def _checked_rows(self) -> Iterator[pl.DataFrame]:
+        """Yield the good rows of each batch; keep the others."""
+        for rows, refused in self.checker.blocks():
+            self._rejected.add(refused)
+            yield rows
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
-        rows, misplaced, segments = cutter.cut(block.rows, last=last)
-        self._open.add(rows)
-        self._rejected.add(block.refused)
-        self._rejected.add(misplaced)
-        for ended in self._open.take(segments, last=last):
-            if ended.end_s - ended.start_s < STEP_S - TIME_EPSILON_S:
-                self._rejected.add(describe_refused(ended.frame, None, "too_short"))
-            else:
-                yield self._drive(ended, intervals_s)
-        self._open.spill()
 
-    def _drive(self, rows: DriveRows, intervals_s: dict[int, float]) -> MeasuredDrive:
-        group = int(next(iter(rows.bases.values()))["group"][0])
+    def _drives(self, segments: Iterable[DriveRows]) -> Iterator[MeasuredDrive]:
+        for rows in segments:
+            if rows.end_s - rows.start_s < STEP_S - TIME_EPSILON_S:
+                self._rejected.add(describe_refused(rows.frame, "too_short"))
+            else:
+                yield self._drive(rows)
+
+    def _drive(self, rows: DriveRows) -> MeasuredDrive:
+        group = rows.group
         self._drives_of_group[group] += 1
         name = drive_id(self.prefix, group, self._drives_of_group[group])
         trip_id, ended_s = self._trips.get(group, (name, rows.start_s))
@@ -234,26 +183,18 @@ class MeasuredLog:
         metadata = dict(self.checker.keys.metadata[group])
         metadata["drive_name"] = metadata.pop("drive", self._stem)
         metadata |= {"source_file": self.name, "trip_id": trip_id}
-        for base in rows.bases.keys() - intervals_s.keys():
-            steps_s = np.diff(rows.bases[base]["time"].head(RATE_ROWS).to_numpy())
-            intervals_s[base] = float(np.median(steps_s)) if steps_s.size else STEP_S
         try:
-            drive = to_ticks(rows, self.mapping, intervals_s, name, metadata)
+            drive = to_ticks(rows, self.mapping, name, metadata)
         except InputError as error:
             raise InputError(f"{quote_name(self.file)}: {error}") from None
         self.counts.rows_kept += rows.height
         self.counts.drives += 1
         self.counts.drives_resampled += drive.method != "snap"
         self.counts.ticks += drive.ticks.size
-        for signal, values in drive.counts.items():
-            columns = (
-                base_rows[signal]
-                for base_rows in rows.bases.values()
-                if signal in base_rows.columns
-            )
-            self._samples[signal] += sum(column.count() for column in columns)
-            present = len(values) - values.null_count
-            self._values[signal] += drive.grid_values.get(signal, present)
+        for base_rows in rows.bases.values():
+            for signal in drive.values.keys() & set(base_rows.columns):
+                self._samples[signal] += base_rows[signal].count()
+        self._values.update(drive.values)
         if self.longest is None or drive.ticks.size > self.longest.ticks.size:
             self.longest = drive
         if drive.metadata["started_at"] is not None:
@@ -337,7 +278,7 @@ class MeasuredLog:
         faults = [*find_refusals(of_signals, counts.rows_read, counts.quarantined)]
         if twice := sum(map(_overlaps, self._under_way.values())):
             faults.append(CHECKS["one car twice at a time"].fault("time", count=twice))
-        rate_khz = 1e-3 / min(self._intervals_s.values(), default=1.0)
+        rate_khz = 1e-3 / self.longest.interval_s if self.longest else 0.0
         rate = CHECKS["rate of the samples"]
         if rate_khz > rate.high:
             faults.append(rate.fault("time", rate_khz=rate_khz))
@@ -383,47 +324,7 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
 def _file_digest(file: Path) -> "hashlib._Hash":
     """Return the SHA-256 of a file's bytes. Raises `InputError`."""
     with file_errors(file), file.open("rb") as stream:
-        _require_dense(file, stream.fileno())
         return hashlib.file_digest(stream, "sha256")
-
-
-FREE_SPARSE_BYTES, SPARSE_RATIO = 2**30, 64
-"""A file of more bytes is refused if it states so many times its space on disk."""
-
-
-def _require_dense(file: Path, descriptor: int) -> None:
-    """Raise `InputError` for a large file that is almost all holes, which take long to read.
-
-    A compressed file system gives a file less space too, but such a file has no hole.
-    """
-    status = os.fstat(descriptor)
-    on_disk = 512 * status.st_blocks
-    if status.st_size <= max(FREE_SPARSE_BYTES, SPARSE_RATIO * on_disk):
-        return
-    first_hole = os.lseek(descriptor, 0, os.SEEK_HOLE)
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    if first_hole < status.st_size:
-        raise InputError(
-            f"{quote_name(file)}: its size is {status.st_size:,} bytes, but only {on_disk:,} were "
-            "ever "
-            "written. Copy it again."
-        )
-
-
-def _reach(blocks: list[CheckedBlock]) -> int:
-    """Return of how many rows the usual time can be taken; of several bases, of good ones."""
-    if "base" in blocks[-1].rows.columns:
-        return sum(block.rows.height for block in blocks)
-    return blocks[-1].read
-
-
-def _trial(mapping: Mapping, blocks: list[CheckedBlock], until: int) -> pl.DataFrame:
-    """Return the first rows, cut into segments, for `_usual_intervals`."""
-    several = "base" in blocks[0].rows.columns
-    names = ["row", "group", "time", *(["base"] if several else [])]
-    rows = pl.concat([block.rows.select(names) for block in blocks])
-    rows = rows.head(until) if several else rows.filter(pl.col("row") <= until)
-    return DriveCutter(mapping.time).cut(rows, last=several).rows
 
 
 # Faults of a log as a whole: many rejected rows, and several cars, where one is under way

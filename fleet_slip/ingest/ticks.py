@@ -57,8 +57,10 @@ class MeasuredDrive:
     method: Method
     ticks: NDArray[np.int32]
     counts: dict[str, pa.Array]
-    grid_values: dict[str, int] = field(default_factory=dict)
-    """Values of each signal on the ticks, before labels at low speed were dropped."""
+    values: dict[str, int] = field(default_factory=dict)
+    """Values of each mapped signal on the ticks, before labels at low speed were dropped."""
+    interval_s: float = STEP_S
+    """Least of the usual times between the samples of a time base."""
 
     @cached_property
     def counts_digest(self) -> str:
@@ -73,20 +75,15 @@ def drive_id(prefix: str, group: int, segment: int = 1) -> str:
 
 
 def to_ticks(
-    rows: DriveRows,
-    mapping: Mapping,
-    intervals_s: dict[int, float],
-    name: str,
-    metadata_of_drive: dict[str, Any],
+    rows: DriveRows, mapping: Mapping, name: str, metadata_of_drive: dict[str, Any]
 ) -> MeasuredDrive:
     """Convert a drive's signals, SI units at times in s, to counts at 100 Hz.
 
-    Ticks at which no signal has a value are left out. `intervals_s` are the usual times between
-    the samples of each time base; `metadata_of_drive` has values by column of `logs`. Raises
-    `InputError` for missing metadata.
+    Ticks at which no signal has a value are left out. `metadata_of_drive` has values by column of
+    `logs`. Raises `InputError` for missing metadata.
     """
     start_s = rows.start_s
-    resampler = _resampler_of(rows, intervals_s, fill_gaps=COURSE in mapping.signals)
+    resampler = _resampler_of(rows, fill_gaps=COURSE in mapping.signals)
     method, ticks = resampler.method, resampler.ticks.astype(np.int32)
     counts, somewhere = {}, np.zeros(ticks.size, dtype=np.bool_)
     for signal, source in mapping.signals.items():
@@ -96,13 +93,13 @@ def to_ticks(
             values = [chunk.to_numpy() for chunk in rows.column(signal).get_chunks()]
         else:
             samples = rows.samples(signal)
-            on_own_times = _on_own_times(rows, signal, samples, resampler, intervals_s)
+            on_own_times = _on_own_times(rows, signal, samples, resampler)
             values = [_resample(samples[signal].to_numpy(), on_own_times, signal, mapping)]
         # Rounding clips a resampled value's last bit, no more: the rest is in quarantine.
         counts[signal] = round_chunks(values, mapping.signal_catalog[signal])
     if COURSE in mapping.signals:
-        counts |= _fixes(rows, resampler, intervals_s, mapping, counts)
-    grid_values = {signal: len(array) - array.null_count for signal, array in counts.items()}
+        counts |= _fixes(rows, resampler, mapping, counts)
+    values_on_ticks = {signal: len(a) - a.null_count for signal, a in counts.items()}
     counts |= place_label(mapping, counts)
     counts |= {
         wheel: round_chunks(
@@ -122,13 +119,13 @@ def to_ticks(
     metadata = _metadata(name, metadata_of_drive, start_s, mapping)
     if len(ticks):
         metadata |= {"rows": len(ticks), "duration_s": (int(ticks[-1]) - int(ticks[0])) * STEP_S}
-    return MeasuredDrive(name, metadata, method, ticks, counts, grid_values)
+    interval_s = min(rows.intervals_s.values())
+    return MeasuredDrive(name, metadata, method, ticks, counts, values_on_ticks, interval_s)
 
 
 def _fixes(
     rows: DriveRows,
     resampler: Resampler,
-    intervals_s: dict[int, float],
     mapping: Mapping,
     counts: dict[str, pa.Array],
 ) -> dict[str, pa.Array]:
@@ -138,7 +135,7 @@ def _fixes(
     fixes = fixes_on_ticks(
         mapping.signals[COURSE],
         (samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()),
-        _on_own_times(rows, COURSE, samples, resampler, intervals_s),
+        _on_own_times(rows, COURSE, samples, resampler),
         physical(mapping.signal_catalog, counts, "yaw_rate"),
         physical(mapping.signal_catalog, counts, "ay") if "ay" in counts else None,
     )
@@ -160,14 +157,14 @@ def _resample(
     return _on_the_circle(resample, values) if is_label else resample(values)
 
 
-def _resampler_of(rows: DriveRows, intervals_s: dict[int, float], *, fill_gaps: bool) -> Resampler:
+def _resampler_of(rows: DriveRows, *, fill_gaps: bool) -> Resampler:
     """Return the resampler that has the ticks of a drive; it resamples signals of one time base.
 
     With `fill_gaps` ticks in short gaps are interpolated: some loggers lose one sample in a
     hundred, which would leave no whole second over which to integrate the yaw rate.
     """
-    if len(intervals_s) == 1:
-        (interval_s,) = intervals_s.values()
+    if len(rows.bases) == 1:
+        (interval_s,) = rows.intervals_s.values()
         time_s = rows.column("time").to_numpy() - rows.start_s
         resampler = build_resampler(time_s, choose_method(time_s, interval_s))
         if fill_gaps and resampler.method == "snap" and (np.diff(resampler.ticks) > 1).any():
@@ -181,11 +178,10 @@ def _on_own_times(
     signal: str,
     samples: pl.DataFrame,
     ticks: Resampler,
-    intervals_s: dict[int, float],
 ) -> Resampler:
     """Return the resampler from a signal's own times to the ticks of its drive."""
     of_base = (
-        intervals_s[base]
+        rows.intervals_s[base]
         for base, rows_of_base in rows.bases.items()
         if signal in rows_of_base.columns
     )

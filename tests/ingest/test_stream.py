@@ -4,6 +4,7 @@ import threading
 from datetime import date
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import polars as pl
@@ -16,7 +17,7 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import checked_columns, drives, logs, measured_log
-from fleet_slip.ingest.drives import DriveCutter
+from fleet_slip.ingest.drives import DriveCutter, DriveRows
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvSource
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
@@ -49,30 +50,25 @@ times = st.lists(
 def cut(
     rows: list[tuple[int, float]], sizes: list[int], longest_s: float
 ) -> tuple[list[list[int]], list[tuple[int, str]]]:
-    """The rows of each part, in the order in which parts end; and the refused ones."""
-    cutter = DriveCutter(a_mapping().time, longest_s)
+    """The rows of each drive, in the order in which they end; and the refused ones."""
+    refused: list[pl.DataFrame] = []
+    cutter = DriveCutter(a_mapping().time.split_gap_s, refused.append)
     frame = pl.DataFrame(
         {
             "row": range(1, len(rows) + 1),
             "group": pl.Series([group for group, _ in rows], dtype=pl.Int32),
             "time": [time for _, time in rows],
         }
-    )
-    parts: dict[int, list[int]] = {}
-    refused, order, at = [], [], 0
-    for size in [*sizes, len(rows)]:
-        found, bad, ended = cutter.cut(frame.slice(at, size), last=False)
-        at += size
-        for part, row in found.select("segment", "row").iter_rows():
-            parts.setdefault(part, []).append(row)
-        refused += list(bad.select("row", "reason").iter_rows())
-        order += ended
-    found, bad, ended = cutter.cut(frame.clear(), last=True)
-    for part, row in found.select("segment", "row").iter_rows():
-        parts.setdefault(part, []).append(row)
-    refused += list(bad.select("row", "reason").iter_rows())
-    order += ended
-    return [parts[part] for part in order if part in parts], sorted(refused)
+    ).sort("group", maintain_order=True)
+    ended: list[DriveRows] = []
+    at = 0
+    with mock.patch.object(drives, "MAX_DRIVE_S", longest_s):
+        for size in [*sizes, len(rows)]:
+            ended += cutter.cut(frame.slice(at, size))
+            at += size
+        ended += cutter.end_group()
+    bad = [row for rows in refused for row in rows.select("row", "reason").iter_rows()]
+    return [drive.frame["row"].to_list() for drive in ended], sorted(bad)
 
 
 @settings(max_examples=60)
@@ -94,27 +90,14 @@ def test_blocks_change_nothing(
 def test_a_drive_that_lasts_too_long_is_cut(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(measured_log, "MAX_DRIVE_S", 0.5)
+    monkeypatch.setattr(drives, "MAX_DRIVE_S", 0.5)
+    monkeypatch.setattr(drives, "MAX_DRIVE_ROWS", 50)
     log = read_columns(tmp_path, good_columns(60))
     name = f"test-{log.digest[:12]}-1"
     assert log.drives["drive_id"].to_pylist() == [name] * 50 + [f"{name}-2"] * 10
     assert ticks(log) == [*range(50), *range(10)]
     fast = {"t": [i / 1000 for i in range(600)], "ax": [1] * 600, "beta": [1] * 600}
     assert read_columns(tmp_path, fast).counts.drives == 12
-
-
-@pytest.mark.parametrize("rows", [1, 7])
-def test_the_usual_rate_does_not_depend_on_blocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int
-) -> None:
-    t = [*(i / 100 for i in range(30)), *(0.3 + i / 1000 for i in range(300))]
-    columns = {"t": t, "ax": [1] * 330, "beta": [1] * 330}
-    monkeypatch.setattr(measured_log, "RATE_ROWS", 20)
-    monkeypatch.setattr(measured_log, "MIN_STEPS", 10)
-    whole = read_columns(tmp_path, columns)
-    monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 12 * rows)
-    assert read_columns(tmp_path, columns).drives.equals(whole.drives)
-    assert whole.counts.drives_resampled == 1
 
 
 @pytest.mark.parametrize(("limit", "files"), [(1, 3), (40, 2), (10_000, 1)])
@@ -182,18 +165,9 @@ def test_nothing_is_left_of_a_file_that_fails_at_its_end(
     assert not list((tmp_path / "data").rglob("*.parquet"))
 
 
-@pytest.mark.parametrize(
-    ("rows", "parts", "pieces", "groups"),
-    [(4, 64, 512, 128), (4, 1, 512, 128), (9, 2, 512, 128), (2**20, 1, 512, 128),
-     (2**20, 2, 512, 128), (4, 1, 1, 1), (9, 1, 1, 2), (4, 1, 0, 128)],
-)  # fmt: skip
-def test_open_drives_that_wait_in_a_file_are_the_same(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    rows: int,
-    parts: int,
-    pieces: int,
-    groups: int,
+@pytest.mark.parametrize("values", [0, 200, 2**20])
+def test_drives_that_alternate_are_the_same_sorted_in_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, values: int
 ) -> None:
     """Drives that alternate row by row, of which one ends early, and one that stands together."""
     columns: dict[str, list[Any]] = {**good_columns(60)}
@@ -203,10 +177,7 @@ def test_open_drives_that_wait_in_a_file_are_the_same(
     monkeypatch.setattr(csv_batches, "BLOCK_BYTES", 200)
     mapping = a_mapping(drive={"column": "run"}, time={"longest_gap_s": 0.1})
     whole = read_columns(tmp_path, columns, mapping)
-    monkeypatch.setattr(drives, "MAX_OPEN_VALUES", 8 * rows)
-    monkeypatch.setattr(drives, "MANY_SEGMENTS", parts)
-    monkeypatch.setattr(drives, "MAX_SINGLE_PIECES", pieces)
-    monkeypatch.setattr(drives, "BUNDLED_GROUPS", groups)
+    monkeypatch.setattr(drives, "MAX_VALUES_IN_MEMORY", values)
     spilled = read_columns(tmp_path, columns, mapping)
     assert spilled.drives.equals(whole.drives)
     assert spilled.counts == whole.counts

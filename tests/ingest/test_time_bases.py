@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
-from fleet_slip.ingest import batches, drives, measured_log
+from fleet_slip.ingest import batches, drives
 from fleet_slip.ingest.batches import DISORDER, HELD, ROW, merge_bases
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME, Channel, Source
 from fleet_slip.ingest.resampling import average, build_resampler, choose_method, interpolate
@@ -144,13 +144,9 @@ def read_in(
         patched.enter_context(mock.patch.object(batches, "open_log", opened))
         patched.enter_context(mock.patch.object(batches, "BATCH_ROWS", max(batch // 2, 1)))
         patched.enter_context(mock.patch.object(batches, "WINDOW_ROWS", window))
-        patched.enter_context(mock.patch.object(drives, "MANY_SEGMENTS", 1 + batch % 3))
-        patched.enter_context(mock.patch.object(drives, "MAX_OPEN_VALUES", 40 * window))
-        patched.enter_context(mock.patch.object(drives, "MAX_SINGLE_PIECES", batch % 5))
-        patched.enter_context(mock.patch.object(drives, "BUNDLED_GROUPS", 1 + batch % 2))
-        patched.enter_context(mock.patch.object(measured_log, "RATE_ROWS", 60))
-        patched.enter_context(mock.patch.object(measured_log, "MIN_STEPS", 20))
-        patched.enter_context(mock.patch.object(measured_log, "MAX_DRIVE_S", 0.8))
+        patched.enter_context(mock.patch.object(drives, "MAX_VALUES_IN_MEMORY", 40 * window))
+        patched.enter_context(mock.patch.object(drives, "MAX_DRIVE_S", 0.8))
+        patched.enter_context(mock.patch.object(drives, "MAX_DRIVE_ROWS", 70))
         try:
             return read_measured(file, mapping)
         except InputError as error:
