@@ -36,35 +36,6 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 _TRIED = re.compile(r"[\[(]|^constrained-|^([A-Z][a-z]+){2,}$|^(str|int|float|decimal|bool)$")
 """Matches the names of types that pydantic inserts between keys."""
 
-_SAID = {
-    "missing": "is missing",
-    "extra_forbidden": "unknown key",
-    "string_type": "must be text",
-    "bool_type": "must be true or false",
-    "bool_parsing": "must be true or false",
-    "list_type": "must be a list",
-    "tuple_type": "must be a list",
-    "dict_type": "must be a table",
-    "model_type": "must be a table",
-    "model_attributes_type": "must be a table",
-    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "must be a whole number"),
-    **dict.fromkeys(
-        ("float_type", "float_parsing", "decimal_type", "decimal_parsing"), "must be a number"
-    ),
-    **dict.fromkeys(
-        ("date_type", "date_parsing", "date_from_datetime_parsing"),
-        "must be a date such as 2024-05-31",
-    ),
-    "literal_error": "must be {expected}",
-    "greater_than": "must be greater than {gt}",
-    "greater_than_equal": "must be at least {ge}",
-    "less_than": "must be less than {lt}",
-    "less_than_equal": "must be at most {le}",
-    "finite_number": "must be a finite number",
-    "too_long": "has more than {max_length} entries",
-}
-"""Our text of a fault, by pydantic's type of the fault; other types keep pydantic's text."""
-
 
 def _printable(text: str) -> str:
     if not text.isprintable():
@@ -109,9 +80,7 @@ def read_named_file(
                 raise error(f"{file}: not a regular file. Give the path of a file.")
             content = stream.read(most_bytes + 1)
     except FileNotFoundError:
-        is_link = isinstance(file, Path) and file.is_symlink()
-        problem = "a link to a file that does not exist" if is_link else "no such file"
-        raise error(f"{file}: {problem}.") from None
+        raise error(f"{file}: no such file.") from None
     except (OSError, ValueError) as fault:
         reason = getattr(fault, "strerror", None) or "no file can have this name"
         raise error(f"{file}: cannot be read: {reason}.") from None
@@ -178,18 +147,12 @@ def parse_document(
 
 def faults_of(error: ValidationError) -> str:
     """Return the first faults on one line: key and reason."""
-    wrong: dict[str, list[str]] = {}
+    reasons: dict[str, dict[str, None]] = {}
     for fault in error.errors(include_input=False, include_url=False):
-        reasons = wrong.setdefault(_key_of(fault), [])
-        if (text_of_fault := _reason_text(fault)) not in reasons:
-            reasons.append(text_of_fault)
-    faults = [f"{key and f'{key}: '}{', or '.join(reasons)}" for key, reasons in wrong.items()]
-    text = "; ".join(
-        fault if len(fault) <= LONGEST_FAULT else fault[:LONGEST_FAULT] + "…"
-        for fault in faults[:FAULTS_SHOWN]
-    )
-    more = len(faults) - FAULTS_SHOWN
-    return text + (f"; and {more:,} more" if more > 0 else "")
+        reasons.setdefault(_key_of(fault), {})[_reason_text(fault)] = None
+    faults = [f"{key and f'{key}: '}{', or '.join(texts)}" for key, texts in reasons.items()]
+    more = f"; and {len(faults) - FAULTS_SHOWN:,} more" if len(faults) > FAULTS_SHOWN else ""
+    return "; ".join(fault[:LONGEST_FAULT] for fault in faults[:FAULTS_SHOWN]) + more
 
 
 def _key_of(fault: ErrorDetails) -> str:
@@ -205,8 +168,7 @@ def _key_of(fault: ErrorDetails) -> str:
 
 
 def _reason_text(fault: ErrorDetails) -> str:
-    """Return the reason of a fault: our text, or the message of a validator."""
-    words = _SAID.get(fault["type"])
-    if words is None:
-        return fault["msg"].replace("Value error, ", "").replace("Input should be", "must be")
-    return words.format(**fault.get("ctx", {}))
+    """Return the reason of a fault: the text of pydantic or of a validator."""
+    texts = {"missing": "is missing", "extra_forbidden": "unknown key"}
+    text = fault["msg"].replace("Value error, ", "").replace("Input should be", "must be")
+    return texts.get(fault["type"], text)

@@ -39,8 +39,7 @@ def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iter
     As in SQL, a drive without a row of tick 0 is skipped.
     """
     drive_columns = tuple(warehouse.catalog.signals.drive)
-    present = warehouse.logs.read_metadata(file.path).schema.to_arrow_schema().names
-    columns = [name for name in (*drive_columns, "tick", *plan.signals) if name in present]
+    columns = [n for n in (*drive_columns, "tick", *plan.signals) if n in file.null_counts]
     for drive in rows_by_drive(warehouse.logs.read(file.path, columns)):
         ticks = drive["tick"].to_numpy()
         if (ticks[1:] < ticks[:-1]).any():

@@ -301,7 +301,7 @@ def write_batch(
     failures: list[Failure] = []
     written: list[WrittenFile] = []
     with ThreadPoolExecutor(WRITERS) as writers:
-        batch = _BatchWriter(warehouse, mapping, files, writers, replace)
+        batch = _BatchWriter(warehouse, mapping, writers, replace)
         for task in files:
             try:
                 written.append(batch.write(task))
@@ -329,13 +329,12 @@ class _BatchWriter:
         self,
         warehouse: Warehouse,
         mapping: Mapping,
-        files: Batch,
         writers: ThreadPoolExecutor,
         replace: Replace,
     ) -> None:
         self._warehouse, self._mapping = warehouse, mapping
         self._erasure_log = ErasureLog(warehouse.root)
-        self.forgotten, self._number = self._erasure_log.begun(), len(files)
+        self.forgotten = self._erasure_log.begun()
         logs = self._look()
         self.data = {name: DataFiles(t, writers) for name, t in tables_of(warehouse).items()}
         self._duplicates = DuplicateDetector(warehouse, logs, mapping.name, replace)
@@ -343,9 +342,7 @@ class _BatchWriter:
     def _look(self) -> Snapshot:
         """Read the current state of the tables; return a snapshot of the logs."""
         snapshots = {name: table.snapshot() for name, table in tables_of(self._warehouse).items()}
-        self._landed = {
-            name: written.transaction_lookup(self._number) for name, written in snapshots.items()
-        }
+        self._landed = {name: written.has_committed for name, written in snapshots.items()}
         return snapshots["logs"]
 
     def _lacks(self, name: TableName, digest: str) -> bool:
@@ -691,8 +688,7 @@ class BatchCommit:
         if ErasureLog(self._warehouse.root).begun() != self.written.forgotten:
             return True
         transactions = self.written.new[name].transactions
-        landed = snapshot.transaction_lookup(len(transactions))
-        if any(landed(transaction.name) for transaction in transactions):
+        if any(snapshot.has_committed(transaction.name) for transaction in transactions):
             return True
         files = [file for file in self.written.files if file.fingerprints and name == "logs"]
         stored = Fingerprints(snapshot.transactions if files else {})

@@ -221,7 +221,7 @@ class IngestCache:
 
     def without_landed(self, files: Iterable[Path], warehouse: Warehouse) -> list[Path]:
         """Return the files that are not in the logs, judged by size and time of change."""
-        landed = warehouse.logs.snapshot().transaction_lookup(len(self.digests))
+        landed = warehouse.logs.snapshot().has_committed
 
         def is_landed(file: Path) -> bool:
             entry = self.digests.get(_name_of(file))
@@ -342,7 +342,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
         snapshot = table.snapshot()
         if _drives_of(warehouse, {SourceRef.of_file(digest)}):
             return
-        if snapshot.transaction_version(f"{FILES}{digest}") not in {None, WITHDRAWN}:
+        if snapshot.has_committed(f"{FILES}{digest}"):
             transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
             snapshot.commit(Change(transactions=transactions, note={"job": "undo"}))
 

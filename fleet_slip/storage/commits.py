@@ -136,13 +136,12 @@ def _object(text: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def read_commit(log: Folder, version: int) -> Commit:
-    """Return a commit of a Delta log. Raises `ValueError` for what is none."""
+def _actions_in(text: bytes | None) -> list[Action]:
+    """Return the actions of a commit of a Delta log. Raises `ValueError` for what is none."""
+    if not text:
+        raise ValueError("is missing" if text is None else "is empty, or a link")
     try:
-        text = log.read(f"{version:020}.json").decode()
-        actions = [json.loads(line) for line in text.split("\n") if line]
-    except StorageError as error:
-        raise ValueError(f"cannot be read: {error}") from None
+        actions = [json.loads(line) for line in text.decode().split("\n") if line]
     except (ValueError, RecursionError):
         raise ValueError("is not JSON") from None
     for action in actions:
@@ -150,7 +149,7 @@ def read_commit(log: Folder, version: int) -> Commit:
             raise ValueError("has an action that this program never writes")
         if not all(isinstance(content, dict) for content in action.values()):
             raise ValueError("has an action without content")
-    return Commit(version, actions)
+    return actions
 
 
 def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], dict[str, str]]:
@@ -160,14 +159,14 @@ def check_commits(log: Folder, last: int | None = None) -> tuple[list[Commit], d
     """
     versions = {int(name[:20]) for name in log.names() if _COMMIT.fullmatch(name)}
     newest = max(versions, default=-1) if last is None else last
+    names = [f"{version:020}.json" for version in range(min(versions, default=newest), newest + 1)]
     commits: list[Commit] = []
     faults: dict[str, str] = {}
-    for version in range(min(versions, default=newest), newest + 1):
-        name = f"{version:020}.json"
+    for name, content in zip(names, log.read_many(names), strict=True):
         try:
-            commit = read_commit(log, version)
+            commit = Commit(int(name[:20]), _actions_in(content))
         except ValueError as error:
-            faults[name] = str(error) if version in versions else "is missing"
+            faults[name] = str(error)
             continue
         if problem := commit.problem():
             faults[name] = problem
@@ -237,16 +236,14 @@ def _logged(table: Folder, version: int, kind: str, *fields: str) -> Iterator[tu
             actions = rows[kind].combine_chunks().drop_null()
             values = (actions.field(field).to_pylist() for field in fields)
             yield from (row for row in zip(*values, strict=True) if row[0] is not None)
-    for name in names:
-        if _COMMIT.fullmatch(name) and base < int(name[:20]) <= version:
-            try:
-                commit = read_commit(log, int(name[:20]))
-            except ValueError as error:
-                raise StorageError(f"{log}/{name}: {error}") from None
-            for action in commit.actions:
-                content = action.get(kind)
-                if content is None:
-                    continue
-                if not set(fields) <= content.keys():
-                    raise StorageError(f"{log}/{name}: was damaged: a {kind} action is incomplete.")
-                yield tuple(content[field] for field in fields)
+    later = [name for name in names if _COMMIT.fullmatch(name) and base < int(name[:20]) <= version]
+    for name, content in zip(later, log.read_many(later), strict=True):
+        try:
+            actions = _actions_in(content)
+        except ValueError as error:
+            raise StorageError(f"{log}/{name}: {error}") from None
+        for action in actions:
+            if kind in action and not set(fields) <= action[kind].keys():
+                raise StorageError(f"{log}/{name}: was damaged: a {kind} action is incomplete.")
+            if kind in action:
+                yield tuple(action[kind][field] for field in fields)

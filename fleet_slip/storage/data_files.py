@@ -197,30 +197,19 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     array = column.combine_chunks()
     if len(array.dictionary) == 1 and array.null_count < len(array):
         return column
-    used = array.indices.unique().drop_null()
-    if used.to_pylist() == list(range(len(array.dictionary))):
-        return column
     codes = array.indices.dictionary_encode()
     values = array.dictionary.take(codes.dictionary)
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
 
 
 def read_names(file: pa.NativeFile, columns: Sequence[str]) -> dict[str, frozenset[str]]:
-    """Return the used names in a Parquet file, by column with a dictionary."""
+    """Return the names in a Parquet file, by text column."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    metadata = pq.read_metadata(file)
-    stored = [name for name in columns if name in metadata.schema.names]
-    with pq.ParquetFile(file, metadata=metadata, read_dictionary=stored) as parquet:
+    with pq.ParquetFile(file) as parquet:
         schema = parquet.schema_arrow
-        dictionaries = [n for n in schema.names if pa.types.is_dictionary(schema.field(n).type)]
-        groups = [parquet.read_row_group(i, dictionaries) for i in range(parquet.num_row_groups)]
-    return {n: _names([chunk for rows in groups for chunk in rows[n].chunks]) for n in dictionaries}
-
-
-def _names(chunks: Sequence[pa.DictionaryArray]) -> frozenset[str]:
-    names: set[str] = set()
-    for chunk in chunks:
-        names.update(chunk.dictionary.take(chunk.indices.unique().drop_null()).to_pylist())
-    return frozenset(names)
+        stored = [name for name in columns if name in schema.names]
+        rows = parquet.read([n for n in stored if not pa.types.is_primitive(schema.field(n).type)])
+    names = rows.unify_dictionaries()
+    return {n: frozenset(names[n].unique().drop_null().to_pylist()) for n in names.column_names}

@@ -32,7 +32,6 @@ from fleet_slip.storage.folder import Folder, first_line, storage_errors
 # longer to start than a command that only reads documents.
 if TYPE_CHECKING:
     import pyarrow as pa
-    import pyarrow.parquet as pq
     from deltalake import DeltaTable
     from deltalake.transaction import AddAction, RemoveAction
 
@@ -303,9 +302,6 @@ def scales_of(schema: pa.Schema) -> dict[str, Decimal]:
     }
 
 
-MANY_TRANSACTIONS = 8
-"""Number of names from which all transactions are read at once."""
-
 WITHDRAWN = -1
 """Version of a transaction whose rows were removed: it may be committed again."""
 
@@ -378,13 +374,8 @@ class Snapshot:
 
     def refresh(self) -> Snapshot:
         """Return the newest version: this snapshot if nobody committed."""
-        version = self.version
-        if self.delta is not None and not self.table.folder.is_local:
-            with storage_errors(self.table.folder):
-                self.delta.update_incremental()
-            return self if self.version == version else self.table.snapshot()
         newest = self.table.snapshot()
-        return self if newest.version == version else newest
+        return self if newest.version == self.version else newest
 
     @cached_property
     def removals(self) -> Mapping[str, int]:
@@ -399,18 +390,13 @@ class Snapshot:
         newest = _now_ms() - hours * 3.6e6
         return {path for path, removed_ms in self.removals.items() if removed_ms <= newest}
 
-    def transaction_version(self, transaction_name: str) -> int | None:
+    def transaction_version(self, name: str) -> int | None:
         """Return the version of a committed transaction; None without one."""
-        if self.delta is None:
-            return None
-        with storage_errors(self.table.folder):
-            return self.delta.transaction_version(transaction_name)
+        return self.transactions.get(name)
 
-    def transaction_lookup(self, number: int) -> Callable[[str], bool]:
-        """Return a lookup `name -> committed?`. Reads the log once if `number` is large."""
-        if self.version is None or number < MANY_TRANSACTIONS:
-            return lambda name: self.transaction_version(name) not in {None, WITHDRAWN}
-        return lambda name: self.transactions.get(name, WITHDRAWN) != WITHDRAWN
+    def has_committed(self, name: str) -> bool:
+        """Return True if a transaction was committed and not withdrawn."""
+        return self.transactions.get(name, WITHDRAWN) != WITHDRAWN
 
     @cached_property
     def transactions(self) -> Mapping[str, int]:
@@ -450,39 +436,12 @@ class Snapshot:
             table.folder.settle_commits(self.version)
 
 
-class _NewestSnapshot:
-    """The newest snapshot of a table: opening it takes milliseconds, a look for commits does not.
-
-    Threads may use it at once: assignments are atomic. It is pickled empty.
-    """
-
-    def __init__(self) -> None:
-        self._snapshot: tuple[Snapshot, object] | None = None
-
-    def __reduce__(self) -> tuple[type[_NewestSnapshot], tuple[()]]:
-        return _NewestSnapshot, ()
-
-    def find(self) -> Snapshot | None:
-        """Return the snapshot if nobody committed since; otherwise None."""
-        if self._snapshot is None:
-            return None
-        snapshot, stamp = self._snapshot
-        return snapshot if _stamp(snapshot) == stamp else None
-
-    def keep(self, snapshot: Snapshot) -> Snapshot:
-        """Keep a snapshot if the folder can detect later commits; return it."""
-        stamp = _stamp(snapshot)
-        self._snapshot = None if stamp is None else (snapshot, stamp)
-        return snapshot
-
-
 def _stamp(snapshot: Snapshot) -> object:
     """Return a value that identifies the log up to a snapshot; None after a newer commit."""
     log, version = snapshot.table.folder / LOG, snapshot.version
     if version is None or log.stamp(f"{version + 1:020}.json") is not None:
         return None
-    commit = log.stamp(f"{version:020}.json")
-    return None if commit is None else (commit, log.stamp(LATEST))
+    return log.stamp(f"{version:020}.json"), log.stamp(LATEST)
 
 
 FENCE = "fleet_slip.fence"
@@ -503,9 +462,15 @@ class Table:
     description: str = ""
     optional: tuple[str, ...] = ()
     """Columns that a file has only if they have values."""
-    _newest: _NewestSnapshot = field(
-        default_factory=_NewestSnapshot, init=False, repr=False, compare=False
+    _newest: dict[object, Snapshot] = field(
+        default_factory=dict, init=False, repr=False, compare=False
     )
+    """The newest snapshot by its stamp: to open it takes milliseconds, a look for commits not."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle without the newest snapshot."""
+        fields = (self.folder, self.schema, self.encoding, self.partition_by)
+        return Table, (*fields, self.description, self.optional)
 
     @property
     def usual_schema(self) -> pa.Schema:
@@ -522,12 +487,17 @@ class Table:
         """
         if version is not None:
             return Snapshot(self, self.open_delta(version))
-        if not anew and (opened := self._newest.find()):
-            return opened
+        for stamp, opened in list(self._newest.items()):
+            if not anew and _stamp(opened) == stamp:
+                return opened
         delta = self.open_delta()
         if delta is not None:
             self.require_readable(delta)
-        return self._newest.keep(Snapshot(self, delta))
+        snapshot = Snapshot(self, delta)
+        self._newest.clear()
+        if (stamp := _stamp(snapshot)) is not None:
+            self._newest[stamp] = snapshot
+        return snapshot
 
     def open_delta(self, version: int | None = None) -> DeltaTable | None:
         """Return the newest Delta table, or a version; None if unwritten."""
@@ -580,13 +550,6 @@ class Table:
         return combinations.cast(
             pa.schema([(name, pa.string()) for name in combinations.column_names])
         )
-
-    def read_metadata(self, path: str) -> pq.FileMetaData:
-        """Return the footer of one of the table's files."""
-        import pyarrow.parquet as pq
-
-        with storage_errors(f"{self.folder}/{path}"), self.folder.open(path) as file:
-            return pq.read_metadata(file)
 
     def read_names(self, path: str) -> dict[str, frozenset[str]]:
         """Return the names that rows of one of the table's files have, by column."""

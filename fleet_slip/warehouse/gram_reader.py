@@ -85,9 +85,8 @@ def rows_of_set(grams: Snapshot, identity: str, *columns: str) -> Iterator[pa.Ta
         mask = pc.equal(grams.table.read(file.path, ["feature_set"])["feature_set"], identity)
         if not pc.any(mask).as_py():
             continue
-        stored = grams.table.read_metadata(file.path).schema.to_arrow_schema().names
-        rows = grams.table.read(file.path, [name for name in columns if name in stored])
-        for name in sorted(set(columns).difference(stored)):
+        rows = grams.table.read(file.path, [name for name in columns if name in file.null_counts])
+        for name in sorted(set(columns).difference(rows.column_names)):
             rows = rows.append_column(name, pa.nulls(len(rows)))
         yield rows.filter(mask)
 

@@ -183,7 +183,7 @@ def test_a_config_that_cannot_be_read_is_not_replaced_by_the_shipped_one(
 def test_a_named_config_that_leads_nowhere_is_told(tmp_path: Path) -> None:
     (tmp_path / "campaigns").mkdir()
     (tmp_path / "campaigns" / "smoke.toml").symlink_to("nowhere")
-    with pytest.raises(ConfigError, match="a link to a file that does not exist"):
+    with pytest.raises(ConfigError, match="no such file"):
         read_named_file(Configs(tmp_path).find("campaigns", "smoke"))
 
 
@@ -228,7 +228,7 @@ def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(
     (own / "publish.toml").symlink_to("nowhere")
     done = run_command("--config", str(own), "features", "--files")
     assert done.exit_code == ConfigError.exit_code
-    assert "publish.toml: a link to a file that does not exist" in done.stderr
+    assert "publish.toml: no such file" in done.stderr
 
 
 Place = Callable[[Path], Path]

@@ -122,7 +122,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         (STEER, WHEEL.replace(", radius_m = 0.3", ""), "add radius_m, the rolling radius"),
         (STEER, WHEEL.replace("0.3", "0"), "signals.wheel_fl.radius_m"),
         ("negate = true", "gain = 0", "gain cannot be 0"),
-        ("negate = true", "delay_s = 11", "delay_s: must be at most 10"),
+        ("negate = true", "delay_s = 11", "delay_s: must be less than or equal to 10"),
         (STEER, "[label]\nfrom_velocities = true", "needs the signal vx"),
         (STEER, "[label]\nsensor_x_m = 1.0", "needs the signal sideslip"),
         ('unit = "s"', 'unit = "s", zone = "Europe/Berlin"', "without a time zone"),

@@ -18,7 +18,6 @@ import pyarrow.parquet as pq
 import pytest
 import xxhash
 from deltalake import DeltaTable
-from deltalake.exceptions import DeltaError
 
 from fleet_slip.errors import ConflictError, RefusedError, StorageError
 from fleet_slip.storage.data_files import (
@@ -106,7 +105,7 @@ def test_a_unit_lands_once_in_a_table_that_was_not_there_a_moment_ago(warehouse:
     assert warehouse.logs.snapshot().rows == 1000
 
 
-def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Warehouse) -> None:
+def test_transactions_are_those_of_the_delta_library(warehouse: Warehouse) -> None:
     for number in range(4):
         action = warehouse.logs.write_file(f"f{number}", rows(f"d{number}", 10), DAY)
         transactions = [AppTransaction(f"transaction-{number}-{i}", 1) for i in range(3)]
@@ -118,12 +117,11 @@ def test_of_many_units_the_log_says_at_once_what_it_says_of_each(warehouse: Ware
     commits[1].unlink()  # what the checkpoint sums up, Delta removes in time
     earlier, now = warehouse.logs.snapshot(3), warehouse.logs.snapshot()
     for snapshot, number in ((earlier, 9), (now, 12)):
-        landed = snapshot.transaction_lookup(len(names))
-        assert [landed(n) for n in names] == [
-            snapshot.transaction_version(n) is not None for n in names
-        ]
-        assert sum(map(landed, names)) == number
-    assert not any(map(warehouse.quarantine.snapshot().transaction_lookup(99), names))
+        assert snapshot.delta is not None
+        landed = [snapshot.has_committed(name) for name in names]
+        assert landed == [snapshot.delta.transaction_version(n) is not None for n in names]
+        assert sum(landed) == number
+    assert not any(map(warehouse.quarantine.snapshot().has_committed, names))
 
 
 def test_a_root_that_is_a_file_is_told_with_a_next_step(tmp_path: Path) -> None:
@@ -196,20 +194,6 @@ def test_a_damaged_log_is_told(warehouse: Warehouse) -> None:
         entry.write_text("{ damaged")
     with pytest.raises(StorageError, match="the Delta log cannot be used"):
         warehouse.logs.snapshot()
-
-
-def test_what_the_delta_library_cannot_tell_of_a_unit_is_a_storage_error(
-    warehouse: Warehouse, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    land(warehouse, "one", log_rows("d", random_counts(np.random.default_rng(1), 20)))
-    snapshot = warehouse.logs.snapshot()
-
-    def fail(_table: object, _unit: str) -> None:
-        raise DeltaError("Generic error: a commit is damaged")
-
-    monkeypatch.setattr(DeltaTable, "transaction_version", fail)
-    with pytest.raises(StorageError, match="a commit is damaged"):
-        snapshot.transaction_version("test/one")
 
 
 COUNTS = {"ax": np.arange(5), "sideslip": np.arange(5)}
