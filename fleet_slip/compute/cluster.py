@@ -19,8 +19,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from functools import cache, partial
 from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, version
-from importlib.resources.abc import Traversable
+from importlib.metadata import version
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -67,8 +66,6 @@ FIRST_S = 10.0
 
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
-MARKER_AGE_MAX_H = 7 * 24
-"""Older markers were left by killed commands."""
 
 
 @contextlib.contextmanager
@@ -78,7 +75,7 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
     Workers must see `root` too. Raises `ClusterError` without a scheduler in 10 s (or Dask's own
     limit).
     """
-    _hush_logs()
+    _silence_dask()
     try:
         resolve_address(address)
         client = _connect(address)
@@ -97,23 +94,11 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
             client.close(timeout=CLOSE_S)
 
 
-class _Client(Client):
-    """A client that leaves no thread behind if it cannot start."""
-
-    def start(self, **options: Any) -> None:
-        """Connect."""
-        try:
-            Client.start(self, **options)
-        except (AssertionError, OSError):
-            Client.close(self, timeout=CLOSE_S)
-            raise
-
-
 def _connect(address: str) -> Client:
     """Connect; retry if Dask rejects two initial messages that arrive together."""
     usual_s = float(parse_timedelta(dask.config.get("distributed.comm.timeouts.connect")))
     connect: Callable[[], Client] = partial(
-        _Client, address, timeout=min(FIRST_S, usual_s), set_as_default=False, name="fleet-slip"
+        Client, address, timeout=min(FIRST_S, usual_s), set_as_default=False, name="fleet-slip"
     )
     for _ in range(CONNECT_ATTEMPTS - 1):
         with contextlib.suppress(AssertionError):
@@ -142,16 +127,14 @@ class Marker:
 
 @contextlib.contextmanager
 def _marker(root: Folder) -> Iterator[Marker]:
-    """Create a marker, and delete it at the end, with old ones."""
+    """Create a marker, and delete it at the end."""
     marker = Marker(root / MARKER_FOLDER, uuid.uuid4().hex)
     marker.folder.create(marker.name, b"")
     try:
         yield marker
     finally:
         with contextlib.suppress(StorageError):
-            for file in marker.folder.files():
-                if file.path == marker.name or file.age_hours > MARKER_AGE_MAX_H:
-                    marker.folder.remove(file)
+            marker.folder.delete(marker.name)
 
 
 class ClusterExecutor(Executor):
@@ -283,15 +266,8 @@ def _require_same(where: str, expected: Mapping[str, str], actual: Mapping[str, 
 @cache
 def environment() -> dict[str, str]:
     """Return the versions of packages and the checksum of the sources."""
-    versions = {name: _version(name) for name in PACKAGES}
+    versions = {name: version(name) for name in PACKAGES}
     return {"python": platform.python_version(), **versions, SOURCES: _sources_digest()}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "none"
 
 
 def _sources_digest() -> str:
@@ -299,36 +275,22 @@ def _sources_digest() -> str:
 
     Tasks contain the catalog of their warehouse, so workers need no folder of configs.
     """
-    digest = sha256()
-    package: Traversable = Path(__file__).parent.parent
     shipped = (folder("configs"), folder("jobs"), folder("warehouse"))
-    for entry in (package, *shipped):
-        for file in _shipped(entry):
-            digest.update(f"{file.name}\n".encode())
-            digest.update(file.read_bytes())
+    folders = [Path(__file__).parent.parent, *(Path(str(place)) for place in shipped)]
+    files = (file for place in folders for file in place.rglob("*") if file.suffix in SHIPPED)
+    digest = sha256()
+    for name, content in sorted({(file.name, file.read_bytes()) for file in files}):
+        digest.update(f"{name}\n".encode() + content)
     return digest.hexdigest()[:12]
 
 
-def _shipped(entry: Traversable) -> Iterator[Traversable]:
-    if entry.is_dir():
-        for inner in sorted(entry.iterdir(), key=lambda inner: inner.name):
-            if inner.name != "_data":  # configs, jobs and warehouse of a wheel, which come after
-                yield from _shipped(inner)
-    elif entry.name.endswith(SHIPPED):
-        yield entry
-
-
-def _hush_logs() -> None:
-    """Undo the changes to logging that importing Dask makes."""
-    for name in ("distributed", "tornado", "asyncio"):
-        logger = logging.getLogger(name)
-        logger.handlers[:] = [logging.NullHandler()]
-        logger.propagate = False
-    for name in list(logging.root.manager.loggerDict):
-        if name.startswith(("distributed.", "tornado.")):
-            logger = logging.getLogger(name)
-            logger.handlers.clear()
-            logger.propagate = True
+def _silence_dask() -> None:
+    """Undo the changes to logging that importing Dask makes, and ignore its warnings."""
+    for name, logger in logging.root.manager.loggerDict.items():
+        is_dask = name.partition(".")[0] in ("distributed", "tornado", "asyncio")
+        if is_dask and isinstance(logger, logging.Logger):
+            logger.handlers[:] = [logging.NullHandler()]
+            logger.propagate = False
     warnings.filterwarnings("ignore", category=VersionMismatchWarning)
     # A client that could not start to connect warns when it is collected.
     warnings.filterwarnings("ignore", r"coroutine '(Client\._close|wait_for)' was never awaited")

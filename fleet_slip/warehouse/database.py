@@ -12,12 +12,10 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, wait
-from itertools import accumulate
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fleet_slip.config import load_toml
 from fleet_slip.errors import (
-    FleetSlipError,
     QueryGoesOnError,
     QuestionError,
     StorageError,
@@ -142,63 +140,51 @@ _INTERRUPTED = "Query interrupted"
 _DELETED = re.compile(r'"(.*)/\*\*/\*\.parquet"')
 """DuckDB names a file that was deleted after its view was created as a folder."""
 
-_STREAMED_ERRORS = {
-    "Conversion Error": "ConversionException",
-    "Out of Range Error": "OutOfRangeException",
-    "Invalid Input Error": "InvalidInputException",
-    "IO Error": "IOException",
-    "INTERNAL Error": "InternalException",
-    "Out of Memory Error": "OutOfMemoryException",
-    "INTERRUPT Error": "InterruptException",
-}
-"""DuckDB's exceptions by the beginning of their message."""
-
-
-@contextlib.contextmanager
-def _errors_of_streams() -> Iterator[None]:
-    """Raise DuckDB's exception again, which pyarrow hides if results are read by batch."""
-    import duckdb
-
-    try:
-        yield
-    except OSError as error:
-        name = _STREAMED_ERRORS.get(str(error).partition(":")[0])
-        if name is None:
-            raise
-        raise getattr(duckdb, name)(str(error)) from None
+RESTORE = "If a file is missing or damaged, restore it from a backup."
 
 
 @contextlib.contextmanager
 def database_errors(doing: str) -> Iterator[None]:
-    """Translate DuckDB's errors to ours; `doing` begins the message."""
+    """Translate DuckDB's errors to ours; `doing` begins the message.
+
+    If results are read by batch, pyarrow raises `OSError` with DuckDB's message.
+    """
     import duckdb
 
     try:
-        with _errors_of_streams():
-            yield
-    except FleetSlipError:
-        raise
-    except duckdb.InterruptException:
-        raise KeyboardInterrupt from None
-    except RuntimeError as error:
-        if str(error) == _INTERRUPTED:
-            raise KeyboardInterrupt from None
-        raise
-    except (duckdb.OutOfMemoryException, MemoryError) as error:
-        reason = duckdb_message(error) or f"out of memory ({memory_bytes() // 2**20:,} MiB)"
-        raise StorageError(f"{doing} failed: {reason}. Select less at once.") from None
-    except duckdb.PermissionException as error:
-        if deleted := _DELETED.search(str(error)):
-            raise missing_file_error(deleted[1]) from None
-        raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
-    except (duckdb.IOException, duckdb.InvalidInputException, duckdb.InternalException) as error:
-        raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
-    except duckdb.Error as error:
-        if type(error) is duckdb.Error:  # damaged Parquet metadata
-            raise StorageError(f"{doing} failed: {duckdb_message(error)}. {_RESTORE}") from None
-        raise QuestionError(f"{doing} failed: {duckdb_message(error)}") from None
+        yield
+    except MemoryError:
+        memory = f"{memory_bytes() // 2**20:,} MiB"
+        raise StorageError(f"{doing} failed: out of memory ({memory}). {_LESS}") from None
     except UnicodeDecodeError:  # the message quotes bytes of a damaged file
-        raise StorageError(f"{doing} failed: a file is damaged. {_RESTORE}") from None
+        raise StorageError(f"{doing} failed: a file is damaged. {RESTORE}") from None
+    except (duckdb.Error, OSError, RuntimeError) as error:
+        translated = _translated(error, f"{doing} failed: {duckdb_message(error)}")
+        if translated is None:
+            raise
+        raise translated from None
+
+
+_LESS = "Select less at once."
+
+
+def _translated(error: Exception, message: str) -> BaseException | None:
+    """Return our error for one of DuckDB; None for one of another library."""
+    import duckdb
+
+    kind = str(error).partition(" Error:")[0]
+    if kind in ("INTERRUPT", _INTERRUPTED):
+        return KeyboardInterrupt()
+    if kind == "Out of Memory":
+        return StorageError(f"{message}. {_LESS}")
+    if kind == "Permission" and (deleted := _DELETED.search(str(error))):
+        return missing_file_error(deleted[1])
+    # Damaged Parquet metadata are an error without a class.
+    if kind in ("IO", "Invalid Input", "INTERNAL") or type(error) is duckdb.Error:
+        return StorageError(f"{message}. {RESTORE}")
+    if isinstance(error, duckdb.Error) or kind in ("Conversion", "Out of Range"):
+        return QuestionError(message)
+    return None
 
 
 @contextlib.contextmanager
@@ -240,9 +226,6 @@ def duckdb_message(error: BaseException) -> str:
     if "Traceback (most recent call last)" in text:  # of Python that DuckDB called to read a file
         text = text.strip().rpartition("\n")[2].partition(": ")[2]
     return " ".join(text.split()).rstrip(".")
-
-
-_RESTORE = "If a file is missing or damaged, restore it from a backup."
 
 
 # SQL of users: queries that only read.
@@ -287,25 +270,13 @@ def one_query(database: duckdb.DuckDBPyConnection, text: str) -> str:
         raise QuestionError(f"not valid SQL: {duckdb_message(error)}") from None
     if len(statements) != 1:
         raise QuestionError(f"one SQL statement is expected, not {len(statements)}.")
-    explained = statements[0].type == duckdb.StatementType.EXPLAIN
-    _require_reading(database, _explained(text) if explained else text)
+    is_explain = statements[0].type == duckdb.StatementType.EXPLAIN
+    _require_reading(database, _EXPLAIN.sub("", text) if is_explain else text)
     return text
 
 
-def _explained(text: str) -> str:
-    """Return the statement of an EXPLAIN; EXPLAIN ANALYZE runs it."""
-    import duckdb
-
-    encoded = text.encode()
-    tokens = [start for start, kind in duckdb.tokenize(text) if kind != duckdb.token_type.comment]
-    ends = [*tokens[1:], len(encoded)]
-    words = [encoded[a:b].split()[0].lower() for a, b in zip(tokens, ends, strict=True)]
-    begin = 2 if words[1] == b"analyze" else 1
-    if words[1] == b"(":  # options in parentheses, or a query in parentheses
-        depths = accumulate((word == b"(") - (word == b")") for word in words[1:])
-        query_start = 2 + next(i for i, depth in enumerate(depths) if depth == 0)
-        begin = query_start if query_start < len(tokens) else 1
-    return encoded[tokens[begin] :].decode()
+_EXPLAIN = re.compile(r"^\s*EXPLAIN\s+(?:ANALYZE\s+)?(?:\([^()]*\)\s*(?=\S))?", re.IGNORECASE)
+"""Matches the words and options before the explained statement; EXPLAIN ANALYZE runs that."""
 
 
 def _require_reading(database: duckdb.DuckDBPyConnection, text: str) -> None:

@@ -11,7 +11,6 @@ import difflib
 import functools
 import json
 import re
-import threading
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from hashlib import sha256
@@ -22,6 +21,7 @@ from fleet_slip.catalog.signals import ALL_DRIVES, SCENARIO, TRAINING_DRIVES, Si
 from fleet_slip.errors import QuestionError, StorageError, printable
 from fleet_slip.warehouse.database import (
     LONGEST_QUERY,
+    RESTORE,
     Tree,
     allowed_words,
     duckdb_message,
@@ -33,9 +33,6 @@ from fleet_slip.warehouse.database import (
 if TYPE_CHECKING:
     import duckdb
 
-
-MAX_QUERY_S = 3600.0
-"""Longest query with a predicate, in s: unattended jobs must end."""
 
 _POSITION_KEYS = frozenset({"query_location", "query_location_length"})
 
@@ -79,42 +76,18 @@ class Predicate:
 
 
 @contextlib.contextmanager
-def guarded_query(
-    database: "duckdb.DuckDBPyConnection", predicate: Predicate, limit_s: float = MAX_QUERY_S
-) -> Iterator[None]:
-    """Interrupt a query with a predicate after `limit_s`, and translate its errors.
-
-    A connection can have one such query at a time. Raises `QuestionError` after the time limit.
-    """
-    import duckdb
-
-    expired = threading.Event()
-
-    def stop() -> None:
-        expired.set()
-        database.interrupt()
-
-    timer = threading.Timer(limit_s, stop)
-    timer.daemon = True
-    timer.start()
+def guarded_query(database: "duckdb.DuckDBPyConnection", predicate: Predicate) -> Iterator[None]:
+    """Translate the errors of a query with a predicate."""
+    doing = f"the cohort {predicate.quoted}"
     try:
-        with reading_files(database, f"the cohort {predicate.quoted}"):
+        with reading_files(database, doing):
             yield
     except StorageError as error:
-        cause = error.__context__
-        if isinstance(cause, duckdb.InvalidInputException):  # all files are sound
-            raise QuestionError(
-                f"the cohort {predicate.quoted} cannot be evaluated: {duckdb_message(cause)}."
-            ) from None
-        raise
-    except BaseException:
-        if not expired.is_set():
+        if not str(error).startswith(f"{doing} failed: Invalid Input Error"):
             raise
-        raise QuestionError(
-            f"the cohort {predicate.quoted} took more than {limit_s:g} s. Simplify it."
-        ) from None
-    finally:
-        timer.cancel()
+        # All files are sound.
+        text = str(error).replace(" failed: ", " cannot be evaluated: ", 1)
+        raise QuestionError(text.removesuffix(f" {RESTORE}")) from None
 
 
 def parse_predicate(

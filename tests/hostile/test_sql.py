@@ -169,7 +169,7 @@ READS = (
     "FROM drives",
     "EXPLAIN SELECT 1",
     "EXPLAIN (SELECT 1)",
-    "-- é\nEXPLAIN ANALYZE FROM drives",
+    "EXPLAIN ANALYZE FROM drives",
     "EXPLAIN (ANALYZE, FORMAT json) SELECT 1",
     "SUMMARIZE drives",
     "DESCRIBE log",
