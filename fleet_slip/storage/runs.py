@@ -4,8 +4,8 @@
     runs/2026-11.jsonl/TIME-RANDOM.jsonl      such lines, on an object store
 
 A line is one write, never changed, that ends in a checksum of the bytes before: no lock, and a
-killed run lacks its second line. A changed line differs from a torn one, which lacks its end and is
-skipped.
+killed run lacks its second line. A line without a valid checksum was changed, or torn by a full
+disk or a power cut.
 """
 
 import contextlib
@@ -38,7 +38,6 @@ START = 19
 FOLDER = "runs"
 
 _DIGITS = 32
-_END = b',"sha256":"' + b"0" * _DIGITS + b'"}'
 _WITH_CHECKSUM = re.compile(rb'(.*),"sha256":"([0-9a-f]{%d})"\}' % _DIGITS)
 
 
@@ -59,22 +58,22 @@ def write_line(record: Mapping[str, Any]) -> bytes:
 
 
 def read_lines(content: bytes) -> tuple[list[bytes], list[int]]:
-    """Return the intact lines, and the numbers of changed lines, from 1."""
-    intact, changed = [], []
+    """Return the intact lines, and the numbers of damaged lines, from 1."""
+    intact, damaged = [], []
     for number, line in enumerate(content.split(b"\n"), 1):
         match = _WITH_CHECKSUM.fullmatch(line)
         if match and _checksum(match[1]) == match[2]:
             intact.append(line)
-        elif match or _is_record(line) or _ends(line) or _ends(line[:-1]):
-            changed.append(number)
-    return intact, changed
+        elif line:
+            damaged.append(number)
+    return intact, damaged
 
 
 def find_changed_lines(root: Folder, since: str = "") -> Iterator[tuple[str, str]]:
-    """Yield files with changed lines, from a month YYYY-MM on, and a text on each line."""
+    """Yield files with damaged lines, from a month YYYY-MM on, and a text on each line."""
     for path, content in _read_history(root, since):
         for number in read_lines(content)[1]:
-            yield f"{FOLDER}/{path}", f"line {number} was changed or damaged"
+            yield f"{FOLDER}/{path}", f"line {number} was changed or torn"
 
 
 def _read_history(root: Folder, since: str = "") -> list[tuple[str, bytes]]:
@@ -83,28 +82,6 @@ def _read_history(root: Folder, since: str = "") -> list[tuple[str, bytes]]:
     paths = [f.path for f in folder.files() if f.path.endswith(".jsonl") and f.path >= since]
     contents = folder.read_many(paths)
     return [(path, content or b"") for path, content in zip(paths, contents, strict=True)]
-
-
-def _intact_records(root: Folder, since: str) -> Iterator[dict[str, Any]]:
-    for _, content in _read_history(root, since):
-        yield from map(json.loads, read_lines(content)[0])
-
-
-def _ends(line: bytes) -> bool:
-    """Return True if a line ends like a line with a checksum, except for one byte."""
-    tail = line[-len(_END) :]
-    if len(tail) < len(_END):
-        return False
-    pairs = zip(tail, _END, strict=True)
-    hexadecimal = b"0123456789abcdef"
-    return sum(a != b and not (b == 48 and a in hexadecimal) for a, b in pairs) <= 1
-
-
-def _is_record(line: bytes) -> bool:
-    try:
-        return isinstance(json.loads(line), dict)
-    except (ValueError, RecursionError):
-        return False
 
 
 def _checksum(body: bytes) -> bytes:
@@ -156,13 +133,6 @@ class Run:
         run_id = f"{now:%Y%m%dT%H%M%S.%fZ}-{os.urandom(4).hex()}"
         return cls(command, tuple(arguments), now, run_id)
 
-    @property
-    def shown_arguments(self) -> list[str]:
-        """The command line without private parts."""
-        arguments = publishable(self.arguments)
-        more = len(arguments) - ARGUMENTS_MAX
-        return [*arguments[:ARGUMENTS_MAX], f"... and {more} more"] if more > 0 else arguments
-
     def beginning(self) -> dict[str, Any]:
         """Return the line that is written when the run starts."""
         from importlib.metadata import version
@@ -170,7 +140,7 @@ class Run:
         return {
             "run_id": self.run_id,
             "command": self.command,
-            "arguments": self.shown_arguments,
+            "arguments": publishable(self.arguments)[:ARGUMENTS_MAX],
             "started_at": _timestamp(self.started_at),
             "host": os.uname().nodename,
             "process": os.getpid(),
@@ -181,8 +151,7 @@ class Run:
     def end(self, error: BaseException | None, seconds: float) -> dict[str, Any]:
         """Return the line that is written when the run ends."""
         exit_code = _exit_code(error)
-        message = _without(str(error), self.arguments, publishable(self.arguments))
-        message = hide_passwords(message)[:ERROR_MAX]
+        message = _without_hidden(hide_passwords(str(error)), self.arguments)[:ERROR_MAX]
         outcome = {0: "done", INTERRUPTED: "interrupted"}.get(exit_code, "failed")
         return {
             "run_id": self.run_id,
@@ -208,7 +177,7 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
     file = f"{FOLDER}/{run.started_at:%Y-%m}.jsonl"
     begun = time.monotonic()
     token = _current.set(run)
-    is_recorded = _exists(root) and _append(root, file, run.beginning())
+    is_recorded = _append(root, file, run.beginning())
     error: BaseException | None = None
     try:
         yield run
@@ -216,10 +185,9 @@ def recording(root: Folder, command: str, arguments: Sequence[str]) -> Iterator[
         error = caught
         raise
     finally:
+        beginning = [] if is_recorded else [run.beginning()]
         end = run.end(error, time.monotonic() - begun)
-        if _exists(root) and not _append(
-            root, file, *([] if is_recorded else [run.beginning()]), end
-        ):
+        if _append(root, file, *beginning, end) is False:
             LOGGER.warning(
                 "%s: the run history cannot be written; this run is missing in it.", root
             )
@@ -276,28 +244,27 @@ def publishable(arguments: Sequence[str]) -> list[str]:
     return public
 
 
-def _without(text: str, arguments: Sequence[str], shown: Sequence[str]) -> str:
-    """Return a message in which hidden arguments are replaced."""
-    for argument, instead in zip(arguments, shown, strict=True):
-        if argument != instead:
-            is_option = instead.endswith(f"={HIDDEN}")
-            secret = argument.partition("=")[2] if is_option else argument
-            text = text.replace(secret, HIDDEN if is_option else instead) if secret else text
+def _without_hidden(text: str, arguments: Sequence[str]) -> str:
+    """Return a message in which hidden arguments, or hidden values of options, are replaced."""
+    for argument, shown in zip(arguments, publishable(arguments), strict=True):
+        hidden, instead = argument, shown
+        if shown.endswith(f"={HIDDEN}"):
+            hidden, instead = argument.partition("=")[2], HIDDEN
+        if argument != shown and hidden:
+            text = text.replace(hidden, instead)
     return text
 
 
-def _exists(root: Folder) -> bool:
-    with contextlib.suppress(StorageError):
-        return root.exists()
-    return False
-
-
-def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool:
+def _append(root: Folder, file: str, *records: Mapping[str, Any]) -> bool | None:
+    """Append records to a file; return False on failure, None if the root does not exist."""
     text = b"".join(b"\n" + write_line(record) + b"\n" for record in records)
-    with contextlib.suppress(StorageError):
+    try:
+        if not root.exists():
+            return None
         root.append(file, text)
-        return True
-    return False
+    except StorageError:
+        return False
+    return True
 
 
 def _exit_code(error: BaseException | None) -> int:
@@ -328,7 +295,7 @@ def add_runs(database: "duckdb.DuckDBPyConnection", root: Folder, since: str = "
         lines, changed = read_lines(content)
         if changed:
             raise StorageError(
-                f"{root}/{FOLDER}/{path}: line {changed[0]} was changed or damaged. Restore the "
+                f"{root}/{FOLDER}/{path}: line {changed[0]} was changed or torn. Restore the "
                 "file from a backup, or delete the line: no other depends on it."
             )
         chunks.append(pa.array(lines, pa.binary()).cast(pa.string()))
@@ -343,8 +310,9 @@ def runs_under_way(root: Folder) -> list[str]:
     host = socket.gethostname()
     since = datetime.now(UTC) - timedelta(days=1)
     begun: dict[str, dict[str, Any]] = defaultdict(dict)
-    for record in _intact_records(root, f"{since:%Y-%m}"):
-        begun[record["run_id"]].update(record)
+    for _, content in _read_history(root, f"{since:%Y-%m}"):
+        for record in map(json.loads, read_lines(content)[0]):
+            begun[record["run_id"]].update(record)
     return [
         run_id
         for run_id, run in sorted(begun.items())
