@@ -18,7 +18,6 @@ from itertools import islice
 from typing import TypeVar
 
 from fleet_slip.errors import ClusterError
-from fleet_slip.storage.runs import LOGGER
 
 IN_FLIGHT = 4
 """Maximum number of unprocessed tasks of an executor without `in_flight`."""
@@ -57,55 +56,39 @@ def run_tasks(
 ) -> Iterator[tuple[Item, Result]]:
     """Call a function on items; yield each item with its result on completion, in any order.
 
-    Without an executor, calls run in this thread. Tasks whose worker died are retried one at a time
-    at the end, since any task of a worker may have killed it. Raises `ClusterError` with the tasks
-    that failed again; any other error ends the iteration.
+    Without an executor, calls run in this thread. Raises `ClusterError` at the end with the tasks
+    whose workers died; any other error ends the iteration.
     """
     if executor is None:
         for item in items:
             yield item, function(item)
         return
-    suspects: list[Item] = []
-    yield from _completed(executor, function, items, lambda: in_flight(executor), suspects)
-    for item in suspects:
-        LOGGER.warning(f"{name_of(item)}: its worker died; retrying it once, alone")
-    lost: list[Item] = []
-    yield from _completed(executor, function, suspects, lambda: 1, lost)
-    if lost:
-        more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
-        raise ClusterError(
-            f"{', '.join(map(name_of, lost[:NAMED_MAX]))}{more}: every worker that tried it died, "
-            "often out of memory; see the workers' logs. Everything else is done. Give the workers "
-            "more memory, and run the same command again."
-        )
-
-
-def _completed(
-    executor: Executor,
-    function: Callable[[Item], Result],
-    items: Iterable[Item],
-    limit: Callable[[], int],
-    lost: list[Item],
-) -> Iterator[tuple[Item, Result]]:
-    pending = iter(items)
+    pending, lost = iter(items), []
     futures: dict[Future[Result], Item] = {}
     try:
         while True:
-            for item in islice(pending, max(0, limit() - len(futures))):
+            for item in islice(pending, max(0, in_flight(executor) - len(futures))):
                 futures[executor.submit(function, item)] = item
             if not futures:
-                return
+                break
             for future in wait(futures, return_when=FIRST_COMPLETED).done:
                 item = futures.pop(future)
                 try:
                     result = future.result()
                 except LostTaskError:
-                    lost.append(item)
+                    lost.append(name_of(item))
                 else:
                     yield item, result
     finally:
         for future in futures:
             future.cancel()
+    if lost:
+        more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
+        raise ClusterError(
+            f"{', '.join(lost[:NAMED_MAX])}{more}: every worker that tried it died, often out of "
+            "memory; see the workers' logs. Everything else is done. Give the workers more memory, "
+            "and run the same command again."
+        )
 
 
 def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:
