@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.harness import add_options, simulated
 from benchmarks.peer_ways import COLUMNS, INPUTS, LABEL, WAYS, thread_variables
-from fleet_slip.pages.drawing import PALETTE, STYLE
+from fleet_slip.pages.page import PALETTE, STYLE
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.least_squares import LinearModel, fit
 from tests.support.catalog import CATALOG

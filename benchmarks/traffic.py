@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 import fleet_slip
 from fleet_slip.evaluation.watch import DriveFrames, scenario_frames
-from fleet_slip.pages.drawing import STYLE, colour
+from fleet_slip.pages.page import STYLE, colour
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.simulate import simulate_batch

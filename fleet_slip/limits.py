@@ -37,19 +37,13 @@ def data_needed() -> int:
 
 
 def _cgroup_limits() -> Iterator[int]:
-    """Yield the memory limits of this process's control group and its parents."""
+    """Yield the memory limits of this process's control group (version 2) and its parents.
+
+    In a container the path may be the host's, and the limit at the top.
+    """
     with contextlib.suppress(OSError):
-        for line in OWN_CGROUP.read_text(encoding="utf-8").splitlines():
-            _, kinds, path = line.split(":", 2)
-            if kinds and "memory" not in kinds.split(","):
-                continue
-            # In a container the path may be the host's, and the limit at the top.
-            top, name = (
-                (CGROUPS / "memory", "memory.limit_in_bytes") if kinds else (CGROUPS, "memory.max")
-            )
-            group = top / path.lstrip("/")
-            for folder in (group, *group.parents):
-                with contextlib.suppress(OSError, ValueError):
-                    yield int((folder / name).read_text(encoding="ascii"))
-                if folder == top:
-                    break
+        path = OWN_CGROUP.read_text(encoding="utf-8").strip().rpartition("::")[2]
+        group = CGROUPS / path.lstrip("/")
+        for folder in (group, *group.parents):
+            with contextlib.suppress(OSError, ValueError):
+                yield int((folder / "memory.max").read_text(encoding="ascii"))

@@ -21,7 +21,7 @@ def _():
     from fleet_slip.base import pluralize
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.evaluation.watch import drive_frames
-    from fleet_slip.pages.drawing import colour
+    from fleet_slip.pages.page import colour
 
     return (
         Figure, FleetSlipError, LinearSegmentedColormap, alt, colour,

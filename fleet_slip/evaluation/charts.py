@@ -14,8 +14,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
 from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.test_drives import TestDrive, find_stretches
-from fleet_slip.pages.drawing import BINS, WIDTH_IN, Picture, colour
-from fleet_slip.pages.page import degrees, join_words
+from fleet_slip.pages.page import BINS, WIDTH_IN, Picture, colour, degrees, join_words
 
 ANGLE_IN = 2.3
 STRIP_IN = 0.85

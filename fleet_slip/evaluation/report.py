@@ -13,8 +13,17 @@ from fleet_slip.evaluation.filters import LinearEstimate, restore_filter, train_
 from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData, latest_evaluation
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.pages.drawing import Drawn, draw
-from fleet_slip.pages.page import Cell, ReportTable, Tile, count, degrees, fill_in, number
+from fleet_slip.pages.page import (
+    Cell,
+    Drawn,
+    ReportTable,
+    Tile,
+    count,
+    degrees,
+    draw,
+    fill_in,
+    number,
+)
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.storage.folder import Folder
 from fleet_slip.warehouse.warehouse import Warehouse

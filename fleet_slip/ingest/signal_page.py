@@ -9,8 +9,7 @@ from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.ingest.columns import SignalColumn
 from fleet_slip.ingest.draft import Draft, signal_keys
 from fleet_slip.ingest.guess import Guess
-from fleet_slip.pages.drawing import WIDTH_IN, Picture, colour, draw
-from fleet_slip.pages.page import fill_in
+from fleet_slip.pages.page import WIDTH_IN, Picture, colour, draw, fill_in
 
 MAX_POINTS = 2000
 """Maximum points of a curve. Of longer signals the extremes of equal parts are drawn."""

@@ -41,14 +41,12 @@ def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None
         ("0::/system.slice/fleet-slip.service", "system.slice/fleet-slip.service/memory.max"),
         ("0::/system.slice/fleet-slip.service", "system.slice/memory.max"),
         ("0::/of/the/host", "memory.max"),
-        ("7:cpu:/\n5:memory,hugetlb:/docker/1", "memory/docker/1/memory.limit_in_bytes"),
-        ("5:memory:/docker/1", "memory/memory.limit_in_bytes"),
     ],
 )
 def test_the_limit_of_a_control_group_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, membership: str, file: str
 ) -> None:
-    """Of systemd's MemoryMax= and of a container, in both versions of control groups."""
+    """Of systemd's MemoryMax= and of a container."""
     (tmp_path / "cgroup").write_text(membership + "\n")
     (tmp_path / "fs" / file).parent.mkdir(parents=True)
     (tmp_path / "fs" / file).write_text("123456789\n")

@@ -6,8 +6,19 @@ import re
 import pytest
 from matplotlib.figure import Figure
 
-from fleet_slip.pages.drawing import PALETTE, Picture, colour, draw, inline
-from fleet_slip.pages.page import degrees, join_words, number, percent, rich_text, scientific
+from fleet_slip.pages.page import (
+    PALETTE,
+    Picture,
+    colour,
+    degrees,
+    draw,
+    inline,
+    join_words,
+    number,
+    percent,
+    rich_text,
+    scientific,
+)
 
 
 def test_numbers_read_well() -> None:
@@ -62,7 +73,7 @@ def test_a_drawing_on_the_page_takes_its_colours_from_the_page() -> None:
     assert "var(--model-4)" in svg
     assert not [tone.light for tone in PALETTE.values() if tone.light in svg]
     assert "<style" not in svg
-    assert 'aria-label="title. says &quot;x&quot; &amp; &lt;y> caption"' in svg
+    assert 'aria-label="title. says &#34;x&#34; &amp; &lt;y&gt; caption"' in svg
     names = re.findall(r'\bid="([^"]+)"', svg)
     assert names
     assert all(name.startswith("key-") for name in names)

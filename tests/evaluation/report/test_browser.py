@@ -17,7 +17,7 @@ from pypdfium2 import PdfDocument
 
 import fleet_slip
 from fleet_slip.evaluation.watch import drive_frames, render_watch
-from fleet_slip.pages.drawing import PALETTE
+from fleet_slip.pages.page import PALETTE
 from tests.support.reported import Reported
 
 CHROMIUM = (

@@ -33,8 +33,7 @@ from fleet_slip.evaluation.evaluation_document import evaluations_of, store_eval
 from fleet_slip.evaluation.evaluator import ErrorStatistics
 from fleet_slip.evaluation.report import render, table_two
 from fleet_slip.evaluation.report_data import ReportData
-from fleet_slip.pages.drawing import draw
-from fleet_slip.pages.page import Cell, number
+from fleet_slip.pages.page import Cell, draw, number
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.documents import Document
 from fleet_slip.storage.local import LocalFolder
