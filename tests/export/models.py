@@ -1,6 +1,6 @@
 """Published models of every kind of column, and drives of counts for them."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from decimal import Decimal
 from fractions import Fraction
 
@@ -9,19 +9,25 @@ from hypothesis import strategies as st
 
 from fleet_slip.catalog.definitions import (
     AttributeFactor,
+    Blend,
     Combination,
     Definition,
     Equation,
     Gate,
+    Observer,
     ParameterFactor,
     Product,
     Slope,
 )
+from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation.filter_column import observer_of
+from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
 from fleet_slip.export.program import Car, Program
-from fleet_slip.models.manifest import Manifest, ModelTerm
+from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest
@@ -204,4 +210,91 @@ def hostile_version() -> ModelVersion:
         for i, one in enumerate(facts)
     ]
     manifest = plain_model.model_copy(update={"terms": (signal, *terms)})
+    return ModelVersion(1, manifest, "0123" * 16, CATALOG)
+
+
+# Combinations of a line and a filter.
+
+CAR = VehicleMeasures(name="car", mass_kg=1480, front_axle_m=1.11, rear_axle_m=1.67)
+FRONT = CAR.model_copy(update={"front_drive_share": 0.0})
+
+WITHOUT_STEER = [name for name in SIGNALS.signals if not name.startswith("steer_f")]
+WITHOUT_AX = [name for name in SIGNALS.signals if name != "ax"]
+
+
+def _observer(measures: VehicleMeasures, logged: Collection[str], *, one_speed: bool) -> Observer:
+    vehicle = IdentifiedVehicle(vehicle_with_fit(measures), ekf.EkfNoise(), 0.0)
+    return observer_of(vehicle, SIGNALS, logged, one_speed=one_speed)
+
+
+OBSERVERS: dict[str, Observer] = {
+    "rear": _observer(CAR, SIGNALS.signals, one_speed=False),
+    "front": _observer(FRONT, SIGNALS.signals, one_speed=False),
+    "one_speed": _observer(CAR, WITHOUT_STEER, one_speed=True),
+    "no_ax": _observer(CAR, WITHOUT_AX, one_speed=True),
+}
+
+ESTIMATE = Definition(
+    of="line_estimate",
+    made=Combination(
+        intercept=7, terms=((-9, Definition(of="ay", over="mean", ticks=3)),), divisor=16
+    ),
+)
+
+
+def filtered(observer: Observer) -> Definition:
+    return Definition(of="filter_estimate", made=observer, of_bits=20)
+
+
+BLENDS: dict[str, Blend] = {
+    "alone": Blend(filter=filtered(OBSERVERS["rear"])),
+    "constant": Blend(
+        filter=filtered(OBSERVERS["one_speed"]), line=ESTIMATE, shares=(27_000,), limits=(300,)
+    ),
+    "by_lateral": Blend(
+        filter=filtered(OBSERVERS["front"]),
+        line=ESTIMATE,
+        shares=(60_000, 27_000, 0, 65_536),
+        limits=(300, 2000, 0, 90_000),
+        lateral=Definition(of="ay", over="mean", ticks=32),
+        knots=(0, 300, 600, 900),
+    ),
+    "line": Blend(
+        filter=filtered(OBSERVERS["no_ax"]),
+        line=ESTIMATE,
+        anchor="line",
+        shares=(60_000, 27_000),
+        limits=(300, 2000),
+        lateral=Definition(of="ay", over="mean", ticks=32),
+        knots=(0, 300),
+    ),
+}
+
+
+def model_with(blend: Blend, name: str = "sideslip") -> Manifest:
+    definition = Definition(of="combined", made=blend, of_bits=20)
+    term = ModelTerm(
+        signal="combined_with_filter",
+        column="sideslip_rad",
+        unit="rad",
+        scale=Decimal(1) / 2**16,
+        definition=definition,
+        signal_scales={name: SIGNALS[name].scale for name in definition.signals},
+        coefficient=1.0,
+        coefficient_exact=Fraction(1),
+    )
+    combination = CombinedWithFilter(
+        method="constant", term=term, rmse_deg={}, worst_rmse_deg={}, groups=1, measures=CAR
+    )
+    line = model_of({"ay": Fraction(1, 700)}, name=name)
+    return line.model_copy(update={"combination": combination})
+
+
+def version_of(name: str) -> ModelVersion:
+    """A version of a model of `MODELS` or `BLENDS`, of the same name."""
+    manifest = (
+        model_with(BLENDS[name], name)
+        if name in BLENDS
+        else model_of(MODELS[name], Fraction(-1, 700), name)
+    )
     return ModelVersion(1, manifest, "0123" * 16, CATALOG)

@@ -24,18 +24,26 @@ from tests.export.compiled import (
     needs_cc,
     run_compiled,
 )
-from tests.export.models import CARS, MODELS, SMALL, export_texts, hostile_drive, model_of
+from tests.export.models import (
+    BLENDS,
+    CARS,
+    MODELS,
+    SMALL,
+    export_texts,
+    hostile_drive,
+    model_of,
+    version_of,
+)
 from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [*MODELS, *BLENDS])
 def test_hostile_drives_give_the_angles_of_the_kernel(name: str, tmp_path: Path) -> None:
     """And nothing overflows or reads beyond its memory, where the compiler has sanitizers."""
-    manifest = model_of(MODELS[name], Fraction(-1, 700), name)
-    program = compile_program(CATALOG, manifest)
-    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
+    version = version_of(name)
+    manifest, program = version.manifest, compile_program(CATALOG, version.manifest)
     options = SANITIZED if can_sanitize() else ("-O2",)
     driver = build_driver(tmp_path, version, program, *options)
     angles: set[int | None] = set()
@@ -126,37 +134,16 @@ def test_the_self_test_passes_and_notices_another_angle(smoke_root: Path, tmp_pa
     assert "0 of 900" not in printed.removeprefix("smoke@1: 900")
 
 
-@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++")
-def test_a_program_in_cpp_takes_the_header(smoke_root: Path, tmp_path: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    for name, text in export_texts(fleet.models.get("smoke"), fleet.warehouse, "c").items():
-        (tmp_path / name).write_text(text)
-    (tmp_path / "main.cpp").write_text("""
-        #include "sideslip_smoke.h"
-        int main() {
-            sideslip_smoke_state state;
-            sideslip_smoke_sample sample = {};
-            int32_t angle = 0;
-            sideslip_smoke_start(&state);
-            bool there = sideslip_smoke_step(&state, &sample, &angle);
-            return there && angle * SIDESLIP_SMOKE_ANGLE_SCALE > 1.0;
-        }
-    """)
-    strict = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
-    for words in (
-        ["cc", "-std=c99", *strict, "-c", "sideslip_smoke.c", "-o", "smoke.o"],
-        ["c++", "-std=c++14", *strict, "main.cpp", "smoke.o", "-o", "main"],
-        ["./main"],
-    ):
-        subprocess.run(words, cwd=tmp_path, check=True, timeout=DEADLINE_S)
-
-
 COUNTING = """
-#include <stdio.h>
+#include <cstdio>
 #include "sideslip_smoke.h"
-int main(void) {
-    sideslip_smoke_outside outside = {0};
-    sideslip_smoke_sample sample = {0};
+int main() {
+    sideslip_smoke_state state;
+    sideslip_smoke_outside outside = {};
+    sideslip_smoke_sample sample = {};
+    int32_t angle = 0;
+    sideslip_smoke_start(&state);
+    bool valid = sideslip_smoke_step(&state, &sample, &angle);
     outside.ay_count = UINT32_MAX;
     for (int i = 0; i < 3; i++) {
         sample.ax_count = (int16_t)(i - 30001);
@@ -167,18 +154,27 @@ int main(void) {
     }
     printf("%u %u %u %u %u", outside.ax_count, outside.ay_count, outside.yaw_rate_count,
            outside.steering_wheel_count, outside.wheel_fl_count);
+    return valid && angle * SIDESLIP_SMOKE_ANGLE_SCALE > 1.0;
 }
 """
 
 
-def test_inputs_beyond_their_ranges_are_counted(smoke_root: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++")
+def test_a_program_in_cpp_counts_inputs_beyond_their_ranges(
+    smoke_root: Path, tmp_path: Path
+) -> None:
     """A missing one is none; a counter that is full stays so."""
     fleet = fleet_slip.open(smoke_root)
     for name, text in export_texts(fleet.models.get("smoke"), fleet.warehouse, "c").items():
         (tmp_path / name).write_text(text)
-    (tmp_path / "main.c").write_text(COUNTING)
-    code, printed = result_of(compile_c(tmp_path, ["main.c"]))
-    assert (code, printed) == (0, f"1 {2**32 - 1} 0 1 0")
+    (tmp_path / "main.cpp").write_text(COUNTING)
+    strict = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
+    for words in (
+        ["cc", "-std=c99", *strict, "-c", "sideslip_smoke.c", "-o", "smoke.o"],
+        ["c++", "-std=c++14", *strict, "main.cpp", "smoke.o", "-o", "main"],
+    ):
+        subprocess.run(words, cwd=tmp_path, check=True, timeout=DEADLINE_S)
+    assert result_of(tmp_path / "main") == (0, f"1 {2**32 - 1} 0 1 0")
 
 
 def test_names_of_scales_differ_where_c_looks() -> None:

@@ -2,7 +2,6 @@
 
 import zipfile
 from ctypes import byref, c_double, c_void_p
-from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
 
@@ -17,19 +16,24 @@ from fleet_slip.export.files import export_files
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.fmus import Fmu, drive_fmu, run_fmpy, simulate_with_fmpy, unpack
-from tests.export.models import CARS, MODELS, hostile_drive, model_of
+from tests.export.models import BLENDS, CARS, hostile_drive, version_of
 from tests.support.catalog import CATALOG, SIGNALS
 
 pytestmark = needs_cc
 
-MANIFEST = model_of(MODELS["every_kind"], Fraction(-1, 700), "any")
+
+@pytest.fixture(scope="module")
+def version(request: pytest.FixtureRequest) -> ModelVersion:
+    return version_of(getattr(request, "param", "every_kind"))
 
 
 @pytest.fixture(scope="module")
-def archive() -> bytes:
-    return export_files(ModelVersion(1, MANIFEST, "0123" * 16, CATALOG), None, "fmu")[
-        "sideslip_any_fmi2.fmu"
-    ]
+def archive(version: ModelVersion) -> bytes:
+    return fmu_of(version)
+
+
+def fmu_of(version: ModelVersion) -> bytes:
+    return export_files(version, None, "fmu")[f"sideslip_{version.manifest.name}_fmi2.fmu"]
 
 
 @pytest.fixture
@@ -37,15 +41,21 @@ def instance(archive: bytes, tmp_path: Path) -> Fmu:
     return Fmu(*unpack(archive, tmp_path))
 
 
-def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu) -> None:
-    program = compile_program(CATALOG, MANIFEST)
+LONG = [pytest.param(name, marks=pytest.mark.long) for name in BLENDS]
+
+
+@pytest.mark.parametrize("version", ["every_kind", *LONG], indirect=True)
+def test_hostile_drives_give_the_angles_of_the_kernel(instance: Fmu, version: ModelVersion) -> None:
+    program = compile_program(CATALOG, version.manifest)
     for seed, car in enumerate(CARS):
         samples = hostile_drive(program, 200, seed)
-        expected = angles_by_kernel(SIGNALS, MANIFEST, program, car, samples)
+        expected = angles_by_kernel(SIGNALS, version.manifest, program, car, samples)
         assert drive_fmu(instance, program, car, samples) == expected
 
 
-def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
+def test_a_step_is_of_whole_ticks_and_a_state_comes_back(
+    instance: Fmu, version: ModelVersion
+) -> None:
     assert [instance.step(s) for s in (0.01, 0.05, 0.0100000001)] == [0, 0, 0]
     error = 3
     assert [instance.step(s) for s in (0.015, 0.0, -0.01, float("nan"), 1e300)] == [error] * 5
@@ -54,7 +64,7 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
     assert not instance.instantiate(b"{another}")
     assert instance.messages[0][0] == b"car"
     state = c_void_p()
-    program = compile_program(CATALOG, MANIFEST)
+    program = compile_program(CATALOG, version.manifest)
     samples = hostile_drive(program, 60, 1)
     before = drive_fmu(instance, program, CARS[1], samples)
     assert instance.call("GetFMUstate", byref(state)) == 0
@@ -71,31 +81,28 @@ def test_a_step_is_of_whole_ticks_and_a_state_comes_back(instance: Fmu) -> None:
     assert drive_fmu(instance, program, CARS[1], samples) == before
 
 
-def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes) -> None:
-    version = ModelVersion(1, MANIFEST, "0123" * 16, CATALOG)
+def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes, version: ModelVersion) -> None:
     with zipfile.ZipFile(BytesIO(archive)) as file:
         table = file.read("resources/checks.csv").decode()
         text = file.read("modelDescription.xml").decode()
-    assert fmu.fmu(version, compile_program(CATALOG, MANIFEST), table) == archive
-    assert "any@1, SHA-256 01230123" in text
+    assert fmu.fmu(version, compile_program(CATALOG, version.manifest), table) == archive
+    assert "every_kind@1, SHA-256 01230123" in text
     assert '<Unit name="m/s^2"><BaseUnit m="1" s="-2"/></Unit>' in text
     assert table.startswith("drive_id,tick,")
 
 
 def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fmu, "COMPILER", "no-such-compiler")
-    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
+    version = version_of("signals")
     with pytest.raises(ConfigError, match="the C compiler no-such-compiler"):
         export_files(version, None, "fmu")
 
 
 @pytest.mark.tools("fmpy")
-@pytest.mark.parametrize("name", ["every_kind", "learning"])
+@pytest.mark.parametrize("name", ["every_kind", "learning", "by_lateral"])
 def test_fmpy_finds_no_problem(name: str, tmp_path: Path) -> None:
-    manifest = model_of(MODELS[name], Fraction(-1, 700), "any")
-    content = export_files(ModelVersion(1, manifest, "0" * 64, CATALOG), None, "fmu")
     file = tmp_path / "any.fmu"
-    file.write_bytes(content["sideslip_any_fmi2.fmu"])
+    file.write_bytes(fmu_of(version_of(name)))
     assert "No problems found" in run_fmpy("validate", str(file))
 
 
@@ -115,9 +122,10 @@ def test_fmpy_drives_a_whole_drive_as_score_does(smoke_root: Path, tmp_path: Pat
     assert angles == np.floor(predicted / scale + 0.5).astype(int).tolist()
 
 
-def test_the_readme_lists_inputs_in_si_and_says_when_the_output_comes() -> None:
-    version = ModelVersion(1, MANIFEST, "0123" * 16, CATALOG)
-    text = export_files(version, None, "fmu")["sideslip_any_fmu_README.md"].decode()
+def test_the_readme_lists_inputs_in_si_and_says_when_the_output_comes(
+    version: ModelVersion,
+) -> None:
+    text = export_files(version, None, "fmu")["sideslip_every_kind_fmu_README.md"].decode()
     assert "scale" not in text.partition("## Inputs")[2]
     assert "counts" not in text
     signal = CATALOG.signals.signals["ay"]

@@ -16,19 +16,16 @@ from fleet_slip.export.onnx import FloatName, error_bound
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.engines import in_si, open_session, run_drives
-from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of
+from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of, version_of
 from tests.support.catalog import CATALOG, SIGNALS
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [*MODELS, "by_lateral"])
 def test_hostile_drives_are_within_the_stated_error(name: str, kind: FloatName) -> None:
-    manifest = model_of(MODELS[name], Fraction(-1, 700), name)
-    program, predictor = (
-        compile_program(CATALOG, manifest),
-        Predictor.from_manifest(SIGNALS, manifest),
-    )
-    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
+    version = version_of(name)
+    program = compile_program(CATALOG, version.manifest)
+    predictor = Predictor.from_manifest(SIGNALS, version.manifest)
     samples = [hostile_drive(program, 250, seed) for seed in range(len(CARS))]
     expected = np.array(
         [
@@ -88,6 +85,6 @@ def test_the_files_say_what_they_are_of(smoke_root: Path) -> None:
 def test_without_the_library_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnx", None)
     monkeypatch.delitem(__import__("sys").modules, "fleet_slip.export.onnx")
-    version = ModelVersion(1, model_of(MODELS["signals"]), "0" * 64, CATALOG)
+    version = version_of("signals")
     with pytest.raises(ConfigError, match=r'onnx. Run: pip install "fleet-slip\[onnx\]"'):
         export_files(version, None, "onnx")
