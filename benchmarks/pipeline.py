@@ -174,7 +174,7 @@ def selection(warehouse: Warehouse, gram_rows: int) -> None:
         root = Path(folder) / "data"
         shutil.copytree(str(warehouse.root), root)
         many = repeat_drives(root, gram_rows, PLAIN)
-        seconds = best(lambda: select(load_cohort(many), MODELS.model, MODELS.folds))
+        seconds = best(lambda: select(load_cohort(many), MODELS))
         refit = best(lambda: load_cohort(many, "mass_kg > 0 AND day >= '2024-05-02'"))
     print(
         f"{'select: 5 models x 5 folds':44s} {seconds * 1e3:9.1f} ms  over {gram_rows:,} Gram "

@@ -11,33 +11,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from fleet_slip.arrays import IntArray
 from fleet_slip.grams.cohort import load_cohort
-from fleet_slip.regression.choice import (
-    CROSS_VALIDATION,
-    Rule,
-    TrainingFolds,
-    cross_validate_nested,
-    cross_validate_selection,
-    nested_fits,
-)
-from fleet_slip.regression.folds import CohortFolds, by_hash
+from fleet_slip.regression.choice import PRICES, Rule, choose_nested, criterion_values, nested_fits
+from fleet_slip.regression.folds import CohortFolds, Folds, by_hash
 from fleet_slip.regression.gram import complete_cases
-from fleet_slip.regression.inference import (
-    DriveMoments,
-    Evidence,
-    infer,
-)
+from fleet_slip.regression.inference import DriveMoments, Evidence, infer
 from fleet_slip.regression.least_squares import correlation_matrix
-from fleet_slip.regression.orders import RANKINGS, rank
-from fleet_slip.regression.subsets import (
-    CRITERIA,
-    all_rss,
-    best_subsets,
-    criterion_values,
-    pick_sizes,
-    subset_sizes,
-)
+from fleet_slip.regression.orders import RANKINGS, all_rss, best_subsets, rank, subset_sizes
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG
@@ -48,7 +28,7 @@ NINE = tuple(name for name in SIGNALS.inputs if name != "steering_wheel")
 SCALES = {name: SIGNALS[name].exact_scale for name in SIGNALS.gram_signals}
 
 
-def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
+def load(root: str, campaign: str) -> tuple[Folds, DriveMoments]:
     cohort = load_cohort(Warehouse(LocalFolder(Path(root))), f"campaign = '{campaign}'")
     table, mask = complete_cases(cohort.tables, [*NINE, LABEL])
     ids = [
@@ -56,23 +36,23 @@ def load(root: str, campaign: str) -> tuple[TrainingFolds, IntArray]:
     ]
     assignment = by_hash(ids, 5)
     folds = CohortFolds.from_tables([table], assignment).complete_cases(NINE, LABEL)
-    return TrainingFolds(folds, DriveMoments.from_table(table), SCALES), assignment.fold
+    return folds, DriveMoments.from_table(table)
 
 
-def evidence(training: TrainingFolds, output: Path) -> None:
-    total = training.folds.total
+def evidence(folds: Folds, moments: DriveMoments, output: Path) -> None:
+    total = folds.total
     order = rank("backward", total, NINE, LABEL)
     fits = nested_fits(total, order, LABEL)
-    rows, drives = Evidence.naive(fits), Evidence.clustered(fits, training.drives)
+    rows, drives = Evidence.measure(fits), Evidence.measure(fits, moments)
     print(f"rows {rows.rows:.0f}, effective {drives.rows:.0f}, effect {drives.design_effect:.0f}")
     for name, a, b in zip(order, rows.contributions, drives.contributions, strict=True):
         print(f"  {name:<10} A by rows {a:14.1f}   A by drives {b:12.1f}")
-    for name in CRITERIA:
+    for name in PRICES:
         sizes = [int(np.argmin(criterion_values(name, known))) for known in (rows, drives)]
         print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
     naive, robust = (
         infer(fits[-1], SCALES),
-        infer(fits[-1], SCALES, training.drives),
+        infer(fits[-1], SCALES, moments),
     )
     for one, other in zip(naive.estimates, robust.estimates, strict=True):
         errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"
@@ -90,42 +70,32 @@ def evidence(training: TrainingFolds, output: Path) -> None:
     save(figure, output / "statistics_contributions.svg")
 
 
-def orders(training: TrainingFolds, fold: IntArray, output: Path) -> None:
-    total = training.folds.total
+def orders(folds: Folds, moments: DriveMoments, output: Path) -> None:
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     for name in RANKINGS:
-        order = rank(name, total, NINE, LABEL)
-        models = cross_validate_nested(training, order, LABEL)
-        print(f"  {name:<17} {' '.join(order)}")
-        if name in {"declared", "correlation", "backward"}:
-            rmse = [model.pooled.rmse_deg for model in models]
-            axes.plot(range(len(rmse)), rmse, marker="o", markersize=3, label=name)
+        choice = choose_nested(folds, moments, NINE, LABEL, SCALES, Rule(name))
+        print(f"  {name:<17} {' '.join(choice.order)}")
+        sizes = range(1, len(choice.order) + 1)
+        rmse = [model.pooled.rmse_deg for model in choice.models]
+        axes.plot(sizes, rmse, marker="o", markersize=3, label=name)
     axes.set_xlabel("number of signals")
     axes.set_ylabel("cross-validated RMSE, deg")
     axes.set_yscale("log")
     axes.legend(fontsize=8, title="order")
     save(figure, output / "statistics_nested.svg")
-    for criterion in ("bic", CROSS_VALIDATION):
-        rule = Rule("backward", criterion)
-        honest = cross_validate_selection("rule", training, fold, NINE, LABEL, rule)
-        print(f"  backward + {criterion}: {' '.join(honest.signals)}, r = {honest.correlation:.5f}")
 
 
-def subsets(training: TrainingFolds, output: Path) -> None:
-    total = training.folds.total
+def subsets(folds: Folds, output: Path) -> None:
+    total = folds.total
     results = best_subsets(total, NINE, LABEL)
-    for result in results:
-        gap = f"{result.gap:.2g}" if result.gap is not None else "-"
-        names = " ".join(result.best.model.signals)
-        print(f"  {result.best.size} R2 {result.best.r_squared:.5f} gap {gap:>8} {names}")
-    fits = nested_fits(total, NINE, LABEL)
-    print(" ", pick_sizes(results, Evidence.clustered(fits, training.drives)))
+    for fit in results:
+        print(f"  {fit.size} R2 {fit.r_squared:.5f} {' '.join(fit.model.signals)}")
     rss = all_rss(correlation_matrix(total.restrict([*NINE, LABEL])))
     size = subset_sizes(len(NINE)).astype(np.float64)
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     spread = np.random.default_rng(0).uniform(-0.25, 0.25, len(size))
     axes.plot(size + spread, rss, ".", markersize=3, color="grey", label="all 512 subsets")
-    best = [float(result.best.rss / results[0].best.rss) for result in results]
+    best = [float(fit.rss / results[0].rss) for fit in results]
     axes.plot(range(len(best)), best, "o-", markersize=4, label="best of each size")
     axes.set_yscale("log")
     axes.set_xlabel("number of signals")
@@ -147,12 +117,12 @@ def main() -> None:
     parser.add_argument("campaign", nargs="?", default="waterford")
     parser.add_argument("--output", type=Path, default=Path(), help="folder of the pictures")
     given = parser.parse_args()
-    training, fold = load(given.root, given.campaign)
+    folds, moments = load(given.root, given.campaign)
     given.output.mkdir(parents=True, exist_ok=True)
-    print(f"{training.folds.drives} drives, {training.folds.total.n} rows")
-    evidence(training, given.output)
-    orders(training, fold, given.output)
-    subsets(training, given.output)
+    print(f"{folds.drives} drives, {folds.total.n} rows")
+    evidence(folds, moments, given.output)
+    orders(folds, moments, given.output)
+    subsets(folds, given.output)
 
 
 if __name__ == "__main__":

@@ -109,15 +109,6 @@ def _parse_decimal(text: str) -> Decimal:
     return number
 
 
-def refuse_renamed(content: Any, names: Mapping[str, str]) -> Any:
-    """Return the content of a table. Raises `ValueError` for a key that was renamed."""
-    if isinstance(content, Mapping):
-        for old, new in names.items():
-            if old in content:
-                raise ValueError(f"{old} is now called {new}: rename the key")
-    return content
-
-
 def load_config(file: Traversable, model: type[ConfigT], context: object = None) -> ConfigT:
     """Parse and validate a TOML file. Raises `ConfigError` with file, key, reason of each fault.
 

@@ -1,7 +1,7 @@
 """The drives that satisfy a predicate, and what their Gram rows answer."""
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Unpack
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
 
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import UsageError
@@ -10,10 +10,9 @@ if TYPE_CHECKING:
     from fleet_slip.grams.cohort import Cohort
     from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.registry import ModelVersion
-    from fleet_slip.models.request import SelectionOptions, SelectionRequest
-    from fleet_slip.models.select import Selection
+    from fleet_slip.models.request import SelectionRequest
+    from fleet_slip.models.summary import Selection
     from fleet_slip.operations.sensor_screen import SensorScreen
-    from fleet_slip.regression.inference import ClusterUnit
     from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -50,7 +49,9 @@ class FleetCohort:
             return SensorScreen(self.predicate)
         return screen_drives(self.warehouse, self.predicate)
 
-    def select(self, **options: "Unpack[SelectionOptions]") -> "Selection":
+    def select(
+        self, request: "SelectionRequest | None" = None, *, nested: bool = False, **options: Any
+    ) -> "Selection":
         """Compare models by cross-validation and choose one; `FleetModels.publish` takes it.
 
         Without options the models of the list `estimator` are compared. Drives with faulty sensors
@@ -59,66 +60,31 @@ class FleetCohort:
 
         Parameters
         ----------
-        models
-            A model list of `configs/models`, or a TOML file.
-        model
-            The inputs of one model, separated by commas, instead of a list.
-        order
-            Inputs, separated by commas, whose first 1, 2, ... form nested models. `catalogue` means
-            all inputs; the name of a family means its columns.
-        features
-            Feature set of `configs/features.toml`. Default: the list's, else the logged signals.
-        label
-            `course` learns from changes of the course over ground, without a reference sensor.
-        group_by
-            What defines the folds: `drive`, `vehicle`, `track`, `day`, ... Default: the list's.
-        folds
-            Number of folds, or `each` for one fold per group. Default: the list's.
-        ranking
-            Ranking of the inputs of `order`.
-        criterion
-            Rule for the number of ranked inputs: `cv` or an information criterion.
-        tolerance
-            Smallest gain that justifies another signal: an angle such as `0.025deg`, or a share of
-            the RMSE such as `2%`.
-        all_subsets
-            Search all subsets of the inputs of `order`.
-        robust
-            Down-weight outlier drives, with an error above three times the median.
-        cluster
-            Unit of independent evidence, `vehicle` or `drive`.
-        intercept
-            False forces models through the origin.
-        search
-            Search method among the inputs of `order`, or all, repeated in every fold.
-        max_features
-            Maximum number of columns of `search`.
-        half_life
-            Days after which a drive counts half as much.
-        prior
-            A campaign whose simulated drives join the training with an eighth of the weight of all
-            real rows. It is dropped if held-out drives have a clearly larger error with it.
+        request
+            The options, instead of keyword arguments.
+        nested
+            Repeat the choice without each measured drive, for an error to expect on new drives.
+        options
+            Attributes of `fleet_slip.models.request.SelectionRequest`, such as `models="table1"`.
 
         Raises
         ------
         UsageError
-            If options exclude each other, or the list is invalid.
+            If options are unknown or exclude each other, or the list is invalid.
         DataError
             If no model can be fitted.
         """
-        from fleet_slip.models.request import SelectionRequest
-
-        return self.run_request(SelectionRequest(**options))
-
-    def run_request(self, request: "SelectionRequest", *, nested: bool = False) -> "Selection":
-        """Select as `select` does, with the options of a request.
-
-        With `nested` the choice is repeated without each measured drive, for an error to expect.
-        """
-        from fleet_slip.models.request import SelectionPlan
+        from fleet_slip.models.request import SelectionPlan, SelectionRequest
         from fleet_slip.models.select import run_plan
         from fleet_slip.models.stacking import ensure_rows
 
+        names = [field.name for field in fields(SelectionRequest)]
+        if unknown := options.keys() - {*names}:
+            raise UsageError(
+                f"unknown option of select: {', '.join(sorted(unknown))}. Options: "
+                f"{', '.join(names)}."
+            )
+        request = request or SelectionRequest(**options)
         plan = SelectionPlan.from_request(self.warehouse.catalog, request)
         screen = self.examine()
         with screen.explaining():
@@ -132,7 +98,6 @@ class FleetCohort:
         *,
         signals: str | None = None,
         features: str | None = None,
-        cluster: "ClusterUnit | None" = None,
     ) -> "Diagnosis":
         """Fit the signals of a model to the cohort and examine the fit.
 
@@ -145,8 +110,6 @@ class FleetCohort:
             Signals to fit instead, separated by commas; `catalogue` means all inputs.
         features
             Feature set of `signals`. Default: the logged signals.
-        cluster
-            Unit of independent evidence, `vehicle` or `drive`.
 
         Raises
         ------
@@ -163,7 +126,7 @@ class FleetCohort:
             if model is not None:
                 raise UsageError("name a published model or signals (of a feature set), not both.")
             cohort = self._load(features or PLAIN)
-            return diagnose(cohort, inputs_of(cohort, signals or WHOLE_SET), cluster=cluster)
+            return diagnose(cohort, inputs_of(cohort, signals or WHOLE_SET))
         registry = Registry.open(self.warehouse)
         if model is None:
             model = registry.only(", or signals")
@@ -172,7 +135,6 @@ class FleetCohort:
         diagnosis = diagnose(
             self._load(self.warehouse.catalog.name_of(manifest.trained_on.feature_set)),
             manifest.signals,
-            cluster=cluster,
             intercept=not manifest.through_origin,
         )
         return replace(diagnosis, remark=manifest.line_remark)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
-    from fleet_slip.models.select import Selection
+    from fleet_slip.models.summary import Selection
     from fleet_slip.vehicle.parameters import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -187,7 +187,7 @@ class FleetModels:
         )
         recipe = recipe_for(self.registry, name, SelectionRequest(), predicate)
         cohort = FleetCohort(self.warehouse, recipe.cohort, include_faulty)
-        return cohort.run_request(recipe.request)
+        return cohort.select(recipe.request)
 
     @record_call
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.logs import IngestReport
     from fleet_slip.ingest.mapping import Mapping
     from fleet_slip.models.publish import Publication
-    from fleet_slip.models.select import Selection
+    from fleet_slip.models.summary import Selection
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.sensor_screen import SensorFault
     from fleet_slip.simulation.simulate import SimulationReport
@@ -118,7 +118,7 @@ class Training:
         """Compare the models of the list on the cohort, whose drives are checked already."""
         request = SelectionRequest(models=self.models, tolerance=self.tolerance, label=self.label)
         cohort = fleet.cohort(self.cohort, include_faulty=True)
-        return cohort.run_request(request, nested=True)
+        return cohort.select(request, nested=True)
 
     def publish(
         self, fleet: "Fleet", *, candidate: bool = False, replace_marked: bool = False

@@ -172,34 +172,25 @@ Folds = Annotated[
 ]
 Ranking = Annotated[
     str | None,
-    Option(help="Ranking of inputs: declared (default), correlation, t, forward or backward."),
+    Option(help="Ranking of inputs: declared (default), forward or backward."),
 ]
 Criterion = Annotated[
     str | None,
     Option(
         help="Criterion for the number of ranked inputs: cv (the smallest model within --tolerance "
-        "of the best), cp, aic, aic-likelihood, bic, bic-likelihood, ric or adjusted-r2. Default: "
-        "cv."
+        "of the best), aic or bic. Default: cv."
     ),
 ]
 Tolerance = Annotated[
     str | None,
     Option(
-        help="Smallest gain that justifies another signal: an angle such as 0.025deg (root of the "
-        "difference of the mean squared errors), or a share of the RMSE such as 2%. Models within "
-        "it, or within one standard error of the difference, count as equal. Default: 0.025deg, or "
-        "the list's."
+        help="Smallest gain that justifies another signal, such as 0.025deg: the root of the "
+        "difference of the mean squared errors. Models within it, or within one standard error of "
+        "the difference, count as equal. Default: 0.025deg, or the list's."
     ),
-]
-AllSubsets = Annotated[
-    bool, Option("--all-subsets", help="Search all subsets of the inputs of --order.")
 ]
 Robust = Annotated[
     bool, Option("--robust", help="Down-weight drives with an error above three times the median.")
-]
-ClusterUnit = Annotated[
-    Literal["drive", "vehicle"] | None,
-    Option(help="Unit of independent evidence. Default: vehicle if there are several."),
 ]
 Intercept = Annotated[
     bool, Option("--intercept/--no-intercept", help="Fit an intercept, or go through the origin.")

@@ -26,9 +26,7 @@ def select(
     ranking: opt.Ranking = None,
     criterion: opt.Criterion = None,
     tolerance: opt.Tolerance = None,
-    all_subsets: opt.AllSubsets = False,
     robust: opt.Robust = False,
-    cluster: opt.ClusterUnit = None,
     intercept: opt.Intercept = True,
     search: opt.Search = None,
     max_features: opt.MaxFeatures = None,
@@ -52,8 +50,6 @@ def select(
 
     Choose among many columns: fleet-slip select --features windows --search exchange
 
-    Search all subsets: fleet-slip select --all-subsets --criterion cv
-
     Keep the choice: fleet-slip select --order ay,yaw_rate --save own.toml
     """
     from fleet_slip.models.request import SelectionRequest
@@ -69,9 +65,7 @@ def select(
         ranking=ranking,
         criterion=criterion,
         tolerance=tolerance,
-        all_subsets=all_subsets,
         robust=robust,
-        cluster=cluster,
         intercept=intercept,
         search=search,
         max_features=max_features,
@@ -79,7 +73,7 @@ def select(
         prior=prior,
     )
     drives = fleet_of(context).cohort(cohort, include_faulty=include_faulty)
-    selection = drives.run_request(request)
+    selection = drives.select(request)
     print_answer(selection, json, everything=everything, hint="--all")
     if save is not None:
         remark = f". Publish it: fleet-slip publish NAME --models {save}"
@@ -144,7 +138,7 @@ def publish(
         say(f"{name}: {recipe.explanation}")
     drives = fleet.cohort(recipe.cohort, include_faulty=include_faulty)
     with step("select"):
-        selection = drives.run_request(recipe.request, nested=True)
+        selection = drives.select(recipe.request, nested=True)
     publish_or_preview = fleet.models.preview if dry_run else fleet.models.publish
     answer: DryRun | Publication = publish_or_preview(
         name, selection, force=force, candidate=candidate, with_filter=with_filter
@@ -174,7 +168,6 @@ def diagnose(
     features: Annotated[
         str | None, Option(help="Feature set of --signals. Default: the logged signals.")
     ] = None,
-    cluster: opt.ClusterUnit = None,
     json: opt.Json = False,
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
@@ -184,11 +177,8 @@ def diagnose(
 
     Example: fleet-slip diagnose waterford
     """
-    diagnosis = (
-        fleet_of(context)
-        .cohort(cohort)
-        .diagnose(model, signals=signals, features=features, cluster=cluster)
-    )
+    drives = fleet_of(context).cohort(cohort)
+    diagnosis = drives.diagnose(model, signals=signals, features=features)
     if json:
         print_json({"cohort": cohort, **diagnosis.as_dict()})
     else:

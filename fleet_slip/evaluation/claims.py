@@ -19,9 +19,7 @@ from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.export.costs import COEFFICIENT_BYTES, describe_costs, dot_product_operations
 from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific
 from fleet_slip.regression.choice import nested_fits
-from fleet_slip.regression.inference import student_t_two_sided
-from fleet_slip.regression.orders import RANKINGS, rank
-from fleet_slip.regression.subsets import best_subsets
+from fleet_slip.regression.orders import RANKINGS, best_subsets, rank
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
 
@@ -75,9 +73,11 @@ def mean_squares(run: Blocks, estimator: str) -> FloatArray:
 
 def compare_errors(run: Blocks, first: str, second: str) -> tuple[float, float]:
     """Compare squared errors by a paired t test over blocks; return t (> 0: first wins) and p."""
+    from scipy.special import stdtr  # noqa: PLC0415 - slow
+
     gain = mean_squares(run, second) - mean_squares(run, first)
     t = float(gain.mean() / (gain.std(ddof=1) / math.sqrt(len(gain))))
-    return t, student_t_two_sided(t, len(gain) - 1)
+    return t, float(2 * stdtr(len(gain) - 1, -abs(t)))
 
 
 def blocks_won(run: Blocks, estimators: Sequence[str]) -> list[int]:
@@ -221,7 +221,7 @@ def order_is_crucial(report: ReportData) -> Finding:
     """The order of the variables is crucial for nested models."""
     cohort, signals = report.trained.selection.cohort, report.all_signals
     label, total = cohort.catalog.signals.label, cohort.complete_cases(signals).table.total()
-    subsets = [size.best for size in best_subsets(total, signals, label, count=1)]
+    subsets = best_subsets(total, signals, label)
     threshold = subsets[-1].r_squared - NEGLIGIBLE_R_SQUARED
     best = next(fit.size for fit in subsets if fit.r_squared >= threshold)
     needed = {}

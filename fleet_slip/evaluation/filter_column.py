@@ -27,7 +27,7 @@ from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.score import calibrated_cars
-from fleet_slip.models.select import Selection
+from fleet_slip.models.summary import Selection
 from fleet_slip.regression.combination import CLIP_STD
 from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse

@@ -35,7 +35,8 @@ from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.request import load_model_list
-from fleet_slip.models.select import Selection, select
+from fleet_slip.models.select import select
+from fleet_slip.models.summary import Selection
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
@@ -145,7 +146,7 @@ def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
     """Fit Table I on a published model's cohort as it is now. Raises `DataError` if it is empty."""
     cohort = load_cohort(warehouse, version.manifest.trained_on.cohort)
     models = load_model_list(warehouse.catalog, TABLE_ONE)
-    return TrainedModels(version, select(cohort, models.model, models.folds))
+    return TrainedModels(version, select(cohort, models))
 
 
 GROUP = "filters and observers"

@@ -24,7 +24,8 @@ from fleet_slip.grams.drive_sums import DriveBlocks, counts_of, drive_sums, gram
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionPlan, SelectionRequest
-from fleet_slip.models.select import MIN_DRIVES, Selection, deal_trips, select_without
+from fleet_slip.models.select import MIN_DRIVES, deal_trips, select_without
+from fleet_slip.models.summary import Selection
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 

@@ -26,7 +26,6 @@ from fleet_slip.catalog.signals import LONGEST_PAUSE_S, RECEIVED, SCENARIO, TRAI
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError, NotComputedError, QuestionError, RefusedError, UsageError
 from fleet_slip.grams.calibrated_columns import expansion_of
-from fleet_slip.regression.choice import TrainingFolds
 from fleet_slip.regression.folds import CohortFolds, FoldAssignment, by_hash, by_value
 from fleet_slip.regression.gram import Gram, GramTable, complete_cases, missing_signals_error
 from fleet_slip.regression.inference import ClusterUnit, DriveMoments
@@ -540,49 +539,16 @@ def sum_days(
     )
 
 
-# Folds and moments of the complete cases of a set of inputs.
-
-
-def clustered_moments(
-    cases: CompleteCases, cluster: ClusterUnit | None = None, *, intercept: bool = True
-) -> DriveMoments:
-    """Return the moments of each drive and its cluster: by default its car, for one car its trip.
+def clustered_moments(cases: CompleteCases, *, intercept: bool = True) -> DriveMoments:
+    """Return the moments of independent clusters: the cars, or for one car its trips.
 
     Without an intercept moments are about zero.
     """
     table = cases.table if intercept else cases.table.about_origin()
     cars = cases.drives["vehicle_id"].to_pylist()
-    unit = cluster or ("vehicle" if len(set(cars)) > 1 else "drive")
+    unit: ClusterUnit = "vehicle" if len(set(cars)) > 1 else "drive"
     keys = cars if unit == "vehicle" else cases.drives["trip"].to_pylist()
-    numbers = {key: i for i, key in enumerate(sorted(set(keys), key=str))}
-    if unit == "drive" and len(numbers) == len(keys):
-        return DriveMoments.from_table(table)
-    return DriveMoments.from_table(table, np.array([numbers[key] for key in keys]), unit)
-
-
-def drive_folds(
-    cohort: Cohort,
-    inputs: Sequence[str],
-    folding: Folding,
-    *,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
-) -> tuple[TrainingFolds, IntArray]:
-    """Divide the drives with all inputs into folds; return the folds and the fold of each drive.
-
-    Raises `DataError` if no drive contains all inputs, and `QuestionError` for folds of blocks.
-    """
-    if folding.by == PARTS:
-        raise QuestionError(
-            f"with folds by {folding.by} there are no drives to hold out. Fold by drive for this."
-        )
-    cases = cohort.complete_cases(inputs)
-    values = cases.drives[FOLD_KEYS[folding.by]].to_pylist()
-    assignment = assign_folds(values, folding.by, folding.count)
-    label, scales = cohort.catalog.signals.label, cohort.catalog.input_scales
-    folds = CohortFolds.from_tables([cases.table], assignment).complete_cases(inputs, label)
-    moments = clustered_moments(cases, cluster, intercept=intercept)
-    return TrainingFolds(folds, moments, scales, intercept), assignment.fold
+    return DriveMoments.from_table(table, np.unique(keys, return_inverse=True)[1], unit)
 
 
 # Integer weights of drives: Gram rows times a weight keep every sum exact.

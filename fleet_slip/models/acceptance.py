@@ -29,9 +29,9 @@ from fleet_slip.grams.cohort import (
 )
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
-from fleet_slip.models.search import search_procedure
-from fleet_slip.models.select import Selection
-from fleet_slip.regression.choice import RmseGap, Tolerance, compare_paired
+from fleet_slip.models.select import search_procedure
+from fleet_slip.models.summary import Selection
+from fleet_slip.regression.choice import RmseGap, compare_paired
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
@@ -62,9 +62,9 @@ class PublishThresholds(Config):
     min_rows_per_column: int = Field(default=100, ge=1)
 
     @property
-    def tolerance(self) -> Tolerance:
+    def tolerance(self) -> float:
         """RMSE gap to the champion that is no reason to refuse a challenger."""
-        return Tolerance(math.radians(self.tolerance_deg))
+        return math.radians(self.tolerance_deg)
 
 
 def load_thresholds(configs: Configs) -> PublishThresholds:
@@ -168,7 +168,7 @@ class ChallengerEvaluation:
     by: FoldKey
     procedure: Procedure
     incumbents: dict[str, LinearModel]
-    tolerance: Tolerance
+    tolerance: float
 
     @classmethod
     def prepare(

@@ -94,21 +94,15 @@ class Diagnosis(Answer):
         )
         if self.cluster == "row":
             yield Remark(
-                "only one drive: standard errors take its rows as independent, which they are "
-                "not at 100 Hz, and are far too small."
+                "only one drive or trip: standard errors take its rows as independent, which they "
+                "are not at 100 Hz, and are far too small."
             )
         yield from outlier_remarks(self.weighted)
         if self.remark:
             yield Remark(self.remark)
 
 
-def diagnose(
-    cohort: Cohort,
-    inputs: Sequence[str],
-    *,
-    cluster: ClusterUnit | None = None,
-    intercept: bool = True,
-) -> Diagnosis:
+def diagnose(cohort: Cohort, inputs: Sequence[str], *, intercept: bool = True) -> Diagnosis:
     """Fit the inputs to the drives of a cohort that have them all, and examine the fit.
 
     Raises `DataError` for dependent or absent signals.
@@ -116,9 +110,9 @@ def diagnose(
     catalog = cohort.catalog
     label, scales = catalog.signals.label, catalog.input_scales
     served = cohort.complete_cases(inputs)
-    moments = clustered_moments(served, cluster, intercept=intercept)
-    # A single drive tells nothing of how drives differ: then errors are by rows.
-    alone = moments.unit == "drive" and len(moments) == 1
+    moments = clustered_moments(served, intercept=intercept)
+    # A single drive or trip contains no difference of drives: then errors are by rows.
+    alone = len(moments) < 2
     total = served.table.total()
     fits = nested_fits(total, inputs, label, intercept=intercept)
     fitted = fits[-1]
@@ -131,7 +125,7 @@ def diagnose(
         robust=naive if alone else infer(fitted, scales, moments),
         inflation=variance_inflation(total, inputs),
         condition_number=condition_number(total, inputs),
-        evidence=Evidence.naive(fits) if alone else Evidence.clustered(fits, moments),
+        evidence=Evidence.measure(fits, moments),
         units={name: catalog.input(name).unit for name in inputs}
         | {INTERCEPT: catalog.signals[label].unit},
         weighted=outlier_drives(served, intercept=intercept),

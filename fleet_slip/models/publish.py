@@ -36,7 +36,7 @@ from fleet_slip.models.request import (
     checksum_of_list,
     load_model_list,
 )
-from fleet_slip.models.select import Selection
+from fleet_slip.models.summary import Selection
 from fleet_slip.models.training_checks import (
     require_sound_course,
     require_sound_drives,
@@ -53,7 +53,7 @@ COHORT = "cohort"
 """Key of the predicate that was asked, where cars were left out of it."""
 
 _MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "criterion"}
-_MODEL_OPTIONS |= {"all_subsets", "search", "max_features"}
+_MODEL_OPTIONS |= {"search", "max_features"}
 """Options that define which models are compared: with one of these, none is taken from before."""
 
 _REQUEST_FIELDS = fields(SelectionRequest)
@@ -133,6 +133,11 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
         return _request_of_list(version), cohort
     names = {field.name: _STORED_NAMES.get(field.name, field.name) for field in _REQUEST_FIELDS}
     options: dict[str, Any] = {name: stored[key] for name, key in names.items() if key in stored}
+    if unknown := stored.keys() - {*names.values(), COHORT}:
+        raise QuestionError(
+            f"{version.reference} was selected with {', '.join(sorted(unknown))}, which select no "
+            "longer has. Name a model list: --models estimator"
+        )
     return SelectionRequest(**options), with_all_drives(str(stored.get(COHORT, cohort)))
 
 

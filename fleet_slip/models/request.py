@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -20,11 +20,10 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import Identifier
-from fleet_slip.config import Config, load_config, refuse_renamed
+from fleet_slip.config import Config, load_config
 from fleet_slip.errors import QuestionError, UsageError
 from fleet_slip.grams.cohort import PARTS, Folding, FoldKey, make_folding
-from fleet_slip.regression.choice import DEFAULT_TOLERANCE, Tolerance
-from fleet_slip.regression.inference import ClusterUnit
+from fleet_slip.regression.choice import DEFAULT_TOLERANCE
 from fleet_slip.regression.orders import METHODS
 
 if TYPE_CHECKING:
@@ -44,35 +43,50 @@ COURSE_MODELS = COURSE_FEATURES = "course"
 
 DEFAULT_MAX_FEATURES = 24
 
-_TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?(deg|%)")
-
-
-class SelectionOptions(TypedDict, total=False):
-    """Keyword arguments of `FleetCohort.select`, which explains them."""
-
-    models: str | None
-    model: str | None
-    order: str | None
-    features: str | None
-    label: Label | None
-    group_by: FoldKey | None
-    folds: int | str | None
-    ranking: str | None
-    criterion: str | None
-    tolerance: str | None
-    all_subsets: bool
-    robust: bool
-    cluster: ClusterUnit | None
-    intercept: bool
-    search: str | None
-    max_features: int | None
-    half_life: int | None
-    prior: str | None
+_TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?deg")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionRequest:
-    """Options of a selection with their defaults."""
+    """Options of `FleetCohort.select`, with their defaults.
+
+    Attributes
+    ----------
+    models
+        A model list of `configs/models`, or a TOML file.
+    model
+        The inputs of one model, separated by commas, instead of a list.
+    order
+        Inputs, separated by commas, whose first 1, 2, ... form nested models. `catalogue` means all
+        inputs; the name of a family means its columns.
+    features
+        Feature set of `configs/features.toml`. Default: the list's, else the logged signals.
+    label
+        `course` learns from changes of the course over ground, without a reference sensor.
+    group_by
+        What defines the folds: `drive`, `vehicle`, `track`, `day`, ... Default: the list's.
+    folds
+        Number of folds, or `each` for one fold per group. Default: the list's.
+    ranking
+        Ranking of the inputs of `order`: `declared`, `forward` or `backward`.
+    criterion
+        Rule for the number of ranked inputs: `cv`, `aic` or `bic`.
+    tolerance
+        Smallest gain that justifies another signal, an angle such as `0.025deg`.
+    robust
+        Down-weight outlier drives, with an error above three times the median.
+    intercept
+        False forces models through the origin.
+    search
+        Search method among the inputs of `order`, or all, repeated in every fold.
+    max_features
+        Maximum number of columns of `search`.
+    half_life
+        Days after which a drive counts half as much.
+    prior
+        A campaign whose simulated drives join the training with an eighth of the weight of all real
+        rows. It is dropped if held-out drives have a clearly larger error with it.
+    """
 
     models: str | None = None
     model: str | None = None
@@ -84,9 +98,7 @@ class SelectionRequest:
     ranking: str | None = None
     criterion: str | None = None
     tolerance: str | None = None
-    all_subsets: bool = False
     robust: bool = False
-    cluster: ClusterUnit | None = None
     intercept: bool = True
     search: str | None = None
     max_features: int | None = None
@@ -95,54 +107,39 @@ class SelectionRequest:
 
     @property
     def is_ordered(self) -> bool:
-        """True if inputs are ranked, or all subsets searched, instead of comparing a list."""
-        return bool(self.ranking or self.criterion or self.all_subsets)
-
-    @property
-    def has_inputs(self) -> bool:
-        """True if the options themselves define the models, so that no list is needed."""
-        return bool(self.model or self.order or self.is_ordered or self.search)
+        """True if inputs are ranked, instead of comparing a list."""
+        return bool(self.ranking or self.criterion or (self.order and not self.search))
 
     def check(self) -> None:
         """Raise `UsageError` for options that exclude each other."""
         parse_tolerance(self.tolerance)
-        ranks_order = self.is_ordered or bool(self.order and not self.search)
         conflicts = (
             (
-                self.is_ordered and self.models,
-                "a list of models is compared by cross-validation: leave out models, or ranking, "
-                "criterion and all_subsets, which search among the inputs of order.",
+                self.models and self.is_ordered,
+                "models are compared by cross-validation: leave out models, or order, ranking and "
+                "criterion, which choose from an order of inputs.",
             ),
             (
-                self.model and (self.models or self.order or self.is_ordered or self.search),
-                "model names the inputs: leave out models, order, ranking, criterion, all_subsets "
-                "and search, or leave out model.",
+                self.model and (self.models or self.is_ordered or self.search),
+                "model names the inputs: leave out model, or models, order, ranking, criterion and "
+                "search.",
             ),
             (
-                self.ranking and self.all_subsets,
-                "a search of all subsets needs no ranking: leave out ranking.",
+                self.search and (self.ranking or self.criterion),
+                "a search is judged by folds alone: leave out ranking and criterion, or search.",
             ),
             (
                 self.max_features and not self.search,
                 "max_features limits a search: add search, or leave it out.",
             ),
             (
-                self.cluster and not (self.is_ordered or self.order),
-                "cluster applies to order, ranking, criterion and all_subsets: leave it out.",
-            ),
-            (
-                self.prior and (self.label or ranks_order),
+                self.prior and (self.label or self.is_ordered),
                 "a prior works with a model list, one model or a search: leave out label, ranking, "
-                "criterion, all_subsets, and order without search.",
+                "criterion, and order without search.",
             ),
             (
                 self.half_life is not None and self.half_life < 1,
                 "half_life: give a whole number of days, at least 1.",
-            ),
-            (
-                self.search and self.is_ordered,
-                "a search is repeated in every fold and judged by folds alone: leave out ranking, "
-                "criterion and all_subsets.",
             ),
         )
         for applies, message in conflicts:
@@ -150,22 +147,14 @@ class SelectionRequest:
                 raise UsageError(message)
 
 
-def parse_tolerance(text: str | None) -> Tolerance:
-    """Return a tolerance from text such as `0.025deg` or `2%`. Raises `UsageError`."""
+def parse_tolerance(text: str | None) -> float:
+    """Return a tolerance in rad from text such as `0.025deg`. Raises `UsageError`."""
     if text is None:
         return DEFAULT_TOLERANCE
     match = _TOLERANCE.fullmatch(text.strip())
     if match is None:
-        raise UsageError(
-            f"tolerance = {text}: write an angle such as 0.025deg, or a share of the best RMSE "
-            "such as 2%."
-        )
-    amount = float(match[1])
-    return (
-        Tolerance(amount / 100, relative=True)
-        if match[2] == "%"
-        else Tolerance(math.radians(amount))
-    )
+        raise UsageError(f"tolerance = {text}: write an angle such as 0.025deg.")
+    return math.radians(float(match[1]))
 
 
 # Model lists: the candidates that a selection compares, read from `configs/models/*.toml`.
@@ -211,14 +200,6 @@ class CandidateModel(Config):
         return self
 
 
-RENAMED_KEYS = {
-    "most": "max_features",
-    "fewest_drives": "min_drives",
-    "columns_per_drive": "max_features_per_drive",
-}
-"""Keys of `Search`. Checksums and documents of versions keep the old names."""
-
-
 class Search(Config):
     """A search among many inputs for at most `max_features` columns.
 
@@ -226,6 +207,7 @@ class Search(Config):
     fewest columns with a negligibly larger error (`fleet_slip.regression.choice`); `standard error`
     the fewest with an error that is larger by at most one standard error over folds. A search needs
     `min_drives`, and takes at most `max_features_per_drive` unless folds are parts of drives.
+    Aliases are the names in checksums and documents of versions.
     """
 
     name: str | None = Field(default=None, min_length=1, max_length=40)
@@ -242,20 +224,13 @@ class Search(Config):
         default=None, ge=1, serialization_alias="columns_per_drive"
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_renamed(cls, content: Any) -> Any:
-        if isinstance(content, dict) and content.get("rule") == "worth":
-            raise ValueError('rule = "worth" is now called "tolerance": rename it')
-        return refuse_renamed(content, RENAMED_KEYS)
-
     @property
     def title(self) -> str:
         """The name, or else the method."""
         return self.name or self.method
 
     def as_dict(self, **options: Any) -> dict[str, Any]:
-        """Return the content under the names of documents; see `RENAMED_KEYS`."""
+        """Return the content under the names of documents."""
         content = self.model_dump(mode="json", by_alias=True, **options)
         return content | ({"rule": "worth"} if content.get("rule") == "tolerance" else {})
 
@@ -363,14 +338,6 @@ def _toml_lines(table: Mapping[str, Any]) -> list[str]:
 def load_model_list(catalog: Catalog, name_or_path: str) -> ModelList:
     """Return a model list of the catalog's configs, or of a TOML file. Raises `ConfigError`."""
     return load_config(catalog.configs.find("models", name_or_path), ModelList, catalog)
-
-
-def nested_candidates(order: Sequence[str]) -> tuple[CandidateModel, ...]:
-    """Return the models of an order's first 1..k inputs (paper, section II.B)."""
-    return tuple(
-        CandidateModel(name=f"first {size}", signals=tuple(order[:size]))
-        for size in range(1, len(order) + 1)
-    )
 
 
 WHOLE_SET = "catalogue"
@@ -485,16 +452,10 @@ class SelectionPlan:
         return self.original.models is None and self.request.models == DEFAULT_MODELS
 
     @property
-    def is_nested(self) -> bool:
-        """True if the nested models of an order are compared as given."""
-        return bool(self.request.order) and not (self.request.is_ordered or self.searches)
-
-    @property
     def needs_drives(self) -> bool:
         """True if the Gram rows of single drives are needed, not the sums of folds alone."""
         request = self.request
-        weighted = request.robust or request.half_life
-        return bool(request.is_ordered or weighted or self.is_nested)
+        return bool(request.is_ordered or request.robust or request.half_life)
 
     def with_logged_signals(self, catalog: Catalog) -> "SelectionPlan":
         """Return the same plan with the list of logged signals."""
@@ -504,9 +465,6 @@ class SelectionPlan:
     def compared_list(self, cohort: "Cohort") -> ModelList:
         """Return all that is compared as a model list, which makes the same selection again."""
         model_list = self.model_list
-        candidates = model_list.model if model_list else ()
-        if self.is_nested:
-            candidates += nested_candidates(inputs_of(cohort, self.request.order or WHOLE_SET))
         has_line = model_list is not None and model_list.line is not None
         return ModelList(
             description=model_list.description if model_list else "Models of a selection",
@@ -516,14 +474,14 @@ class SelectionPlan:
             folds=self.folds,
             tolerance=self.tolerance,
             intercept=self.intercept,
-            model=candidates,
+            model=model_list.model if model_list else (),
             search=self.searches,
         )
 
 
 def _default_list(request: SelectionRequest) -> str | None:
     """Return the name of the list that is compared unless the request names one."""
-    if request.has_inputs:
+    if request.model or request.is_ordered or request.search:
         return None
     if request.label:
         return COURSE_MODELS
@@ -575,12 +533,12 @@ def _searches(
     return (Search.model_validate(options),)
 
 
-def checksum_of_list(model_list: ModelList, tolerance: str | None, intercept: bool = True) -> str:
+def checksum_of_list(model_list: ModelList, tolerance: str | None = None) -> str:
     """Return the checksum of a compared list, and of options other than the default."""
     default = {"label": None, "line": None, "tolerance": None, "intercept": True}
     compared = model_list.model_copy(update=default).sha256
     tolerance = tolerance or model_list.tolerance
-    return checksum_with_options(compared, tolerance, intercept and model_list.intercept)
+    return checksum_with_options(compared, tolerance, model_list.intercept)
 
 
 def checksum_with_options(compared: str, tolerance: str | None, intercept: bool) -> str:

@@ -4,17 +4,16 @@ The functions stand in the order in which they run.
 """
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from fleet_slip.arrays import BoolArray
-from fleet_slip.base import Record, canonical_json, document_of, pluralize, sha256_of
-from fleet_slip.calibration.course_label import CourseLabelQuality, assess_course_label
+from fleet_slip.base import canonical_json, pluralize, sha256_of
+from fleet_slip.calibration.course_label import assess_course_label
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.config import load_toml
@@ -28,6 +27,7 @@ from fleet_slip.grams.cohort import (
     DownweightedDrive,
     Folding,
     age_weights,
+    clustered_moments,
     load_cohort,
     robust_weights,
 )
@@ -48,193 +48,33 @@ from fleet_slip.models.request import (
     parse_tolerance,
     require_odd,
 )
-from fleet_slip.models.search import (
-    ALL_SUBSETS,
-    SearchChoice,
-    SearchedModels,
-    choose_by,
-    require_criterion,
-    search_models,
-    select_inputs,
-    try_distances,
+from fleet_slip.models.summary import NestedErrors, SearchedModels, Selection, group_skipped
+from fleet_slip.regression.choice import (
+    Rule,
+    Winner,
+    best_correlated,
+    choose,
+    choose_nested,
+    nested_fits,
 )
-from fleet_slip.models.summary import group_skipped, summarize
-from fleet_slip.regression.choice import NestedDistances, Rule, Tolerance, Winner
 from fleet_slip.regression.folds import (
     CohortFolds,
     CrossValidation,
     ErrorSums,
-    Figures,
+    Procedure,
+    assemble,
     cross_validate,
     error_sums,
+    held_out_errors,
     least_squares,
 )
+from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import DriveMoments
-from fleet_slip.rendering import Answer, Part
+from fleet_slip.regression.least_squares import Fit, LinearModel, fit
+from fleet_slip.regression.orders import stepwise_order
 from fleet_slip.resources import Configs
 from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.warehouse import Warehouse
-
-
-@dataclass(frozen=True)
-class Selection(Answer):
-    """All candidates with their figures, in the order of the list, and the winner.
-
-    Attributes
-    ----------
-    models
-        Figures on the rows that all candidates can use.
-    winner
-        The winner, fitted to all rows that it can use.
-    skipped
-        Candidates that were not compared, with the reason.
-    choice
-        Choice of an order or a subset; None for a list of models.
-    searched
-        The models of each search, which are among `models`.
-    distances
-        Of an order's nested models from the full and the true one, or why unknown.
-    intercept
-        False if models go through the origin.
-    model_list, config_sha256
-        Name of what was compared, such as `table1`, and its checksum.
-    compared
-        What was compared, as a model list.
-    weighted
-        The drives that `robust` down-weights, the most unusual first.
-    full
-        How many times a row of full weight counts.
-    without_label
-        How good the winner is, if changes of the course alone trained it.
-    label_noise_deg
-        Of the label, which every error has in it; None where it is not known.
-    request, asked_condition
-        What was asked for, and of which drives.
-    remark
-        Why another list than the usual one was compared.
-    examined
-        Which drives were left out for faulty sensors, as a sentence.
-    nested
-        Errors with the whole choice repeated without the drives to test; None if not computed.
-    """
-
-    cohort: Cohort
-    folds: Folding
-    models: tuple[CrossValidation, ...]
-    winner: Winner
-    skipped: dict[str, str]
-    choice: SearchChoice | None = None
-    searched: tuple[SearchedModels, ...] = ()
-    distances: NestedDistances | str | None = None
-    intercept: bool = True
-    model_list: str = ""
-    config_sha256: str = ""
-    compared: ModelList | None = None
-    weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
-    full: int = 1
-    without_label: CourseLabelQuality | None = None
-    label_noise_deg: float | None = None
-    request: SelectionRequest = field(default_factory=SelectionRequest)
-    asked_condition: str = TRAINING_DRIVES
-    remark: str = ""
-    examined: str = ""
-    nested: "NestedErrors | None" = None
-
-    def __repr__(self) -> str:
-        winner = self.winner.model
-        return (
-            f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "
-            f"{winner.pooled.rmse_deg:.4f} deg, correlation {winner.correlation:.4f}, of "
-            f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
-            f"{self.cohort.predicate.text}>"
-        )
-
-    def parts(self, everything: bool = False, hint: str = "") -> Iterator[Part]:
-        """Return the winner and why, the best models or all; `hint` is the option for all."""
-        return summarize(self, everything, hint)
-
-    @property
-    def searched_winner(self) -> SearchedModels | None:
-        """The search that found the winner, if one did."""
-        signals = self.winner.model.signals
-        of_search = (s for s in self.searched if signals in [model.signals for model in s.models])
-        return next(of_search, None)
-
-    def as_model_list(self) -> ModelList:
-        """Return a model list whose selection on the same data has the same winner."""
-        if self.choice is None and self.compared is not None:
-            return self.compared
-        winner = self.winner.model
-        return ModelList(
-            description=f"Chosen by select: {self.model_list}",
-            features=self.cohort.feature_set,
-            folds=self.folds,
-            intercept=self.intercept,
-            model=(CandidateModel(name=winner.name, signals=winner.signals),),
-        )
-
-    @property
-    def rows_without(self) -> int:
-        """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
-        return max(self.cohort.rows - self.trained_rows, 0)
-
-    @property
-    def trained_rows(self) -> int:
-        """Rows that the winner was trained on; of drives that count less, so much of them."""
-        return self.winner.model.pooled.rows // self.full
-
-    @property
-    def beyond_label_noise_deg(self) -> float | None:
-        """The winner's RMSE without the label's noise."""
-        if self.label_noise_deg is None:
-            return None
-        rmse_deg = self.winner.model.pooled.rmse_deg
-        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what `select --json` prints."""
-        document: dict[str, Any] = {
-            "models": [
-                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
-                for model in self.models
-            ],
-            "winner": self.winner.model.name,
-            "reason": self.winner.reason,
-            "cohort": self.cohort.predicate.text,
-            "feature_set": self.cohort.catalog.identity(self.cohort.feature_set),
-            "drives": self.cohort.drive_count,
-            "rows": self.cohort.rows,
-            "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.count_onboard_with(),
-            "drives_left_out": self.cohort.left_out,
-            "intercept": self.intercept,
-            "folds": {
-                "by": self.folds.by,
-                "count": len(self.models[0].folds),
-            },
-            "skipped": self.skipped,
-            "drives_weighed": document_of(self.weighted),
-            "label_noise_deg": self.label_noise_deg,
-        }
-        for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
-            model["shortfall"] = shortfall.as_dict()
-        nested = {"left_out": self.distances} if isinstance(self.distances, str) else self.distances
-        optional = {
-            "choice": self.choice,
-            "search": self.searched_winner or next(iter(self.searched), None),
-            "nested": nested,
-            "without_label": self.without_label,
-            "remark": self.remark,
-            "examined": self.examined,
-            "nested_cross_validation": self.nested,
-        }
-        if self.cohort.prior:
-            optional["prior"] = {
-                "campaign": str(self.request.prior),
-                "weight": str(self.cohort.weight),
-            }
-        document |= {name: document_of(value) for name, value in optional.items() if value}
-        return document
 
 
 def run_selection(
@@ -250,7 +90,7 @@ def run_plan(
     """Select on the drives of a predicate. Raises as `load_cohort` and `select`.
 
     Compares the list of logged signals if the default list has no Gram rows. With `nested` a choice
-    on labels of measured drives is repeated without the drives to test.
+    on labels of measured drives is repeated without the drives to test, as it is for an order.
     """
     remark = ""
     try:
@@ -266,14 +106,14 @@ def run_plan(
     read = selection.cohort
     quality = assess_course_label(warehouse, read.feature_set, read.predicate, rmse_deg)
     noise_deg = None if quality else label_noise_deg(warehouse, read)
-    is_measured = quality is None and noise_deg is None
+    has_nested = plan.request.is_ordered or (nested and quality is None and noise_deg is None)
     return replace(
         selection,
         without_label=quality,
         label_noise_deg=noise_deg,
         remark=remark,
         asked_condition=predicate,
-        nested=cross_validate_choice(cohort, plan) if nested and is_measured else None,
+        nested=cross_validate_choice(cohort, plan) if has_nested else None,
     )
 
 
@@ -326,16 +166,6 @@ MAX_NESTED_DRIVES = 500
 """Maximum number of drives for which a choice is repeated; beyond it, the optimism is small."""
 
 
-@dataclass(frozen=True)
-class NestedErrors(Record):
-    """Held-out errors of a choice that is repeated without each group of drives."""
-
-    DOCUMENT = "groups correlation=figures.correlation rmse_deg=figures.rmse_deg"
-
-    groups: int
-    figures: Figures
-
-
 def deal_trips(trips: Sequence[str]) -> list[int]:
     """Return the group of each trip, to be held out together."""
     order = list(dict.fromkeys(trips))
@@ -365,8 +195,8 @@ def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors |
             return None
         cohort = load_cohort(cohort.source, cohort.predicate, cohort.feature_set)
     groups = np.array(deal_trips(cohort.drives["trip"].to_pylist()))
-    compared = len(plan.compared_list(cohort).model)
-    has_choice = plan.searches or plan.request.is_ordered or compared > 1
+    listed = plan.model_list.model if plan.model_list else ()
+    has_choice = plan.searches or plan.request.is_ordered or len(listed) > 1
     if len(np.unique(groups)) < MIN_DRIVES or not has_choice:
         return None
     errors: list[ErrorSums] = []
@@ -409,10 +239,6 @@ def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
         selection = _select_order(cohort, plan)
     else:
         selection = _select_listed(cohort, plan)
-    if plan.is_nested:
-        inputs = inputs_of(cohort, plan.request.order or WHOLE_SET)
-        distances = try_distances(cohort, inputs, plan.folds, plan.request)
-        selection = replace(selection, distances=distances)
     return replace(selection, weighted=weighted, full=full, request=plan.original)
 
 
@@ -447,76 +273,70 @@ def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, Downwe
 def _select_listed(cohort: Cohort, plan: SelectionPlan) -> Selection:
     """Compare the candidates and searches of a plan."""
     compared = plan.compared_list(cohort)
-    tolerance = None if plan.tolerance is None else parse_tolerance(plan.tolerance)
-    selection = select(
-        cohort,
-        compared.model,
-        plan.folds,
-        tolerance,
-        compared.search,
-        cohort.inputs if compared.search else (),
-        intercept=plan.intercept,
-    )
-    order = f"order:{plan.request.order}" if plan.is_nested else None
-    name = plan.request.models or (GIVEN if plan.request.model else None)
-    title = "+".join(filter(None, [name, order]))
+    title = plan.request.models or (GIVEN if plan.request.model else None)
     if not title:
         (search,) = compared.search
         title = f"search:{search.method} {search.max_features}"
-    checksum = checksum_of_list(compared, plan.tolerance, plan.intercept)
-    return replace(selection, model_list=title, config_sha256=checksum, compared=compared)
+    selection = select(cohort, compared)
+    return replace(selection, model_list=title, config_sha256=checksum_of_list(compared))
 
 
 MAX_LOST_SHARE = Fraction(1, 10)
 """Maximum share of the drives that a candidate may remove from the comparison of all others."""
 
 
-def select(
-    cohort: Cohort,
-    candidates: Sequence[CandidateModel],
-    folding: Folding,
-    tolerance: Tolerance | None = None,
-    searches: Sequence[Search] = (),
-    inputs: Sequence[str] = (),
-    *,
-    intercept: bool = True,
-) -> Selection:
+def select(cohort: Cohort, compared: ModelList) -> Selection:
     """Cross-validate candidates and searches on the rows that all can use, and choose a winner.
 
-    `tolerance` overrides the rule of the first search. Skips, with the reason, candidates with
-    absent or dependent signals, candidates that too few drives have, and searches that need more
-    drives. Raises `DataError` if none is left, or no drive has the label.
+    Skips, with the reason, candidates with absent or dependent signals, candidates that too few
+    drives have, and searches that need more drives. Raises `DataError` if none is left, or no drive
+    has the label.
     """
-    folds = _labelled_folds(cohort, folding)
+    catalog, intercept = cohort.catalog, compared.intercept
+    folds = _labelled_folds(cohort, compared.folds)
     skipped: dict[str, str] = {}
-    candidates = [c for c in candidates if _is_allowed(c, cohort, skipped)]
-    searches_run = [s for s in searches if _has_drives(s, cohort, skipped)]
-    columns = [name for name in inputs if any(search.among([name]) for search in searches_run)]
-    rows = find_complete_cases(folds, cohort.catalog.signals.label, candidates, columns, skipped)
-    models = _cross_validate_candidates(rows, cohort.catalog, skipped, intercept=intercept)
-    searched: list[SearchedModels] = []
-    for search in searches_run:
-        bounded = _bounded(search, cohort, folding)
-        if models_of := _cross_validate_search(
-            rows, columns, bounded, cohort.catalog, skipped, intercept=intercept
-        ):
-            searched.append(models_of)
-            models += models_of.models
+    candidates = [c for c in compared.model if _is_allowed(c, cohort, skipped)]
+    searches = [s for s in compared.search if _has_drives(s, cohort, skipped)]
+    columns = [name for name in cohort.inputs if any(search.among([name]) for search in searches)]
+    rows = find_complete_cases(folds, catalog.signals.label, candidates, columns, skipped)
+    models = []
+    for candidate in rows.candidates:
+        name, signals = candidate.name, candidate.signals
+        try:
+            models.append(_cross_validate(name, signals, rows.folds, catalog, intercept))
+        except DataError as error:
+            skipped[name] = str(error)
+    searched = []
+    for search in searches:
+        among = search.among(rows.columns)
+        if rare := [name for name in search.among(columns) if name not in among]:
+            skipped[f"{search.title} (columns)"] = (
+                "not comparable: more than a tenth of the drives lack "
+                f"{', '.join(rare[:MAX_LISTED_INPUTS])}"
+            )
+        if not among:
+            continue
+        bounded = _bounded(search, cohort, compared.folds)
+        try:
+            searched.append(search_models(rows.folds, among, catalog, bounded, intercept))
+        except DataError as error:  # no drive, or not one in each fold, has all inputs
+            skipped[f"{search.title} (search)"] = str(error)
+    models += [model for search_result in searched for model in search_result.models]
     if not models:
-        groups = [(names, reason.rstrip(".")) for names, reason in group_skipped(skipped)]
-        reasons = [reason if len(groups) == 1 else f"{names}: {reason}" for names, reason in groups]
+        reasons = [f"{names}: {reason.rstrip('.')}" for names, reason in group_skipped(skipped)]
         raise DataError(f"no candidate model can be fitted: {'; '.join(reasons)}.")
-    winner = choose_by(searches[0] if searches else None, models, tolerance)
+    winner = choose_by(compared, models)
     if winner.model.name in {candidate.name for candidate in rows.candidates}:
-        winner = _refit(winner, folds, rows, cohort.catalog, intercept=intercept)
+        winner = _refit(winner, folds, rows, catalog, intercept=intercept)
     return Selection(
         cohort,
-        folding,
+        compared.folds,
         tuple(models),
         winner,
         skipped,
         searched=tuple(searched),
         intercept=intercept,
+        compared=compared,
     )
 
 
@@ -628,21 +448,6 @@ def _missing_signals(folds: CohortFolds, label: str, signals: Collection[str]) -
     return None
 
 
-def _cross_validate_candidates(
-    rows: ComparedRows, catalog: Catalog, skipped: dict[str, str], *, intercept: bool
-) -> list[CrossValidation]:
-    """Cross-validate the candidates; note those with dependent signals."""
-    models = []
-    for candidate in rows.candidates:
-        try:
-            models.append(
-                _cross_validate(candidate.name, candidate.signals, rows.folds, catalog, intercept)
-            )
-        except DataError as error:
-            skipped[candidate.name] = str(error)
-    return models
-
-
 def _cross_validate(
     name: str, signals: Sequence[str], folds: CohortFolds, catalog: Catalog, intercept: bool
 ) -> CrossValidation:
@@ -661,31 +466,65 @@ def _bounded(search: Search, cohort: Cohort, folding: Folding) -> Search:
     return search.model_copy(update={"max_features": min(search.max_features, limit)})
 
 
-def _cross_validate_search(
-    rows: ComparedRows,
-    columns: Sequence[str],
-    search: Search,
-    catalog: Catalog,
-    skipped: dict[str, str],
-    *,
-    intercept: bool,
-) -> SearchedModels | None:
-    """Search among the comparable columns; note the others, and why a search has no model."""
-    among = search.among(rows.columns)
-    if rare := [name for name in search.among(columns) if name not in among]:
-        names, more = ", ".join(rare[:MAX_LISTED_INPUTS]), len(rare) - MAX_LISTED_INPUTS
-        skipped[f"{search.title} (columns)"] = (
-            f"not comparable: more than a tenth of the drives lack {names}"
-            + (f" and {more} more" if more > 0 else "")
-        )
-    if not among:
-        return None
-    label, scales = catalog.signals.label, catalog.input_scales
-    try:
-        return search_models(rows.folds, among, label, scales, search, intercept=intercept)
-    except DataError as error:  # no drive, or not one in each fold, has all inputs
-        skipped[f"{search.title} (search)"] = str(error)
-        return None
+def search_models(
+    cohort: CohortFolds, inputs: Sequence[str], catalog: Catalog, search: Search, intercept: bool
+) -> SearchedModels:
+    """Search among the inputs on the rows that have them all. Raises `DataError`.
+
+    Folds without such a row are left out: a car that stands or creeps has no curvature.
+    """
+    label = catalog.signals.label
+    folds = cohort.complete_cases(inputs, label, sparse=True)
+
+    def fits(gram: Gram) -> list[Fit]:
+        moments = gram if intercept else gram.about_origin()
+        sets = stepwise_order(moments, inputs, label, search.method, search.max_features)
+        is_nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
+        if sets and is_nested:
+            return nested_fits(moments, sets[-1], label)[1:]
+        return [fit(moments, signals, label) for signals in sets]
+
+    chosen = fits(folds.total)
+    tests: list[list[ErrorSums]] = [[] for _ in chosen]
+    for training, fold in folds.splits():
+        for sums, fitted in zip(tests, fits(training), strict=False):
+            sums.append(held_out_errors(fitted.model, training, fold))
+    models = tuple(
+        assemble(f"{search.title} {fitted.size}", folds, sums, fitted.model, catalog.input_scales)
+        for sums, fitted in zip(tests, chosen, strict=True)
+        if len(sums) == len(folds.grams)
+    )
+    if not models:
+        raise DataError("every input is constant or depends on others: there is nothing to choose.")
+    return SearchedModels(search, tuple(inputs), models)
+
+
+def search_procedure(
+    label: str, searched: SearchedModels, size: int, *, intercept: bool
+) -> Procedure:
+    """Return a procedure that repeats a search for at most `size` columns."""
+
+    def procedure(gram: Gram) -> LinearModel:
+        moments = gram if intercept else gram.about_origin()
+        sets = stepwise_order(moments, searched.inputs, label, searched.search.method, size)
+        return fit(moments, sets[-1] if sets else (), label).model
+
+    return procedure
+
+
+def choose_by(compared: ModelList, models: Sequence[CrossValidation]) -> Winner:
+    """Return the winner by the tolerance of a list, else by the rule of its first search."""
+    rule = compared.search[0].rule if compared.search and not compared.tolerance else "tolerance"
+    if rule == "tolerance":
+        return choose(models, parse_tolerance(compared.tolerance))
+    if rule == "standard error":
+        return choose(models, 0.0)
+    best = best_correlated(models)
+    reason = (
+        f"Model {best.name} has the best cross-validated correlation, {best.correlation:.6f}, "
+        f"which is the rule of its list; every fold repeated the search."
+    )
+    return Winner(best, best, reason)
 
 
 def _refit(
@@ -742,14 +581,18 @@ def _select_with_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Se
 
 
 def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
-    """Rank the inputs of an order, or search all their subsets, and choose a size."""
-    request = plan.request
+    """Rank the inputs of an order, and choose one of the nested models."""
+    request, catalog = plan.request, cohort.catalog
     order = request.order or WHOLE_SET
-    inputs = inputs_of(cohort, order)
-    ranking = ALL_SUBSETS if request.all_subsets else request.ranking or "declared"
-    criterion = require_criterion(request.criterion or "cv")
-    rule = Rule(ranking, criterion, parse_tolerance(plan.tolerance))
-    result = select_inputs(cohort, inputs, plan.folds, rule, request)
+    inputs, label = inputs_of(cohort, order), catalog.signals.label
+    rule = Rule(
+        request.ranking or "declared", request.criterion or "cv", parse_tolerance(plan.tolerance)
+    )
+    folds = cohort.folds(plan.folds.by, plan.folds.count).complete_cases(inputs, label, sparse=True)
+    drives = clustered_moments(cohort.complete_cases(inputs), intercept=plan.intercept)
+    choice = choose_nested(
+        folds, drives, inputs, label, catalog.input_scales, rule, intercept=plan.intercept
+    )
     described = ModelList(
         description="Inputs to choose from",
         features=cohort.feature_set,
@@ -757,15 +600,15 @@ def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
         model=(CandidateModel(name="inputs", signals=inputs),),
     )
     content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
-    content |= {"evidence": result.choice.evidence.kind}
+    content |= {"evidence": choice.evidence.kind}
     compared = sha256_of(canonical_json(content))
     return Selection(
         cohort,
         plan.folds,
-        result.models,
-        result.winner,
+        choice.models,
+        choice.winner,
         {},
-        choice=result.choice,
+        choice=choice,
         intercept=plan.intercept,
         model_list=f"order:{order} {rule.ranking} {rule.criterion}",
         config_sha256=checksum_with_options(compared, plan.tolerance, plan.intercept),

@@ -1,22 +1,208 @@
-"""Text of a selection: the winner and the reason, the best models, the excluded drives."""
+"""The result of a selection, as a document and as text."""
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import Any
 
-from fleet_slip.base import pluralize
+from fleet_slip.base import Record, document_of, pluralize
+from fleet_slip.calibration.course_label import CourseLabelQuality
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.grams.cohort import BANDS, PARTS, remark_left_out
-from fleet_slip.regression.choice import CROSS_VALIDATION, NestedDistances
-from fleet_slip.regression.inference import Evidence
-from fleet_slip.rendering import Part, Remark, TextTable
+from fleet_slip.catalog.signals import TRAINING_DRIVES
+from fleet_slip.grams.cohort import (
+    BANDS,
+    PARTS,
+    Cohort,
+    DownweightedDrive,
+    Folding,
+    remark_left_out,
+)
+from fleet_slip.models.request import CandidateModel, ModelList, Search, SelectionRequest
+from fleet_slip.regression.choice import NestedChoice, Winner
+from fleet_slip.regression.folds import CrossValidation, Figures
+from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import describe_cohort
 
-if TYPE_CHECKING:
-    from fleet_slip.calibration.course_label import CourseLabelQuality
-    from fleet_slip.grams.cohort import DownweightedDrive
-    from fleet_slip.models.search import SearchChoice
-    from fleet_slip.models.select import Selection
+
+@dataclass(frozen=True)
+class SearchedModels:
+    """Models of a search, of sizes 1, 2, ...; each training fold repeated the search."""
+
+    search: Search
+    inputs: tuple[str, ...]
+    models: tuple[CrossValidation, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of a JSON document."""
+        main = self.search.as_dict(include={"method", "max_features", "rule"})
+        options = self.search.as_dict(exclude_defaults=True, exclude={"inputs"})
+        return {**main, **options, "inputs": len(self.inputs), "sizes": len(self.models)}
+
+
+@dataclass(frozen=True)
+class NestedErrors(Record):
+    """Held-out errors of a choice that is repeated without each group of drives."""
+
+    DOCUMENT = "groups correlation=figures.correlation rmse_deg=figures.rmse_deg"
+
+    groups: int
+    figures: Figures
+
+
+@dataclass(frozen=True)
+class Selection(Answer):
+    """All candidates with their figures, in the order of the list, and the winner.
+
+    Attributes
+    ----------
+    models
+        Figures on the rows that all candidates can use.
+    winner
+        The winner, fitted to all rows that it can use.
+    skipped
+        Candidates that were not compared, with the reason.
+    choice
+        Choice from an order; None for a list of models.
+    searched
+        The models of each search, which are among `models`.
+    intercept
+        False if models go through the origin.
+    model_list, config_sha256
+        Name of what was compared, such as `table1`, and its checksum.
+    compared
+        What was compared, as a model list.
+    weighted
+        The drives that `robust` down-weights, the most unusual first.
+    full
+        How many times a row of full weight counts.
+    without_label
+        How good the winner is, if changes of the course alone trained it.
+    label_noise_deg
+        Of the label, which every error has in it; None where it is not known.
+    request, asked_condition
+        What was asked for, and of which drives.
+    remark
+        Why another list than the usual one was compared.
+    examined
+        Which drives were left out for faulty sensors, as a sentence.
+    nested
+        Errors with the whole choice repeated without the drives to test; None if not computed.
+    """
+
+    cohort: Cohort
+    folds: Folding
+    models: tuple[CrossValidation, ...]
+    winner: Winner
+    skipped: dict[str, str]
+    choice: NestedChoice | None = None
+    searched: tuple[SearchedModels, ...] = ()
+    intercept: bool = True
+    model_list: str = ""
+    config_sha256: str = ""
+    compared: ModelList | None = None
+    weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
+    full: int = 1
+    without_label: CourseLabelQuality | None = None
+    label_noise_deg: float | None = None
+    request: SelectionRequest = field(default_factory=SelectionRequest)
+    asked_condition: str = TRAINING_DRIVES
+    remark: str = ""
+    examined: str = ""
+    nested: NestedErrors | None = None
+
+    def __repr__(self) -> str:
+        winner = self.winner.model
+        return (
+            f"<{type(self).__name__}: {winner.name}, {len(winner.signals)} signals, RMSE "
+            f"{winner.pooled.rmse_deg:.4f} deg, correlation {winner.correlation:.4f}, of "
+            f"{len(self.models)} models; {self.cohort.drive_count:,} drives where "
+            f"{self.cohort.predicate.text}>"
+        )
+
+    def parts(self, everything: bool = False, hint: str = "") -> Iterator[Part]:
+        """Return the winner and why, the best models or all; `hint` is the option for all."""
+        return summarize(self, everything, hint)
+
+    @property
+    def searched_winner(self) -> SearchedModels | None:
+        """The search that found the winner, if one did."""
+        signals = self.winner.model.signals
+        of_search = (s for s in self.searched if signals in [model.signals for model in s.models])
+        return next(of_search, None)
+
+    def as_model_list(self) -> ModelList:
+        """Return a model list whose selection on the same data has the same winner."""
+        if self.choice is None and self.compared is not None:
+            return self.compared
+        winner = self.winner.model
+        return ModelList(
+            description=f"Chosen by select: {self.model_list}",
+            features=self.cohort.feature_set,
+            folds=self.folds,
+            intercept=self.intercept,
+            model=(CandidateModel(name=winner.name, signals=winner.signals),),
+        )
+
+    @property
+    def rows_without(self) -> int:
+        """Rows of the cohort that tell nothing of the winner: the label or a column is missing."""
+        return max(self.cohort.rows - self.trained_rows, 0)
+
+    @property
+    def trained_rows(self) -> int:
+        """Rows that the winner was trained on; of drives that count less, so much of them."""
+        return self.winner.model.pooled.rows // self.full
+
+    @property
+    def beyond_label_noise_deg(self) -> float | None:
+        """The winner's RMSE without the label's noise."""
+        if self.label_noise_deg is None:
+            return None
+        rmse_deg = self.winner.model.pooled.rmse_deg
+        return math.sqrt(max(rmse_deg**2 - self.label_noise_deg**2, 0.0))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what `select --json` prints."""
+        document: dict[str, Any] = {
+            "models": [
+                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
+                for model in self.models
+            ],
+            "winner": self.winner.model.name,
+            "reason": self.winner.reason,
+            "cohort": self.cohort.predicate.text,
+            "feature_set": self.cohort.catalog.identity(self.cohort.feature_set),
+            "drives": self.cohort.drive_count,
+            "rows": self.cohort.rows,
+            "rows_without": self.rows_without,
+            "drives_without_log": self.cohort.count_onboard_with(),
+            "drives_left_out": self.cohort.left_out,
+            "intercept": self.intercept,
+            "folds": {
+                "by": self.folds.by,
+                "count": len(self.models[0].folds),
+            },
+            "skipped": self.skipped,
+            "drives_weighed": document_of(self.weighted),
+            "label_noise_deg": self.label_noise_deg,
+        }
+        for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
+            model["shortfall"] = shortfall.as_dict()
+        optional = {
+            "choice": self.choice,
+            "search": self.searched_winner or next(iter(self.searched), None),
+            "without_label": self.without_label,
+            "remark": self.remark,
+            "examined": self.examined,
+            "nested_cross_validation": self.nested,
+        }
+        document |= {name: document_of(value) for name, value in optional.items() if value}
+        if self.cohort.prior:
+            weight = str(self.cohort.weight)
+            document["prior"] = {"campaign": str(self.request.prior), "weight": weight}
+        return document
+
 
 MIN_REPORTED_SHARE = 0.01
 """Minimum share of rows without the label or a signal that is reported."""
@@ -31,7 +217,7 @@ def remark_skipped_rows(rows: int, total: int) -> Iterator[Remark]:
         )
 
 
-def outlier_remarks(drives: Mapping[str, "DownweightedDrive"]) -> Iterator[Remark]:
+def outlier_remarks(drives: Mapping[str, DownweightedDrive]) -> Iterator[Remark]:
     """Yield the drives that `robust` down-weights, with the reason."""
     for name, drive in drives.items():
         yield Remark(f"{name}: {drive.reason}.")
@@ -40,14 +226,12 @@ def outlier_remarks(drives: Mapping[str, "DownweightedDrive"]) -> Iterator[Remar
 MANY_SIGNALS = 30
 """A table names families if a model has more signals than this."""
 
-DISTANCES = "contribution A|D to full|expected D"
-
 BEST = 10
 """Number of models in a table without --all."""
 CONDITION_WIDTH = 120
 
 
-def summarize(selection: "Selection", everything: bool = False, hint: str = "") -> Iterator[Part]:
+def summarize(selection: Selection, everything: bool = False, hint: str = "") -> Iterator[Part]:
     """Return the winner and why, the best models or all, and how sure that is.
 
     `hint` is the option that prints all models.
@@ -63,8 +247,6 @@ def summarize(selection: "Selection", everything: bool = False, hint: str = "") 
         yield f"{count}, found by {search.method} search {search.title!r}: {columns}"
     if selection.choice is not None:
         yield from _choice(selection.choice)
-    if isinstance(selection.distances, NestedDistances):
-        yield from _distances(selection.distances)
     yield _models(selection, everything, hint)
     yield from _left_out(selection)
     if selection.folds.by in (PARTS, BANDS):
@@ -76,8 +258,6 @@ def summarize(selection: "Selection", everything: bool = False, hint: str = "") 
             "{0}|{1.rows:,}|{1.correlation:.4f}|{1.rmse_deg:.4f}|{1.error_mean_deg:+.4f}|"
             "{1.error_std_deg:.4f}",
         )
-    if isinstance(selection.distances, str):
-        yield Remark(f"distances of the nested models unknown: {selection.distances}")
     for names, reason in group_skipped(selection.skipped):
         first, *relations = reason.split("; ")
         more = pluralize(len(relations), "relation")
@@ -89,11 +269,6 @@ def summarize(selection: "Selection", everything: bool = False, hint: str = "") 
             f"RMSE of {winner.model.name}: {chosen_deg:.4f} deg in the folds that chose it; "
             f"{nested.figures.rmse_deg:.4f} deg on held-out drives with the choice repeated "
             f"without them, in {nested.groups} groups: expect this one."
-        )
-    if selection.choice is not None and (honest := selection.choice.honest) is not None:
-        yield (
-            "with the whole selection repeated inside every fold: correlation "
-            f"{honest.correlation:.4f}, RMSE {honest.pooled.rmse_deg:.4f} deg."
         )
 
 
@@ -132,7 +307,7 @@ def _shortened(predicate: str, everything: bool, hint: str) -> str:
     return f"{beginning} …{hint and f' ({hint})'}" if len(text) > CONDITION_WIDTH else text
 
 
-def _models(selection: "Selection", everything: bool, hint: str) -> TextTable:
+def _models(selection: Selection, everything: bool, hint: str) -> TextTable:
     """Return a table of the models, or of the best listed ones and the winner.
 
     It omits signals if a table above has them. For models of a search it has the number of columns:
@@ -174,7 +349,7 @@ def _models(selection: "Selection", everything: bool, hint: str) -> TextTable:
     return TextTable(title, header, rows, row, text_columns=1 + has_signals)
 
 
-def _label_noise(selection: "Selection") -> Remark:
+def _label_noise(selection: Selection) -> Remark:
     """Return the share of the label's noise in the errors."""
     noise = selection.label_noise_deg
     if noise is None:
@@ -185,7 +360,7 @@ def _label_noise(selection: "Selection") -> Remark:
     )
 
 
-def _without_label(quality: "CourseLabelQuality") -> Iterator[Remark]:
+def _without_label(quality: CourseLabelQuality) -> Iterator[Remark]:
     """Yield the quality of a label from course changes, and its limits."""
     over = ", ".join(f"{seconds:g}" for seconds in quality.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
@@ -206,7 +381,7 @@ def _without_label(quality: "CourseLabelQuality") -> Iterator[Remark]:
     )
 
 
-def _left_out(selection: "Selection") -> Iterator[Remark]:
+def _left_out(selection: Selection) -> Iterator[Remark]:
     """Yield which drives of the cohort the models were not made of, and what the label is worth."""
     yield from remark_skipped_rows(selection.rows_without, selection.cohort.rows)
     if without_log := selection.cohort.count_onboard_with():
@@ -231,65 +406,30 @@ def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
     return f"{len(signals)}: " + " ".join(names)
 
 
-def _evidence_text(evidence: Evidence) -> str:
-    """Return the unit and the effective number of rows of evidence."""
-    return f"with {evidence.kind} as independent observations: {evidence.rows:,.0f} effective rows"
-
-
-def _distances(distances: NestedDistances) -> Iterator[Part]:
-    """Yield the distances of nested models."""
-    yield TextTable(
-        "distance D of equation (2) by the number of signals; "
-        f"{_evidence_text(distances.evidence)}",
-        f"|added|{DISTANCES}",
-        _distance_rows(distances.order, distances.evidence),
-        text_columns=2,
-    )
-    yield f"without any signal: RMSE {distances.null.pooled.rmse_deg:.4f} deg.\n"
-
-
-def _choice(choice: "SearchChoice") -> Iterator[Part]:
-    """Yield the tables of an order, or of best subsets."""
-    evidence = _evidence_text(choice.evidence)
-    if (nested := choice.nested) is not None:
-        by_folds = choice.rule.criterion == CROSS_VALIDATION
-        criterion = "minus correlation" if by_folds else choice.rule.criterion
-        rows = zip(_distance_rows(nested.order, nested.evidence), nested.values, strict=True)
-        yield TextTable(
-            f"order by {choice.rule.ranking}; {evidence}",
-            f"|added|{DISTANCES}|{criterion}",
-            (
-                [*line, f"{value:,.4f}{' <' if j == nested.size else '  '}"]
-                for j, (line, value) in enumerate(rows)
-            ),
-            text_columns=2,
-        )
-    if choice.subsets is not None and (picks := choice.picks) is not None:
-        rows_of_sizes = (
-            {
-                "best": subset.best,
-                "picked_by": [name for name, size in picks.items() if size == subset.best.size],
-                "gap": subset.gap,
-            }
-            for subset in choice.subsets
-        )
-        yield TextTable(
-            f"best subset of every size; {evidence}",
-            "size|signals|picked by|R squared|gap to second",
-            rows_of_sizes,
-            "{best.size}|{best.model.signals}|{picked_by}|{best.r_squared:.6f}|{gap:.2g}",
-            text_columns=3,
-        )
-
-
-def _distance_rows(order: Sequence[str], evidence: Evidence) -> Iterator[list[str]]:
-    """Return a line for each of the k+1 models of an order, the empty one first.
+def _choice(choice: NestedChoice) -> Iterator[Part]:
+    """Yield the table of the k+1 models of an order, the empty one first.
 
     The distance D is that of the paper's equation (2), in units of the noise: from the full model,
     and as it is to be expected from the true one.
     """
-    columns = zip(evidence.excess(), evidence.distances(), strict=True)
-    for j, (to_full, expected) in enumerate(columns):
-        added = order[j - 1] if j else "(none)"
-        contribution = f"{evidence.contributions[j - 1]:,.1f}" if j else ""
-        yield [str(j), added, contribution, f"{to_full:,.1f}", f"{expected:,.1f}"]
+    evidence, criterion = choice.evidence, choice.rule.criterion
+    size = len(choice.winner.model.signals)
+    columns = zip(evidence.excess(), evidence.distances(), choice.values, strict=True)
+    yield TextTable(
+        f"order by {choice.rule.ranking}; with {evidence.kind} as independent observations: "
+        f"{evidence.rows:,.0f} effective rows",
+        "|added|contribution A|D to full|expected D|"
+        + ("minus correlation" if criterion == "cv" else criterion),
+        (
+            [
+                str(j),
+                choice.order[j - 1] if j else "(none)",
+                f"{evidence.contributions[j - 1]:,.1f}" if j else "",
+                f"{to_full:,.1f}",
+                f"{expected:,.1f}",
+                f"{value:,.4f}{' <' if j == size else '  '}",
+            ]
+            for j, (to_full, expected, value) in enumerate(columns)
+        ),
+        text_columns=2,
+    )

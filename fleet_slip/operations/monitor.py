@@ -24,7 +24,6 @@ from fleet_slip.models.registry import ModelVersion
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.folds import error_sums, least_squares
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.inference import student_t_quantile
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
@@ -42,8 +41,10 @@ class Limits:
     @classmethod
     def from_values(cls, usual: Sequence[float], false_alarms: float) -> "Limits":
         """Return the two-sided prediction interval of one more individual."""
+        from scipy.special import stdtrit  # noqa: PLC0415 - slow
+
         m = len(usual)
-        t = student_t_quantile(1 - false_alarms / 2, m - 1)
+        t = float(stdtrit(m - 1, 1 - false_alarms / 2))
         half = t * stdev(usual) * math.sqrt(1 + 1 / m)
         return cls(fmean(usual), fmean(usual) - half, fmean(usual) + half)
 

@@ -1,32 +1,26 @@
-"""Choice among cross-validated models, and among the k + 1 nested models of a ranking.
-
-The figures of a chosen model are optimistic, so the choice is repeated in every training fold.
-"""
+"""Choice among cross-validated models, and among the k + 1 nested models of a ranking."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import IntArray
+from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
-from fleet_slip.errors import QuestionError
+from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.folds import (
     CrossValidation,
     Folds,
-    assemble,
     cross_validate,
     error_of_mean,
-    held_out_errors,
     least_squares,
 )
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import DriveMoments, Evidence
 from fleet_slip.regression.least_squares import Fit, Scales, fit_moments, moments
 from fleet_slip.regression.orders import rank
-from fleet_slip.regression.subsets import best_size, criterion_values
 
 # The winner is the model with the fewest signals whose gap to the best is negligible.
 #
@@ -41,33 +35,9 @@ from fleet_slip.regression.subsets import best_size, criterion_values
 # 6.4).
 
 
-@dataclass(frozen=True)
-class Tolerance:
-    """The smallest gain that justifies a signal.
-
-    Absolute: sqrt(MSE - MSE of the best), in rad. Relative: of RMSEs, as a fraction of the best's.
-    """
-
-    amount: float
-    relative: bool = False
-
-    def squared(self, rmse: float) -> float:
-        """Return the difference of mean squared errors, in rad^2, the best having this RMSE."""
-        share = self.amount * (2 + self.amount) * rmse**2  # ((1 + amount) rmse)^2 - rmse^2
-        return share if self.relative else self.amount**2
-
-    def __str__(self) -> str:
-        if self.relative:
-            return f"{100 * self.amount:.3g} % of the best"
-        return f"{math.degrees(self.amount):.4g} deg"
-
-
-DEFAULT_TOLERANCE = Tolerance(math.radians(0.025))
-"""A quarter of the accuracy of the best reference sensors, about 0.1 deg."""
-
-
-ZERO_TOLERANCE = Tolerance(0.0)
-"""Any gain that is larger than its standard error."""
+DEFAULT_TOLERANCE = math.radians(0.025)
+"""The smallest gain that justifies a signal, sqrt(MSE - MSE of the best) in rad: a quarter of the
+accuracy of the best reference sensors, about 0.1 deg."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +79,6 @@ class RmseGap:
             "negligible": self.negligible,
         }
 
-    def __str__(self) -> str:
-        return f"{math.degrees(self.rmse):.4f} +- {math.degrees(self.standard_error):.2g} deg"
-
 
 @dataclass(frozen=True)
 class Winner:
@@ -123,7 +90,7 @@ class Winner:
     gaps: tuple[RmseGap, ...] = ()
 
 
-def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOLERANCE) -> Winner:
+def choose(models: Sequence[CrossValidation], tolerance: float = DEFAULT_TOLERANCE) -> Winner:
     """Choose among cross-validated models by the one-standard-error rule.
 
     Of the models that are negligibly worse than the best pooled correlation, those with the fewest
@@ -133,8 +100,8 @@ def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOL
     ----------
     models : sequence of CrossValidation
         In their declared order.
-    tolerance : Tolerance
-        Smallest gain that is worth a signal.
+    tolerance : float
+        Smallest gain that is worth a signal, in rad; 0 for any gain above its standard error.
 
     Returns
     -------
@@ -151,29 +118,25 @@ def choose(models: Sequence[CrossValidation], tolerance: Tolerance = DEFAULT_TOL
     """
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
-    best = max(models, key=lambda model: model.sums.signed_r_squared)
-    gaps = tuple(measure_gap(model, best, tolerance) for model in models)
-    contenders = [gap for gap in gaps if gap.model is best or gap.negligible]
-    min_size = min(len(gap.model.signals) for gap in contenders)
-    smallest = [gap for gap in contenders if len(gap.model.signals) == min_size]
-    winner = max(smallest, key=lambda gap: gap.model.sums.signed_r_squared)
-    reason = _reason(winner, best, len(contenders), len(models), tolerance)
-    return Winner(winner.model, best, reason, gaps)
+    best = best_correlated(models)
+    gaps = tuple(_gap(model, best, tolerance, _standard_error(model, best)) for model in models)
+    contenders = [gap.model for gap in gaps if gap.model is best or gap.negligible]
+    min_size = min(len(model.signals) for model in contenders)
+    winner = best_correlated([model for model in contenders if len(model.signals) == min_size])
+    return Winner(winner, best, _reason(winner, best, len(contenders), len(models)), gaps)
 
 
-def measure_gap(model: CrossValidation, best: CrossValidation, tolerance: Tolerance) -> RmseGap:
-    """Return the difference of two models' RMSE, over the same folds."""
-    return _gap(model, best, tolerance, _standard_error(model, best))
+def best_correlated(models: Sequence[CrossValidation]) -> CrossValidation:
+    """Return the model with the best pooled correlation, compared exactly; the first of equals."""
+    return max(models, key=lambda model: model.sums.signed_r_squared)
 
 
 def _gap(
-    model: CrossValidation, best: CrossValidation, tolerance: Tolerance, standard_error: float
+    model: CrossValidation, best: CrossValidation, tolerance: float, standard_error: float
 ) -> RmseGap:
     first, second = model.pooled.rmse, best.pooled.rmse
     square = (first - second) * (first + second)
-    return RmseGap(
-        model, first - second, standard_error, square, square < tolerance.squared(second)
-    )
+    return RmseGap(model, first - second, standard_error, square, square < tolerance**2)
 
 
 def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
@@ -185,53 +148,33 @@ def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float
     return math.hypot(error_of_mean(first), error_of_mean(second))
 
 
-def _reason(
-    winner: RmseGap, best: CrossValidation, contenders: int, total: int, tolerance: Tolerance
-) -> str:
-    if winner.model is best and contenders == total == 1:
+def _reason(winner: CrossValidation, best: CrossValidation, contenders: int, total: int) -> str:
+    if total == 1:
         return f"Model {best.name} is the only one."
     rmse = f"RMSE {best.pooled.rmse_deg:.4f} deg"
-    if winner.model is best:
-        rivals = "every other model" if contenders == 1 else "every model with fewer signals"
-        larger = f"{tolerance} or more, and by " if tolerance.amount else ""
+    if winner is best:
         return (
             f"Model {best.name} has the best cross-validated correlation, {best.correlation:.4f}, "
-            f"with {rmse}. The gain over {rivals} is {larger}more than one standard error, so it "
-            "is significant."
+            f"with {rmse}, and no model with fewer signals is negligibly worse."
         )
-    if not tolerance.amount:
-        return (
-            f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of "
-            f"the {contenders} models within one standard error of the best. The gain of model "
-            f"{best.name} ({len(best.signals)} signals, {rmse}), {winner}, is not significant."
-        )
-    real = (
-        "significant, but less than the required"
-        if winner.is_significant
-        else "not significant; required are"
-    )
-    lacks_deg = math.degrees(winner.independent_error)
-    lacking = (
-        ""
-        if tolerance.relative
-        else f" (root of the difference of the squares: {lacks_deg:.2g} deg)"
-    )
+    gap_deg = winner.pooled.rmse_deg - best.pooled.rmse_deg
     return (
-        f"Model {winner.model.name} has the fewest signals ({len(winner.model.signals)}) of the "
-        f"{contenders} models that are about as good as model {best.name}, the best "
-        f"({len(best.signals)} signals, {rmse}). Its gain, {winner}{lacking}, is {real} "
-        f"{tolerance}."
+        f"Model {winner.name} has the fewest signals ({len(winner.signals)}) of the {contenders} "
+        f"models that are about as good as model {best.name}, the best ({len(best.signals)} "
+        f"signals, {rmse}). Its gain, {gap_deg:.4f} deg, is below the tolerance or one standard "
+        "error."
     )
 
 
-def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: Tolerance) -> RmseGap:
+def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: float) -> RmseGap:
     """Return the difference of two models' RMSE, with a standard error over independent groups.
 
     Parameters
     ----------
     model, other : CrossValidation
         Tested on the same rows; each fold is an independent group.
-    tolerance : Tolerance
+    tolerance : float
+        In rad.
 
     Returns
     -------
@@ -295,101 +238,87 @@ def nested_fits(
     return [*(fit_first(size) for size in range(len(order))), full]
 
 
-CROSS_VALIDATION = "cross-validation"
-"""Criterion: cross-validate all nested models; the smallest that is nearly best wins."""
+PRICES: dict[str, Callable[[float], float]] = {"aic": lambda _: 2.0, "bic": math.log}
+"""Criteria: the price of a signal in units of the noise, given the effective rows (Akaike 1973, for
+a known noise variance, which orders as Mallows' C_p; Schwarz 1978)."""
+
+CRITERIA = ("cv", *PRICES)
+"""`cv` cross-validates all nested models; the smallest that is nearly best wins."""
 
 
-MIN_FOLDS = 3
-"""Minimum number of folds to repeat a choice in the training folds, of which two must remain."""
+def criterion_values(name: str, evidence: Evidence) -> FloatArray:
+    """Return the values of a criterion of `PRICES` for the k + 1 nested models.
+
+    Parameters
+    ----------
+    name : str
+    evidence : Evidence
+
+    Returns
+    -------
+    float array, shape (k + 1,)
+        The smallest value is the best.
+    """
+    size = np.arange(evidence.inputs + 1)
+    return np.asarray(evidence.excess() + PRICES[name](evidence.rows) * size)
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A ranking, a criterion or `CROSS_VALIDATION`, and the gain that justifies a signal."""
+    """A ranking, a criterion, and the gain in rad that justifies a signal."""
 
-    ranking: str
-    criterion: str
-    tolerance: Tolerance = DEFAULT_TOLERANCE
+    ranking: str = "declared"
+    criterion: str = "cv"
+    tolerance: float = DEFAULT_TOLERANCE
 
 
 @dataclass(frozen=True)
 class NestedChoice(Record):
-    """A choice of the first `size` signals of an order, their exact fit and its evidence.
+    """The choice of the first signals of a ranking.
 
     `values` of the criterion are for 0..k signals, smaller being better; of cross-validation they
-    are the negative correlations.
+    are the negative correlations. `models` are those of 1..k signals.
     """
 
-    DOCUMENT = "order signals criterion_values=values *evidence"
+    DOCUMENT = (
+        "ranking=rule.ranking criterion=rule.criterion order signals=winner.model.signals "
+        "criterion_values=values *evidence"
+    )
 
+    rule: Rule
     order: tuple[str, ...]
-    size: int
-    fit: Fit
     evidence: Evidence
     values: tuple[float, ...]
-
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """The chosen signals."""
-        return self.order[: self.size]
+    models: tuple[CrossValidation, ...]
+    winner: Winner
 
 
-@dataclass(frozen=True)
-class NestedDistances(Record):
-    """Distances D of the nested models of an order; `null` is the model without any signal."""
-
-    DOCUMENT = "order *evidence null"
-
-    order: tuple[str, ...]
-    evidence: Evidence
-    null: CrossValidation
-
-
-@dataclass(frozen=True)
-class TrainingFolds:
-    """The training rows of a choice: their folds, and the moments of each drive.
-
-    `scales` is the physical value of a count of each signal. Without `intercept` moments are about
-    zero.
-    """
-
-    folds: Folds
-    drives: DriveMoments
-    scales: Scales
-    intercept: bool = True
-
-    @property
-    def total(self) -> Gram:
-        """The Gram to rank and search on."""
-        return self.folds.total if self.intercept else self.folds.total.about_origin()
-
-    def nested_fits(self, order: Sequence[str], label: str) -> list[Fit]:
-        """Return the k+1 nested fits of an order. Raises `DataError` for dependent signals."""
-        return nested_fits(self.folds.total, order, label, intercept=self.intercept)
-
-    def evidence(self, fits: Sequence[Fit]) -> Evidence:
-        """Return the evidence for the nested models of an order; raises like `Evidence`."""
-        return Evidence.clustered(fits, self.drives)
-
-    def cross_validate(self, name: str, inputs: Sequence[str], label: str) -> CrossValidation:
-        """Cross-validate least squares on given inputs."""
-        procedure = least_squares(inputs, label, intercept=self.intercept)
-        return cross_validate(name, self.folds, procedure, self.scales)
-
-
-def select_nested(
-    training: TrainingFolds, inputs: Sequence[str], label: str, rule: Rule
+def choose_nested(
+    folds: Folds,
+    drives: DriveMoments,
+    inputs: Sequence[str],
+    label: str,
+    scales: Scales,
+    rule: Rule,
+    *,
+    intercept: bool = True,
 ) -> NestedChoice:
     """Rank the inputs and choose one of the nested models.
 
     Parameters
     ----------
-    training : TrainingFolds
+    folds : Folds
+        Rows with all inputs and the label.
+    drives : DriveMoments
+        Of the same rows, the independent clusters of the evidence. About zero without intercept.
     inputs : sequence of str
         The k candidate signals.
     label : str
+    scales : mapping of str to Fraction
+        Physical value of one count of each signal.
     rule : Rule
         Ranking and criterion.
+    intercept : bool
 
     Returns
     -------
@@ -398,84 +327,40 @@ def select_nested(
     Raises
     ------
     DataError
-        If inputs are linearly dependent, or there are too few rows.
+        If inputs are linearly dependent, there are too few rows, or the criterion keeps no signal.
     QuestionError
         For an unknown ranking or criterion.
     """
-    order = rank(rule.ranking, training.total, inputs, label)
-    fits = training.nested_fits(order, label)
-    evidence = training.evidence(fits)
-    if rule.criterion == CROSS_VALIDATION:
-        models = cross_validate_nested(training, order, label)
-        size = len(choose(models, rule.tolerance).model.signals)
-        values = tuple(-model.correlation for model in models)
-    else:
-        size = best_size(rule.criterion, evidence)
-        values = tuple(criterion_values(rule.criterion, evidence).tolist())
-    return NestedChoice(order, size, fits[size], evidence, values)
-
-
-def measure_distances(training: TrainingFolds, order: Sequence[str], label: str) -> NestedDistances:
-    """Return the distances of a given order. Raises `DataError` as `select_nested`."""
-    evidence = training.evidence(training.nested_fits(order, label))
-    null = training.cross_validate("none", (), label)
-    return NestedDistances(tuple(order), evidence, null)
-
-
-def cross_validate_nested(
-    training: TrainingFolds, order: Sequence[str], label: str
-) -> list[CrossValidation]:
-    """Cross-validate the k+1 nested models of a given order; model j is called "first j"."""
-    return [
-        training.cross_validate(f"first {size}", order[:size], label)
+    if rule.criterion not in CRITERIA:
+        criteria = ", ".join(CRITERIA)
+        raise QuestionError(f"unknown criterion {rule.criterion!r}. Known criteria: {criteria}.")
+    total = folds.total if intercept else folds.total.about_origin()
+    order = rank(rule.ranking, total, inputs, label)
+    fits = nested_fits(folds.total, order, label, intercept=intercept)
+    evidence = Evidence.measure(fits, drives)
+    null, *models = (
+        cross_validate(
+            f"first {size}",
+            folds,
+            least_squares(order[:size], label, intercept=intercept),
+            scales,
+        )
         for size in range(len(order) + 1)
-    ]
-
-
-def cross_validate_selection(
-    name: str,
-    training: TrainingFolds,
-    fold: IntArray,
-    inputs: Sequence[str],
-    label: str,
-    rule: Rule,
-) -> CrossValidation:
-    """Cross-validate the choice itself: each training set ranks and chooses anew.
-
-    Parameters
-    ----------
-    name : str
-        Name of the result.
-    training : TrainingFolds
-    fold : integer array, shape (drives,)
-        Fold of each drive.
-    inputs : sequence of str
-    label : str
-    rule : Rule
-
-    Returns
-    -------
-    CrossValidation
-
-    Raises
-    ------
-    DataError
-        If a training set determines no model.
-    QuestionError
-        If there are fewer than three folds.
-    """
-    folds = training.folds
-    tests = []
-    for number, test in enumerate(folds.grams):
-        inner = _without(training, fold, number)
-        model = select_nested(inner, inputs, label, rule).fit.model
-        tests.append(held_out_errors(model, inner.folds.total, test))
-    chosen = select_nested(training, inputs, label, rule).fit.model
-    return assemble(name, folds, tests, chosen, training.scales)
-
-
-def _without(training: TrainingFolds, fold: IntArray, number: int) -> TrainingFolds:
-    if len(training.folds.grams) < MIN_FOLDS:
-        raise QuestionError("choosing inside the training folds needs at least three folds.")
-    remaining_folds = training.folds.without(number, int(np.count_nonzero(fold != number)))
-    return replace(training, folds=remaining_folds, drives=training.drives.take(fold != number))
+    )
+    if rule.criterion == "cv":
+        values = [-model.correlation for model in (null, *models)]
+        winner = choose(models, rule.tolerance)
+    else:
+        values = criterion_values(rule.criterion, evidence).tolist()
+        size = int(np.argmin(values))
+        if size == 0:
+            raise DataError(
+                f"the criterion {rule.criterion} selects no signal: none is better than chance. "
+                "Choose more drives, other signals, or the criterion cv."
+            )
+        reason = (
+            f"{rule.criterion} keeps {size} of {len(models)} signals of the order by "
+            f"{rule.ranking}, with {evidence.kind} as independent."
+        )
+        winner = Winner(models[size - 1], best_correlated(models), reason)
+    return NestedChoice(rule, order, evidence, tuple(values), tuple(models), winner)

@@ -7,13 +7,12 @@ the evidence is taken over drives.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.errors import DataError
@@ -27,7 +26,7 @@ ClusterUnit = Literal["drive", "vehicle"]
 
 @dataclass(frozen=True)
 class DriveMoments:
-    """Moments of u = (1, (count - centre) / spread) of each drive. The label is last.
+    """Moments of u = (1, (count - centre) / spread) of drives or clusters. The label is last.
 
     Attributes
     ----------
@@ -37,10 +36,8 @@ class DriveMoments:
         Mean count over all drives, rounded.
     spread : float array, shape (k,)
         Standard deviation of the counts; 1 for a constant.
-    moments : float array, shape (drives, k + 1, k + 1)
+    moments : float array, shape (clusters, k + 1, k + 1)
         Sums of products of u.
-    cluster : integer array, shape (drives,), or None
-        Cluster of each drive; None if each drive is a cluster.
     unit : str
         The independent unit: drives of a vehicle share its biases and tyres.
     """
@@ -49,14 +46,16 @@ class DriveMoments:
     centre: tuple[int, ...]
     spread: FloatArray
     moments: FloatArray
-    cluster: IntArray | None = None
     unit: ClusterUnit = "drive"
 
     @classmethod
     def from_table(
         cls, table: GramTable, cluster: IntArray | None = None, unit: ClusterUnit = "drive"
     ) -> "DriveMoments":
-        """Scale a table of drives. Raises `DataError` without rows."""
+        """Scale a table of drives and sum it by cluster; without clusters each drive is one.
+
+        Raises `DataError` without rows.
+        """
         total = table.total()
         if total.n == 0:
             raise DataError(f"no rows have all of {', '.join(table.signals)}.")
@@ -67,28 +66,14 @@ class DriveMoments:
         spread = np.where(squares > 0, np.sqrt(squares) / total.n, 1.0)
         unit_of_u = np.array([1.0, *spread])
         moments = table.about(centre).moments() / np.outer(unit_of_u, unit_of_u)
-        return cls(table.signals, centre, spread, moments, cluster, unit)
+        if cluster is not None:
+            order = np.argsort(cluster, kind="stable")
+            _, first = np.unique(cluster[order], return_index=True)
+            moments = np.add.reduceat(moments[order], first, axis=0)
+        return cls(table.signals, centre, spread, moments, unit)
 
     def __len__(self) -> int:
         return len(self.moments)
-
-    def take(self, rows: NDArray[Any]) -> "DriveMoments":
-        """Return the drives at an index array or a mask, with the same centre and spread."""
-        cluster = None if self.cluster is None else self.cluster[rows]
-        return replace(self, moments=self.moments[rows], cluster=cluster)
-
-    @property
-    def clusters(self) -> int:
-        """Number of clusters."""
-        return len(self) if self.cluster is None else len(np.unique(self.cluster))
-
-    def by_cluster(self, values: FloatArray) -> FloatArray:
-        """Sum values of drives, shape (drives, ...), over each cluster."""
-        if self.cluster is None:
-            return values
-        order = np.argsort(self.cluster, kind="stable")
-        _, first = np.unique(self.cluster[order], return_index=True)
-        return np.add.reduceat(values[order], first, axis=0)
 
     def direction(self, model: LinearModel) -> FloatArray:
         """Return w with w'u = prediction minus label, in spreads of the label; model in counts."""
@@ -145,7 +130,7 @@ def clustered_variances(fitted: Fit, drives: DriveMoments) -> tuple[FloatArray, 
     """
     at, first = _columns(fitted, drives), int(not fitted.has_intercept)
     chosen = at[first:]
-    cluster_moments = drives.by_cluster(drives.moments)[:, chosen][:, :, chosen]
+    cluster_moments = drives.moments[:, chosen][:, :, chosen]
     back = np.linalg.inv(np.linalg.cholesky(cluster_moments.sum(axis=0)))
     leverage = back @ cluster_moments @ back.T
     values, vectors = np.linalg.eigh(np.eye(len(back)) - leverage)
@@ -233,15 +218,13 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
     list of Fraction
         In counts, the intercept first if any.
     """
-    inputs, gram = fitted.model.signals, fitted.gram
-    scale = gram.n if fitted.has_intercept else 1
-    part = gram.restrict(inputs)
+    gram, part = fitted.gram, fitted.gram.restrict(fitted.model.signals)
     inverse, denominator = exact.invert(moments(part, intercept=fitted.has_intercept))
-    unit = variance * scale / denominator
-    slopes = [unit * inverse[i][i] for i in range(fitted.size)]
+    unit = variance * (gram.n if fitted.has_intercept else 1) / denominator
+    k = range(fitted.size)
+    slopes = [unit * inverse[i][i] for i in k]
     if not fitted.has_intercept:
         return slopes
-    k = range(fitted.size)
     # S^-1 = n N^-1 and m = sums / n, so m'S^-1 m = sums'N^-1 sums / n.
     form = sum(part.sums[i] * inverse[i][j] * part.sums[j] for i in k for j in k)
     return [variance * (1 + Fraction(form, denominator)) / gram.n, *slopes]
@@ -259,8 +242,8 @@ def infer(fitted: Fit, scales: Scales, drives: DriveMoments | None = None) -> In
     scales : mapping of str to Fraction
         Physical value of one count of each signal.
     drives : DriveMoments, optional
-        Drives, with a drive or a vehicle as cluster. Default: rows are independent, and each error
-        is computed exactly and rounded once.
+        Two or more clusters, drives or vehicles. Default: rows are independent, and each error is
+        computed exactly and rounded once.
 
     Returns
     -------
@@ -269,18 +252,33 @@ def infer(fitted: Fit, scales: Scales, drives: DriveMoments | None = None) -> In
     Raises
     ------
     DataError
-        If there is one cluster, or too few rows.
+        If there are too few rows.
     """
-    clusters = None if drives is None else _require_clusters(drives.clusters, drives.unit)
-    sigma2 = noise_variance(fitted)
-    units = _units(fitted, scales)
-    if drives is None or clusters is None:
-        exact_variances = classical_variances(fitted, sigma2)
-        errors = [exact.sqrt(v * u**2) for v, u in zip(exact_variances, units, strict=True)]
-        return _inference(fitted, scales, sigma2, errors, fitted.degrees_of_freedom)
-    variances, degrees = clustered_variances(fitted, drives)
-    errors = [math.sqrt(v) * float(u) for v, u in zip(variances, units, strict=True)]
-    return _inference(fitted, scales, sigma2, errors, clusters - 1, degrees.tolist())
+    from scipy.special import stdtr  # noqa: PLC0415 - slow
+
+    sigma2, degrees_of_freedom = noise_variance(fitted), fitted.degrees_of_freedom
+    label = scales[fitted.model.label]
+    model = fitted.model.physical(scales)
+    coefficients = {INTERCEPT: model.offset} if fitted.has_intercept else {}
+    coefficients |= model.weights
+    units = [label / scales.get(name, 1) for name in coefficients]
+    if drives is None:
+        variances = classical_variances(fitted, sigma2)
+        errors = [exact.sqrt(v * unit**2) for v, unit in zip(variances, units, strict=True)]
+        degrees = np.full(len(errors), float(degrees_of_freedom))
+    else:
+        degrees_of_freedom = len(drives) - 1
+        robust, degrees = clustered_variances(fitted, drives)
+        errors = [math.sqrt(v) * float(unit) for v, unit in zip(robust, units, strict=True)]
+    estimates = []
+    for (name, value), error, freedom in zip(
+        coefficients.items(), errors, degrees.tolist(), strict=True
+    ):
+        t = value / error if error else math.copysign(math.inf, value)
+        p = float(2 * stdtr(freedom, -abs(t)))
+        estimates.append(Estimate(name, value, error, t, p, freedom))
+    residual_std = exact.sqrt(sigma2 * label**2)
+    return Inference(tuple(estimates), residual_std, degrees_of_freedom)
 
 
 def _to_counts(drives: DriveMoments, at: Sequence[int]) -> FloatArray:
@@ -303,15 +301,8 @@ def cluster_scores(fitted: Fit, drives: DriveMoments) -> FloatArray:
     -------
     float array, shape (clusters, k + 1)
     """
-    scores = -(drives.moments @ drives.direction(fitted.model))[:, _columns(fitted, drives)]
-    return drives.by_cluster(scores)
-
-
-def _require_clusters(clusters: int, unit: str) -> int:
-    if clusters < 2:
-        otherwise = ": take drives for independent, cluster drive" if unit == "vehicle" else ""
-        raise DataError(f"cluster-robust errors need at least two {unit}s{otherwise}.")
-    return clusters
+    scores = -(drives.moments @ drives.direction(fitted.model))
+    return np.asarray(scores[:, _columns(fitted, drives)])
 
 
 def variance_inflation(gram: Gram, inputs: Sequence[str]) -> dict[str, float]:
@@ -346,38 +337,6 @@ def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:
     return [0, *(drives.signals.index(name) + 1 for name in fitted.model.signals)]
 
 
-def _units(fitted: Fit, scales: Scales) -> list[Fraction]:
-    label = scales[fitted.model.label]
-    slopes = [label / scales[name] for name in fitted.model.signals]
-    return [label, *slopes] if fitted.has_intercept else slopes
-
-
-def _inference(
-    fitted: Fit,
-    scales: Scales,
-    sigma2: Fraction,
-    errors: Sequence[float],
-    degrees: int,
-    coefficient_degrees: Sequence[float] = (),
-) -> Inference:
-    model = fitted.model.physical(scales)
-    names = [INTERCEPT] if fitted.has_intercept else []
-    values = [model.offset] if fitted.has_intercept else []
-    estimates = []
-    for name, value, error, degrees_of_t in zip(
-        [*names, *model.signals],
-        [*values, *model.weights.values()],
-        errors,
-        coefficient_degrees or [float(degrees)] * len(errors),
-        strict=True,
-    ):
-        t = value / error if error else math.copysign(math.inf, value)
-        p = student_t_two_sided(t, degrees_of_t)
-        estimates.append(Estimate(name, value, error, t, p, degrees_of_t))
-    residual_std = exact.sqrt(sigma2 * scales[fitted.model.label] ** 2)
-    return Inference(tuple(estimates), residual_std, degrees)
-
-
 @dataclass(frozen=True)
 class Evidence:
     """The evidence of the data for the k + 1 nested models of an order.
@@ -390,8 +349,6 @@ class Evidence:
         Effective number of independent rows.
     design_effect : float
         Variance of an estimate over that of independent rows.
-    variance, full_rss : float
-        Noise variance and residual sum of squares of the full model, in counts^2.
     kind : {"rows", "drives", "vehicles"}
         The independent unit.
     """
@@ -399,40 +356,15 @@ class Evidence:
     contributions: tuple[float, ...]
     rows: float
     design_effect: float
-    variance: float
-    full_rss: float
     kind: Literal["rows", "drives", "vehicles"]
 
     @classmethod
-    def naive(cls, fits: Sequence[Fit]) -> "Evidence":
-        """Return the evidence if rows were independent, A_j = (RSS_{j-1} - RSS_j) / sigma^2.
+    def measure(cls, fits: Sequence[Fit], drives: DriveMoments | None = None) -> "Evidence":
+        """Return the evidence of independent clusters; of rows without two clusters.
 
-        Parameters
-        ----------
-        fits : sequence of Fit, length k + 1
-            Nested fits of 0 to k signals.
-
-        Raises
-        ------
-        DataError
-            If there is no noise, or too few rows.
-        """
-        full, variance = fits[-1], _variance(fits[-1])
-        return cls(
-            tuple(float(gain / variance) for gain in _gains(fits)),
-            float(full.gram.n),
-            1.0,
-            float(variance),
-            float(full.rss),
-            "rows",
-        )
-
-    @classmethod
-    def clustered(cls, fits: Sequence[Fit], drives: DriveMoments) -> "Evidence":
-        """Return the evidence with independent drives or vehicles: A_j is a squared robust t value.
-
-        With q_j the orthogonal direction of signal j and e the residuals of the full model,
-        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2) over clusters p. Its ratio to the naive A_j is the
+        Of rows, A_j = (RSS_{j-1} - RSS_j) / sigma^2. Of clusters, A_j is a squared robust t value:
+        with q_j the orthogonal direction of signal j and e the residuals of the full model,
+        A_j = (q_j'y)^2 / (c sum_p (q_j'e)_p^2) over clusters p. Its ratio to that of rows is the
         design effect of the direction (Kish 1965). The effective rows are the rows over the mean
         design effect, at least k + 2.
 
@@ -440,36 +372,34 @@ class Evidence:
         ----------
         fits : sequence of Fit, length k + 1
             Nested fits of 0 to k signals.
-        drives : DriveMoments
+        drives : DriveMoments, optional
 
         Raises
         ------
         DataError
-            If there is one cluster, no noise, or too few rows.
+            If there is no noise, or too few rows.
 
         References
         ----------
         Kish, Survey Sampling, 1965.
         """
         full, variance = fits[-1], _variance(fits[-1])
+        gains, rows = [a.rss - b.rss for a, b in pairwise(fits)], full.gram.n
+        if drives is None or len(drives) < 2:
+            contributions = tuple(float(gain / variance) for gain in gains)
+            return cls(contributions, float(rows), 1.0, "rows")
         at = _columns(full, drives)
         total = drives.moments.sum(axis=0)[np.ix_(at, at)]
         scores = cluster_scores(full, drives)
         rotated = np.linalg.solve(np.linalg.cholesky(total), scores.T)[1:]
-        unit = float(drives.spread[-1]) ** 2
-        clusters = _require_clusters(len(scores), drives.unit)
-        factor = clusters / (clusters - 1) * (full.gram.n - 1) / full.degrees_of_freedom
-        noise = factor * np.sum(rotated**2, axis=1) * unit
-        gains = np.array([float(gain) for gain in _gains(fits)])
-        effects = noise / float(variance)
-        effect = float(effects.mean()) if len(effects) else 1.0
-        rows = min(full.gram.n, max(full.gram.n / effect, full.size + 2))
+        clusters = len(scores)
+        factor = clusters / (clusters - 1) * (rows - 1) / full.degrees_of_freedom
+        noise = factor * np.sum(rotated**2, axis=1) * float(drives.spread[-1]) ** 2
+        effect = float(np.mean(noise / float(variance))) if gains else 1.0
         return cls(
-            tuple((gains / noise).tolist()),
-            float(rows),
+            tuple((np.array(gains, dtype=np.float64) / noise).tolist()),
+            float(min(rows, max(rows / effect, full.size + 2))),
             effect,
-            float(variance),
-            float(full.rss),
             "vehicles" if drives.unit == "vehicle" else "drives",
         )
 
@@ -499,10 +429,6 @@ class Evidence:
         tail = np.cumsum([0.0, *reversed(self.contributions)])[::-1]
         return np.ascontiguousarray(tail)
 
-    def excess_of(self, rss: FloatArray) -> FloatArray:
-        """Return the excess of subset models from their residual sums of squares, in counts^2."""
-        return np.asarray((rss - self.full_rss) / (self.variance * self.design_effect))
-
     def distances(self) -> tuple[float, ...]:
         """Return unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2) of the paper, j = 0..k.
 
@@ -516,10 +442,6 @@ class Evidence:
         """
         size = np.arange(self.inputs + 1)
         return tuple((self.excess() + 2 * size - self.inputs).tolist())
-
-
-def _gains(fits: Sequence[Fit]) -> list[Fraction]:
-    return [a.rss - b.rss for a, b in pairwise(fits)]
 
 
 def _variance(full: Fit) -> Fraction:
@@ -631,42 +553,3 @@ def _root(falling: Callable[[float], float], low: float, high: float) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if falling(middle) > 0 else (low, middle)
     return (low + high) / 2
-
-
-def student_t_two_sided(t: float, degrees: float) -> float:
-    """Return the two-sided p-value of Student's t distribution.
-
-    Parameters
-    ----------
-    t : float
-        Value of the statistic.
-    degrees : float
-        Degrees of freedom, above 0.
-
-    Returns
-    -------
-    float
-        P(|T| >= |t|).
-    """
-    from scipy.special import stdtr  # noqa: PLC0415 - slow
-
-    return float(2 * stdtr(degrees, -abs(t)))
-
-
-def student_t_quantile(p: float, degrees: float) -> float:
-    """Return the quantile of Student's t distribution.
-
-    Parameters
-    ----------
-    p : float
-        Probability of a smaller value, between 0 and 1.
-    degrees : float
-        Degrees of freedom, above 0.
-
-    Returns
-    -------
-    float
-    """
-    from scipy.special import stdtrit  # noqa: PLC0415 - slow
-
-    return float(stdtrit(degrees, p))

@@ -1,64 +1,24 @@
-"""Rankings: the predefined order of the signals of nested models (section II.B of the paper).
+"""Searches: orders of the signals of nested models (paper, section II.B), and best subsets.
 
 All compare exactly; ties are resolved by the declared order.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
-from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import dependence, moments
+from fleet_slip.regression.least_squares import Fit, correlation_matrix, dependence, fit, moments
 
-Matrix = list[list[int]]
-Ranking = Callable[[Gram, Sequence[str], str], tuple[str, ...]]
-"""Orders inputs, given a Gram with them and the label. Raises `DataError` if dependent."""
-
-
-def declared(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:  # noqa: ARG001
-    """Keep the declared order, as the paper does."""
-    return tuple(inputs)
-
-
-def correlation(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order by the absolute correlation with the label, largest first."""
-    matrix = _moments(gram, inputs, label)
-    scores = [Fraction(matrix[i][-1] ** 2, matrix[i][i]) for i in range(len(inputs))]
-    return _descending(inputs, scores)
-
-
-def t_value(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Order by |t| in the full model, largest first: b_i^2 / (S^-1)_ii."""
-    matrix = _moments(gram, inputs, label)
-    inverse, denominator = exact.invert([row[:-1] for row in matrix[:-1]])
-    slopes = [sum(a * b for a, b in zip(row, matrix[-1], strict=False)) for row in inverse]
-    scores = [Fraction(b**2, inverse[i][i] * denominator) for i, b in enumerate(slopes)]
-    return _descending(inputs, scores)
-
-
-def forward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Add, at each step, the signal that reduces the residual sum of squares most."""
-    return _stepwise(gram, inputs, label, "forward")
-
-
-def backward(gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
-    """Remove, at each step, the signal whose loss costs least, as Wang and WEKA do."""
-    return _stepwise(gram, inputs, label, "backward")
-
-
-RANKINGS: dict[str, Ranking] = {
-    "declared": declared,
-    "correlation": correlation,
-    "t": t_value,
-    "forward": forward,
-    "backward": backward,
-}
+RANKINGS = ("declared", "forward", "backward")
+"""Rankings: the declared order, as in the paper; adding the signal that reduces the residual sum of
+squares most; removing the one whose loss costs least, as Wang and WEKA do."""
 
 
 def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str, ...]:
@@ -86,27 +46,18 @@ def rank(name: str, gram: Gram, inputs: Sequence[str], label: str) -> tuple[str,
     """
     if name not in RANKINGS:
         raise QuestionError(f"unknown ranking {name!r}. Known rankings: {', '.join(RANKINGS)}.")
-    return RANKINGS[name](gram, inputs, label)
-
-
-def _moments(gram: Gram, inputs: Sequence[str], label: str) -> Matrix:
-    relations = dependence(gram, inputs)
-    if relations:
-        raise DataError(relations)
-    return moments(gram.restrict([*inputs, label]))
-
-
-def _stepwise(gram: Gram, inputs: Sequence[str], label: str, method: str) -> tuple[str, ...]:
-    """Return the order of a search, followed by nearly dependent inputs in declared order."""
-    _moments(gram, inputs, label)
-    sets = stepwise_order(gram, inputs, label, method, len(inputs))
+    if name == "declared":
+        return tuple(inputs)
+    _require_independent(gram, inputs)
+    sets = stepwise_order(gram, inputs, label, name, len(inputs))
     order = sets[-1] if sets else ()
+    # Nearly dependent inputs follow in their declared order.
     return (*order, *(name for name in inputs if name not in order))
 
 
-def _descending(inputs: Sequence[str], scores: Sequence[Fraction]) -> tuple[str, ...]:
-    order = sorted(range(len(inputs)), key=lambda i: (-scores[i], i))
-    return tuple(inputs[i] for i in order)
+def _require_independent(gram: Gram, inputs: Sequence[str]) -> None:
+    if relations := dependence(gram, inputs):
+        raise DataError(relations)
 
 
 # Choosing among many inputs: forward, backward, or exchange.
@@ -157,12 +108,11 @@ def stepwise_order(
         raise QuestionError(f"unknown search {method!r}. Known: {', '.join(METHODS)}.")
     search = _Search(gram.restrict([*inputs, label]))
     max_size = min(max_size, len(search.usable))
-    steps: dict[str, Callable[[int], list[list[int]]]] = {
-        "forward": search.forward,
-        "backward": search.backward,
-        "exchange": partial(search.forward, exchanging=True),
-    }
-    return tuple(tuple(inputs[i] for i in chosen) for chosen in steps[method](max_size))
+    if method == "backward":
+        sets = search.backward(max_size)
+    else:
+        sets = search.forward(max_size, exchanging=method == "exchange")
+    return tuple(tuple(inputs[i] for i in chosen) for chosen in sets)
 
 
 def sweep(matrix: LongArray, pivot: int) -> LongArray:
@@ -197,18 +147,7 @@ class _Search:
     def __init__(self, gram: Gram) -> None:
         self.exact = moments(gram)
         size = len(self.exact)
-        # Each integer as the sum of two floats: 64 bits or more.
-        half = [x for i, row in enumerate(self.exact) for x in row[: i + 1]]
-        high = np.array([float(x) for x in half])
-        low = np.array(
-            [
-                float(x - int(approximate))
-                for x, approximate in zip(half, high.tolist(), strict=True)
-            ]
-        )
-        matrix = np.empty((size, size), dtype=np.longdouble)
-        matrix[np.tril_indices(size)] = high.astype(np.longdouble) + low.astype(np.longdouble)
-        matrix.T[np.tril_indices(size)] = matrix[np.tril_indices(size)]
+        matrix = np.array(self.exact, dtype=np.longdouble)
         length = np.sqrt(np.diag(matrix))
         length[length == 0] = 1
         self.matrix: LongArray = matrix / np.outer(length, length)
@@ -219,20 +158,15 @@ class _Search:
         """Return independent inputs, found by pivoting on the largest remaining variance."""
         if self._far_from_dependent():
             return list(range(self.inputs))
-        work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
-        buffer, independent = np.empty_like(work), list[int]()
-        is_remaining = np.ones(self.inputs, dtype=np.bool_)
-        while is_remaining.any():
-            best = int(np.argmax(np.where(is_remaining, work.diagonal(), -1)))
-            if work[best, best] < DEPENDENT:
+        work, independent = self.matrix[:-1, :-1].copy(), list[int]()
+        while len(independent) < self.inputs:
+            variance = work.diagonal().copy()
+            variance[independent] = -1
+            best = int(np.argmax(variance))
+            if variance[best] < DEPENDENT:
                 break
-            np.multiply.outer(work[:, best], work[best] / work[best, best], out=buffer)
-            work -= buffer
-            independent.append(int(names[best]))
-            is_remaining[best] = False
-            if 8 * is_remaining.sum() < 7 * len(is_remaining):  # drop the inputs that were taken
-                work, names = work[np.ix_(is_remaining, is_remaining)], names[is_remaining]
-                buffer, is_remaining = np.empty_like(work), np.ones(len(work), dtype=np.bool_)
+            work -= np.multiply.outer(work[:, best], work[best] / work[best, best])
+            independent.append(best)
         return sorted(independent)
 
     def _far_from_dependent(self) -> bool:
@@ -326,3 +260,97 @@ class _Search:
             for columns in ([*chosen, self.inputs], chosen)
         )
         return Fraction(bordered, inner)
+
+
+# All 2^k subsets: each signal doubles a list of moments into copies without it and with it (Schur
+# complement), until 2^k residual sums of squares remain, by bit mask: float64 on correlations.
+
+MAX_SUBSET_INPUTS = 22
+"""Maximum number of signals for all subsets: 2^22 take about two seconds."""
+
+_SPARE = 4
+"""Subsets of a size, the best by float64, that are compared exactly."""
+
+
+def best_subsets(gram: Gram, inputs: Sequence[str], label: str) -> list[Fit]:
+    """Return the best model of each size, compared exactly; of equal ones the first declared.
+
+    Parameters
+    ----------
+    gram : Gram
+    inputs : sequence of str
+        The k signals, at most `MAX_SUBSET_INPUTS`.
+    label : str
+
+    Returns
+    -------
+    list of Fit, length k + 1
+
+    Raises
+    ------
+    DataError
+        If inputs are linearly dependent, or the label is constant.
+    QuestionError
+        If there are too many inputs.
+    """
+    _require_independent(gram, inputs)
+    if len(inputs) > MAX_SUBSET_INPUTS:
+        raise QuestionError(
+            f"all subsets of {len(inputs)} signals are too many: give at most {MAX_SUBSET_INPUTS}, "
+            "or search among them with: search exchange."
+        )
+    part = gram.restrict([*inputs, label])
+    matrix = correlation_matrix(part)
+    if matrix[-1, -1] == 0:
+        raise DataError(f"{label} is constant: there is nothing to explain.")
+    rss, sizes = all_rss(matrix), subset_sizes(len(inputs))
+    results = []
+    for size in range(len(inputs) + 1):
+        masks = np.flatnonzero(sizes == size)
+        best = masks[np.argsort(rss[masks], kind="stable")[:_SPARE]].tolist()
+        fits = [fit(part, signals_of(mask, inputs), label) for mask in best]
+        results.append(
+            min(fits, key=lambda fitted: (fitted.rss, [*map(inputs.index, fitted.model.signals)]))
+        )
+    return results
+
+
+def subset_sizes(k: int) -> NDArray[np.uint8]:
+    """Return the number of signals of each of the 2^k bit masks."""
+    return np.bitwise_count(np.arange(2**k, dtype=np.uint32))
+
+
+def all_rss(matrix: FloatArray) -> FloatArray:
+    """Return the residual sums of squares of all 2^k subsets.
+
+    Parameters
+    ----------
+    matrix : float array, shape (k + 1, k + 1)
+        Moments of the inputs and the label, which is last.
+
+    Returns
+    -------
+    float array, shape (2^k,)
+        Element m is that of the inputs whose bits are set in m.
+    """
+    work: FloatArray = np.asarray(matrix, dtype=np.float64)[:, :, None]
+    # Signals are taken from the last to the first, so that the first ends in the lowest bit.
+    # The label moves to the front, out of the way.
+    order = [len(matrix) - 1, *range(len(matrix) - 1)]
+    work = work[np.ix_(order, order)]
+    while len(work) > 1:
+        row, trailing = work[-1, :-1], work[:-1, :-1]
+        size = len(trailing)
+        doubled = np.empty((size, size, 2 * work.shape[2]))
+        doubled[:, :, 0::2] = trailing
+        scaled = row / work[-1, -1]
+        for i in range(size):
+            doubled[i, : i + 1, 1::2] = trailing[i, : i + 1] - scaled[i] * row[: i + 1]
+            doubled[: i + 1, i, 1::2] = doubled[i, : i + 1, 1::2]
+        work = doubled
+    return np.asarray(np.maximum(work[0, 0], 0.0))
+
+
+def signals_of(mask: int, inputs: Sequence[str]) -> list[str]:
+    """Return the signals whose bit is set, in declared order."""
+    return [name for i, name in enumerate(inputs) if mask >> i & 1]

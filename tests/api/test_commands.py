@@ -110,7 +110,7 @@ def test_running_again_selects_again_where_anything_is_new(tmp_path: Path) -> No
 
     assert [selects(), selects()] == [True, False]
     assert {*steps} >= {"simulate smoke", "gram signals"}
-    assert selects(tolerance="50%")
+    assert selects(tolerance="0.5deg")
     assert selects(name="other")
     assert not selects()
     assert selects(name="other", models=str(short))
@@ -123,8 +123,10 @@ def test_a_cohort_answers_from_gram_rows(fleet: Fleet) -> None:
     diagnosis = cohort.diagnose("bent")
     assert diagnosis.fitted.model.signals == fleet.models.get("bent").manifest.signals
     assert cohort.diagnose(fleet.models.get("bent")).drives == diagnosis.drives
-    subset = cohort.select(order="ay,yaw_rate", all_subsets=True, criterion="bic")
-    assert subset.choice and subset.choice.subsets
+    ranked = cohort.select(order="ay,yaw_rate", ranking="backward", criterion="bic")
+    assert ranked.choice and {*ranked.choice.order} == {"ay", "yaw_rate"}
+    with pytest.raises(UsageError, match=r"unknown option of select: orders\. Options: models, "):
+        cohort.select(orders="ay")
     with pytest.raises(UsageError, match="not both"):
         cohort.diagnose("bent", signals="ay")
     with pytest.raises(QuestionError, match="name a published model"):

@@ -18,7 +18,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.api.fleet_cohort import FleetCohort
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.models.select import Selection
+from fleet_slip.models.summary import Selection
 from tests.support.commands import finish, run, run_on, start
 
 

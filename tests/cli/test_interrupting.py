@@ -17,9 +17,9 @@ import fleet_slip
 from fleet_slip import errors
 from fleet_slip.cli import app as program
 from fleet_slip.cli.app import COMMANDS, EXIT_CODES, GROUPS, CommandGroup, load_command
-from fleet_slip.models.request import SelectionOptions, SelectionRequest
+from fleet_slip.models.request import SelectionRequest
+from fleet_slip.regression.choice import CRITERIA
 from fleet_slip.regression.orders import METHODS, RANKINGS
-from fleet_slip.regression.subsets import CRITERIA
 from fleet_slip.storage.runs import LOGGER
 from tests.support.budget import processor_s
 from tests.support.commands import COMMAND, PATIENCE_S, run
@@ -265,12 +265,11 @@ def test_a_short_command_imports_no_large_library_in_vain(
 
 def test_select_and_publish_take_the_options_of_the_api() -> None:
     """Their help names every ranking, criterion and method."""
-    options = {*SelectionOptions.__annotations__}
+    options = {field.name for field in fields(SelectionRequest)}
     taken = {name: {one.name for one in load_command(name).params} for name in COMMANDS}
     assert taken["select"] - {"json", "cohort", "everything", "include_faulty", "save"} == options
     assert taken["publish"] & options == {"models", "label", "robust", "half_life", "prior"}
     assert len(taken["publish"] - {"name", "help", "context"}) <= 12
-    assert options == {field.name for field in fields(SelectionRequest)}
     helps = {one.name: one.help for one in load_command("select").params}
     for option, names in (("ranking", RANKINGS), ("criterion", CRITERIA), ("search", METHODS)):
         assert all(re.search(rf"\b{name}\b", helps[option]) for name in names)

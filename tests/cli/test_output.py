@@ -4,7 +4,7 @@ import contextlib
 import csv
 import io
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pyarrow.csv as pc
@@ -16,10 +16,7 @@ from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
 from fleet_slip.evaluation.evaluation_document import Evaluation
-from fleet_slip.models import select
-from fleet_slip.models.request import SelectionRequest
 from fleet_slip.rendering import TextTable
-from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand, run_on
 
 QUERY = "SELECT drive_id, rows, 52.660000000000004::DOUBLE AS exact FROM drives ORDER BY 1"
@@ -133,7 +130,6 @@ COMMANDS = [
     "models",
     "show smoke",
     "select",
-    "select --all-subsets",
     "select --order ay,yaw_rate,ax",
     "quality",
     "status",
@@ -141,22 +137,6 @@ COMMANDS = [
     "features --files",
     "diagnose smoke",
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def chosen_once() -> Iterator[None]:
-    """Let what is asked for again be shown again: to choose takes longer than to show."""
-    answer, answers = select.run_selection, dict[str, select.Selection]()
-
-    def once(warehouse: Warehouse, request: SelectionRequest, predicate: str) -> select.Selection:
-        asked = f"{request} {predicate}"
-        if asked not in answers:
-            answers[asked] = answer(warehouse, request, predicate)
-        return answers[asked]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(select, "run_selection", once)
-        yield
 
 
 @pytest.fixture(params=WIDTHS)

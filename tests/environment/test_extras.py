@@ -76,7 +76,7 @@ def test_querying_and_selecting_need_the_core_alone(root: Path, tmp_path: Path) 
         [*at, "sql", "SELECT count(*) FROM log"],
         [*at, "gram"],
         [*at, "select", "--models", "table1"],
-        [*at, "select", "--all-subsets", "--order", "ay,yaw_rate,ax", "--save", own],
+        [*at, "select", "--order", "ay,yaw_rate,ax", "--save", own],
         [*at, "publish", "core", "--models", own],
         [*at, "show", "core"],
         [*at, "score", "core"],

@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +14,6 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.diagnose import diagnose
 from fleet_slip.models.publish import manifest_of
 from fleet_slip.models.select import label_noise_deg
-from fleet_slip.regression.inference import ClusterUnit
 from fleet_slip.resources import Configs
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import connect
@@ -48,19 +46,23 @@ def test_figures_are_those_of_the_rows() -> None:
     assert document["design_effect"] == found.evidence.design_effect
 
 
-def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> None:
+def test_cars_are_independent_and_the_drives_of_a_single_car() -> None:
     """Against matrices of all rows, with the cars or the drives as clusters."""
     drives = driven(9, COEFFICIENTS, drives=22, rows=30)
     cohort = cohort_of(drives)
     owners = cohort.drives["vehicle_id"].to_pylist()
+    at = cohort.drives.schema.get_field_index("vehicle_id")
+    one_car = cohort.drives.set_column(at, "vehicle_id", pa.array(["a"] * len(drives)))
+    of_one = replace(cohort, drives=one_car)
     units = [float(CATALOG.input_scales[LABEL] / CATALOG.input_scales[name]) for name in INPUTS]
-    for cluster, groups in (("vehicle", owners), ("drive", [one.drive for one in drives])):
+    names = [one.drive for one in drives]
+    for cluster, groups, read in (("vehicle", owners, cohort), ("drive", names, of_one)):
         parts = [
             rows_of([d for d, of in zip(drives, groups, strict=True) if of == group])
             for group in sorted(set(groups))
         ]
         expected, degrees = by_rows(parts)
-        found = diagnose(cohort, INPUTS, cluster=cast(ClusterUnit, cluster))
+        found = diagnose(read, INPUTS)
         assert found.cluster == cluster
         slopes = found.robust.estimates[1:]
         errors = [estimate.standard_error for estimate in slopes]
@@ -69,10 +71,6 @@ def test_drives_of_a_car_are_one_piece_of_evidence_unless_told_otherwise() -> No
         np.testing.assert_allclose(of_t, degrees[1:], rtol=1e-6)
         assert found.robust.degrees_of_freedom == len(set(groups)) - 1
         assert found.evidence.kind == f"{cluster}s"
-    assert diagnose(cohort, INPUTS).cluster == "vehicle"
-    at = cohort.drives.schema.get_field_index("vehicle_id")
-    one_car = cohort.drives.set_column(at, "vehicle_id", pa.array(["a"] * len(drives)))
-    assert diagnose(replace(cohort, drives=one_car), INPUTS).cluster == "drive"
 
 
 def test_the_campaigns_noise_is_what_the_label_differs_from_the_truth_by(smoke_root: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import RefusedError
-from fleet_slip.models.select import Selection
+from fleet_slip.models.summary import Selection
 from fleet_slip.regression.gram import Gram, packed_position
 from tests.support.cars import counts, drive, gram_of
 from tests.support.counted_rows import START_S, row_of, write_counted

@@ -122,7 +122,7 @@ def test_a_version_names_its_prior_and_is_trained_so_again(
     "words",
     [
         ("--order", "ay,yaw_rate"),
-        ("--ranking", "tstat"),
+        ("--ranking", "forward"),
         ("--label", "course"),
     ],
 )

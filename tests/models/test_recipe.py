@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.errors import ConfigError, QuestionError
+from fleet_slip.errors import QuestionError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.manifest import SelectedBy
 from fleet_slip.models.publish import recipe_for, stored_options
 from fleet_slip.models.registry import Registry
-from fleet_slip.models.request import SelectionRequest, load_model_list
+from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -70,7 +70,6 @@ def test_what_is_asked_for_is_changed_alone_and_said(root: Path) -> None:
         {"models": "table1", "tolerance": "0.0001deg"},
         {"order": "ax,ay,yaw_rate", "intercept": False},
         {"order": "ax,ay,yaw_rate", "ranking": "backward", "criterion": "bic"},
-        {"order": "ax,ay,yaw_rate", "all_subsets": True},
         {"order": "ax,ay,yaw_rate,steer_fl", "search": "forward", "max_features": 3},
         {"model": "ay,steering_wheel", "group_by": "day", "folds": "each"},
     ],
@@ -103,26 +102,10 @@ def test_options_of_earlier_versions_are_read_under_their_old_names(tmp_path: Pa
     assert recipe_for(registry, "old", SelectionRequest()).request == SelectionRequest(
         order="ay,ax", ranking="forward", tolerance="1deg", max_features=3, group_by="day"
     )
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("most = 3", "max_features"),
-        ("fewest_drives = 3", "min_drives"),
-        ("columns_per_drive = 3", "max_features_per_drive"),
-        ('rule = "worth"', "tolerance"),
-    ],
-)
-def test_a_renamed_key_of_a_model_list_is_refused_with_its_new_name(
-    tmp_path: Path, old: str, new: str
-) -> None:
-    file = tmp_path / "own.toml"
-    file.write_text(
-        f'description = "own"\n[[model]]\nname = "1"\nsignals = ["ay"]\n[[search]]\n{old}\n'
-    )
-    with pytest.raises(ConfigError, match=f"own.toml: search.0: .* is now called .*{new}"):
-        load_model_list(CATALOG, str(file))
+    given_up = chosen.model_copy(update={"options": {**stored, "all_subsets": True}})
+    registry.add(manifest(name="older").model_copy(update={"selected_by": given_up}), b"")
+    with pytest.raises(QuestionError, match="older@1 was selected with all_subsets, which"):
+        recipe_for(registry, "older", SelectionRequest())
 
 
 def test_a_version_from_before_that_no_list_chose_needs_to_be_told(tmp_path: Path) -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 
 import fleet_slip
@@ -21,7 +19,6 @@ from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
 from fleet_slip.models.select import run_selection
 from fleet_slip.operations.monitor import Chart, Limits, monitor
-from fleet_slip.regression.inference import student_t_quantile
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import counts, drive
@@ -162,11 +159,6 @@ def test_the_share_of_usual_days_beyond_the_limits_is_what_was_asked_for() -> No
         days = rng.standard_normal(7).tolist()
         beyond += Limits.from_values(days[:6], 0.05).beyond(days[6])
     assert beyond / 2000 == pytest.approx(0.05, abs=0.015)  # three standard errors
-
-
-@given(st.floats(0.6, 0.9999), st.integers(2, 200))
-def test_quantiles_of_student_s_t(p: float, degrees: int) -> None:
-    assert student_t_quantile(p, degrees) == pytest.approx(stats.t.ppf(p, degrees), rel=1e-9)
 
 
 def test_the_command_tells_by_its_exit_code(

@@ -186,7 +186,7 @@ def test_a_choice_on_the_test_drives_understates_the_error(tmp_path: Path) -> No
     done_on(root, "gram")
     fleet = fleet_slip.open(root)
     search: Any = {"search": "exchange", "max_features": 3, "tolerance": "0deg", "folds": "each"}
-    selection = fleet.cohort().run_request(SelectionRequest(**search), nested=True)
+    selection = fleet.cohort().select(SelectionRequest(**search), nested=True)
     fleet.models.publish("again", selection, force=True)
     chosen = fleet_slip.open(root).models.get("again").manifest.signals
     fleet.models.publish("once", fleet.cohort().select(model=",".join(chosen)), force=True)
@@ -237,7 +237,7 @@ def test_quarters_of_drives_do_not_count_as_drives(own: Path, tmp_path: Path) ->
     request = SelectionRequest(models=str(tmp_path / "searches.toml"))
     drives = read_measured_drives(fleet.warehouse, load_cohort(fleet.warehouse, predicate))
     learner = Learner.prepare(fleet.warehouse, request, predicate, drives)
-    published = fleet.cohort(predicate).run_request(request)
+    published = fleet.cohort(predicate).select(request)
     chosen = learner.choose(folds_of(drives)[3])
     assert (
         chosen.skipped

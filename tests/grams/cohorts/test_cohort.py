@@ -15,9 +15,9 @@ from fleet_slip.grams.cohort import (
     MAX_LOST_SHARE,
     Cohort,
     DriveWeights,
-    Folding,
     FoldKey,
-    drive_folds,
+    assign_folds,
+    clustered_moments,
     hash_names,
     load_cohort,
     robust_weights,
@@ -112,24 +112,26 @@ COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 def test_a_fold_holds_out_whole_drives_cars_or_days(by: FoldKey, column: str) -> None:
     drives = driven(1, COEFFICIENTS, drives=20)
     cohort = cohort_of(drives)
-    training, fold_of = drive_folds(cohort, INPUTS, Folding(by=by, count=4))
-    pairs = set(zip(cohort.drives[column].to_pylist(), fold_of.tolist(), strict=True))
+    values = cohort.drives[column].to_pylist()
+    assignment = assign_folds(values, by, 4)
+    pairs = set(zip(values, assignment.fold.tolist(), strict=True))
     assert len(pairs) == len({value for value, _ in pairs})
-    for number, gram in enumerate(training.folds.grams):
-        mine = [one for one, fold in zip(drives, fold_of, strict=True) if fold == number]
+    folds = cohort.folds(by, 4).complete_cases(INPUTS, LABEL)
+    for number, gram in enumerate(folds.grams):
+        mine = [one for one, fold in zip(drives, assignment.fold, strict=True) if fold == number]
         assert gram == Gram.from_counts((*INPUTS, LABEL), rows_of(mine))
-    assert training.folds.total.n == 20 * 80
-    table = cohort.complete_cases(INPUTS).table
-    assert np.array_equal(training.drives.moments, DriveMoments.from_table(table).moments)
+    assert folds.total.n == 20 * 80
 
 
-def test_drives_without_a_signal_are_left_out_and_without_any_that_is_told() -> None:
+def test_cars_are_clusters_and_for_one_car_its_drives() -> None:
     cohort = cohort_of(driven(1, COEFFICIENTS))
-    training, fold = drive_folds(cohort, ["ay", "ax"], Folding(count=3))
-    assert training.drives.signals == ("ay", "ax", LABEL)
-    assert len(training.drives) == len(fold) == 12
+    cars = clustered_moments(cohort.complete_cases(["ay", "ax"]))
+    assert (cars.signals, cars.unit, len(cars)) == (("ay", "ax", LABEL), "vehicle", 4)
+    one_car = np.array(cohort.drives["vehicle_id"].to_pylist()) == "car-0"
+    of_one = clustered_moments(cohort.filter(one_car).complete_cases(["ay", "ax"]))
+    assert (of_one.unit, len(of_one)) == ("drive", 3)
     with pytest.raises(DataError, match="wheel_fl"):
-        drive_folds(cohort, ["ay", "wheel_fl"], Folding(count=3))
+        cohort.complete_cases(["ay", "wheel_fl"])
 
 
 def land_another(warehouse: Warehouse, number: int) -> None:

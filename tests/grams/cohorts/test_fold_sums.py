@@ -76,8 +76,9 @@ def test_models_are_compared_on_the_same_drives_or_not_at_all(
     land(warehouse, "one", *rows)
     update_grams(warehouse)
     plan = Folding(count=3)
-    whole = select(load_cohort(warehouse), MODELS.model, plan)
-    summed = select(load_cohort(warehouse, folding=plan), MODELS.model, plan)
+    shared = MODELS.model_copy(update={"folds": plan})
+    whole = select(load_cohort(warehouse), shared)
+    summed = select(load_cohort(warehouse, folding=plan), shared)
     assert summed.as_dict() == whole.as_dict()
     assert {model.name for model in summed.models} == compared
     assert {model.drives for model in summed.models} == drives

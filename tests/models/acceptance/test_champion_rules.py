@@ -13,9 +13,9 @@ from fleet_slip.models import acceptance as champion_rules
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import CANDIDATE, ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
-from fleet_slip.models.select import Selection, run_selection
+from fleet_slip.models.select import run_selection
+from fleet_slip.models.summary import Selection
 from fleet_slip.operations.forget import forget, models_trained_on
-from fleet_slip.regression.choice import ZERO_TOLERANCE
 from fleet_slip.regression.folds import cross_validate, held_out_errors, least_squares
 from fleet_slip.regression.least_squares import fit
 from fleet_slip.regression.orders import stepwise_order
@@ -147,7 +147,7 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules.PublishThresholds, "tolerance", ZERO_TOLERANCE)
+    monkeypatch.setattr(champion_rules.PublishThresholds, "tolerance", 0.0)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = run_selection(warehouse, SelectionRequest(model=every))

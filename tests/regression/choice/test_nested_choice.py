@@ -1,28 +1,12 @@
-"""Choosing among nested models, and the honest figures of the choice."""
+"""Choosing among nested models, and the distances of the paper."""
 
 import numpy as np
 import pytest
 
-from fleet_slip.errors import QuestionError
-from fleet_slip.regression.choice import (
-    CROSS_VALIDATION,
-    Rule,
-    TrainingFolds,
-    cross_validate_nested,
-    cross_validate_selection,
-    nested_fits,
-    select_nested,
-)
-from fleet_slip.regression.folds import (
-    CohortFolds,
-    by_value,
-    cross_validate,
-    error_sums,
-    least_squares,
-)
+from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.regression.choice import NestedChoice, Rule, choose_nested, nested_fits
+from fleet_slip.regression.folds import CohortFolds, by_value, cross_validate, least_squares
 from fleet_slip.regression.inference import DriveMoments, Evidence
-from fleet_slip.regression.least_squares import fit
-from fleet_slip.regression.subsets import best_size, best_subsets, pick_sizes
 from tests.support.counts import gram_of, names, table_of, unit_scales
 
 INPUTS = names(5)[:-1]
@@ -39,88 +23,70 @@ def sparse_drives(seed: int, drives: int = 40) -> list[np.ndarray]:
     return result
 
 
-def training_of(drives: list[np.ndarray]) -> tuple[TrainingFolds, np.ndarray]:
-    table = table_of([gram_of(counts) for counts in drives])
-    assignment = by_value([i % 5 for i in range(len(drives))])
-    folds = CohortFolds.from_tables([table], assignment).complete_cases(INPUTS, "y")
-    return TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5)), assignment.fold
+def chosen(seed: int, rule: Rule, cluster: int | None = None) -> NestedChoice:
+    """Choose in five folds; with a `cluster` all drives are one, so that rows are independent."""
+    table = table_of([gram_of(counts) for counts in sparse_drives(seed)])
+    folds = CohortFolds.from_tables([table], by_value([i % 5 for i in range(40)]))
+    clusters = None if cluster is None else np.full(40, cluster)
+    moments = DriveMoments.from_table(table, clusters)
+    complete = folds.complete_cases(INPUTS, "y")
+    return choose_nested(complete, moments, INPUTS, "y", unit_scales(5), rule)
 
 
-@pytest.mark.parametrize("ranking", ["forward", "backward", "t"])
-@pytest.mark.parametrize("criterion", ["bic", CROSS_VALIDATION])
+@pytest.mark.parametrize("ranking", ["forward", "backward"])
+@pytest.mark.parametrize("criterion", ["bic", "aic", "cv"])
 def test_the_signals_that_matter_are_found(ranking: str, criterion: str) -> None:
-    training, _ = training_of(sparse_drives(1))
-    selection = select_nested(training, INPUTS, "y", Rule(ranking, criterion))
-    assert set(selection.order[: selection.size]) == {"x2", "x4"}
-    assert selection.fit == fit(training.folds.total, selection.order[:2], "y")
-    assert len(selection.values) == 6
-    document = selection.as_dict()
-    assert document["signals"] == [*selection.signals]
+    choice = chosen(1, Rule(ranking, criterion))
+    assert {*choice.order[:2]} == {"x2", "x4"} <= {*choice.winner.model.signals}
+    if criterion != "aic":
+        assert choice.winner.model.signals == choice.order[:2]
+    assert [model.signals for model in choice.models] == [choice.order[:j] for j in range(1, 6)]
+    assert len(choice.values) == 6
+    document = choice.as_dict()
+    assert document["signals"] == [*choice.winner.model.signals]
     assert document["evidence"] == "drives"
-    assert np.argmin(selection.values) >= 2
+    assert np.argmin(choice.values) >= 2
+
+
+def test_nested_models_have_the_figures_of_their_own_cross_validation() -> None:
+    table = table_of([gram_of(counts) for counts in sparse_drives(2)])
+    folds = CohortFolds.from_tables([table], by_value([i % 5 for i in range(40)]))
+    complete = folds.complete_cases(INPUTS, "y")
+    for model in chosen(2, Rule("declared")).models:
+        procedure = least_squares(model.signals, "y")
+        assert model.sums == cross_validate("x", complete, procedure, unit_scales(5)).sums
 
 
 def test_rows_taken_for_independent_keep_signals_that_drives_do_not_support() -> None:
-    by_drives = by_rows = 0
+    rule, by_drives, by_rows = Rule("backward", "bic"), 0, 0
     for seed in range(8):
-        training, _ = training_of(sparse_drives(seed))
-        chosen = select_nested(training, INPUTS, "y", Rule("backward", "bic"))
-        by_drives += chosen.size
-        by_rows += best_size("bic", Evidence.naive(training.nested_fits(chosen.order, "y")))
+        by_drives += len(chosen(seed, rule).winner.model.signals)
+        single = chosen(seed, rule, cluster=0)
+        assert single.evidence.kind == "rows"
+        by_rows += len(single.winner.model.signals)
     assert by_drives < 8 * 2.5
     assert by_rows > 8 * 3.5
 
 
-def test_the_choice_is_made_again_inside_every_training_fold() -> None:
-    drives = sparse_drives(3, drives=20)
-    training, fold = training_of(drives)
-    rule = Rule("forward", "aic")
-    result = cross_validate_selection("rule", training, fold, INPUTS, "y", rule)
-    tests = []
-    for number in range(5):
-        rest = [drive for drive, f in zip(drives, fold, strict=True) if f != number]
-        table = table_of([gram_of(counts) for counts in rest])
-        folds = CohortFolds.from_tables([table], by_value([i % 4 for i in range(16)]))
-        inner = TrainingFolds(
-            folds.complete_cases(INPUTS, "y"), DriveMoments.from_table(table), unit_scales(5)
+def test_unknown_rules_and_criteria_that_keep_nothing_are_errors() -> None:
+    for rule, message in (
+        (Rule("size"), "Known rankings: declared, forward, backward"),
+        (Rule(criterion="cp"), "Known criteria: cv, aic, bic"),
+    ):
+        with pytest.raises(QuestionError, match=message):
+            chosen(1, rule)
+    noise = np.random.default_rng(3).integers(-500, 500, (40, 50, 6))
+    table = table_of([gram_of(counts) for counts in noise])
+    folds = CohortFolds.from_tables([table], by_value([i % 5 for i in range(40)]))
+    with pytest.raises(DataError, match="the criterion bic selects no signal"):
+        choose_nested(
+            folds.complete_cases(INPUTS, "y"),
+            DriveMoments.from_table(table),
+            INPUTS,
+            "y",
+            unit_scales(5),
+            Rule("forward", "bic"),
         )
-        model = select_nested(inner, INPUTS, "y", rule).fit.model
-        tests.append(error_sums(model, training.folds.grams[number]))
-    pooled = sum(tests[1:], tests[0])
-    assert result.pooled.rmse == pooled.figures(unit_scales(5)["y"]).rmse
-    assert result.pooled.correlation == pooled.figures(unit_scales(5)["y"]).correlation
-    assert result.signals == select_nested(training, INPUTS, "y", rule).fit.model.signals
-
-
-def test_nested_models_are_cross_validated_in_order() -> None:
-    training, _ = training_of(sparse_drives(2))
-    order = ("x4", "x2", "x1", "x3", "x5")
-    models = cross_validate_nested(training, order, "y")
-    assert [model.signals for model in models] == [order[:j] for j in range(6)]
-    alone = cross_validate("x", training.folds, least_squares(order[:2], "y"), training.scales)
-    assert models[2].pooled == alone.pooled
-
-
-def test_inner_cross_validation_needs_folds() -> None:
-    drives = sparse_drives(4, drives=6)
-    table = table_of([gram_of(counts) for counts in drives])
-    assignment = by_value([0, 0, 0, 1, 1, 1])
-    folds = CohortFolds.from_tables([table], assignment).complete_cases(INPUTS, "y")
-    training = TrainingFolds(folds, DriveMoments.from_table(table), unit_scales(5))
-    with pytest.raises(QuestionError, match="at least three folds"):
-        cross_validate_selection(
-            "x", training, assignment.fold, INPUTS, "y", Rule("t", CROSS_VALIDATION)
-        )
-
-
-def test_criteria_choose_among_the_best_subsets() -> None:
-    training, _ = training_of(sparse_drives(5))
-    selection = select_nested(training, INPUTS, "y", Rule("t", "cp"))
-    results = best_subsets(training.folds.total, INPUTS, "y")
-    picked = pick_sizes(results, selection.evidence)
-    assert picked["bic"] == 2
-    assert set(results[2].best.model.signals) == {"x2", "x4"}
-    assert results[2].as_dict()["signals"] == ["x2", "x4"]
 
 
 ORDER = ("x1", "x2", "x3", "x4")
@@ -139,7 +105,7 @@ def drawn(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 def evidence_of(x: np.ndarray, y: np.ndarray) -> Evidence:
     gram = gram_of(np.column_stack([x, y]).astype(np.int64))
-    return Evidence.naive(nested_fits(gram, ORDER, "y"))
+    return Evidence.measure(nested_fits(gram, ORDER, "y"))
 
 
 def test_the_distance_to_the_full_model_is_that_of_the_predictions() -> None:

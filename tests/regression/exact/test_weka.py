@@ -21,7 +21,7 @@ from fleet_slip.regression.folds import CrossValidation, Folds, cross_validate, 
 from fleet_slip.regression.gram import Gram
 from fleet_slip.regression.inference import Evidence
 from fleet_slip.regression.least_squares import LinearModel, fit
-from fleet_slip.regression.orders import backward
+from fleet_slip.regression.orders import rank
 from tests.support.counts import EVIDENCE, columns_to_counts, evidence
 
 Selection = Literal["none", "m5", "greedy"]
@@ -206,13 +206,13 @@ def test_exact_answers(name: str) -> None:
     model = fit(folds.total, inputs, label).model.physical(scales)
     expected = [Fraction(int(p), int(q)) for p, q in exact["ols_coef_fraction"]]
     assert [model.intercept, *model.coefficients] == expected
-    order = backward(folds.total, inputs, label)
+    order = rank("backward", folds.total, inputs, label)
     assert [inputs.index(s) for s in order] == exact["backward_order"]
     fits = nested_fits(folds.total, order, label)
     rss = [float(f.rss * scales[label] ** 2) for f in fits]
     np.testing.assert_allclose(rss, [float(v) for v in exact["nested_rss_in_backward_order"]])
     a = [float(v) for v in exact["A_j_in_backward_order"]]
-    np.testing.assert_allclose(Evidence.naive(fits).contributions, a, rtol=1e-13)
+    np.testing.assert_allclose(Evidence.measure(fits).contributions, a, rtol=1e-13)
     result = cross_validate("ols", folds, lambda g: fit(g, inputs, label).model, scales)
     answers = exact["cv10_seed1_weka_folds"]
     assert result.correlation == float(answers["corr"])
