@@ -46,6 +46,7 @@ from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S,
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.drive_sums import DriveBlocks
+from fleet_slip.grams.parquet_pages import RowGroup, read_page_headers, read_row_groups
 from fleet_slip.grams.update import (
     files_to_rewrite,
     gram_digests,
@@ -53,8 +54,6 @@ from fleet_slip.grams.update import (
     rows_to_keep,
     write_rows,
 )
-from fleet_slip.ingest.formats.parquet_footer import RowGroup, read_page_headers
-from fleet_slip.ingest.formats.tables import read_footer
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import read_sql
@@ -354,7 +353,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
     stream = pa.BufferReader(content)
     try:
-        _require_decodable(file, content, read_footer(stream, file))
+        _require_decodable(file, content, read_row_groups(content))
         schema = pq.ParquetFile(stream).schema_arrow
         columns = [name for name in COLUMNS.names if name in schema.names]
         if missing := set(COLUMNS.names).difference(columns, OPTIONAL):

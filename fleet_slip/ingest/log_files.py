@@ -11,23 +11,14 @@ from pathlib import Path
 from fleet_slip.base import pluralize, quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.file_groups import FileGroup, group_lake
-from fleet_slip.ingest.formats.confined_reader import FORMATS
-from fleet_slip.ingest.formats.parquet_footer import MAGIC
-from fleet_slip.ingest.formats.reading import StrayLink
+from fleet_slip.ingest.formats.reading import BEGINNINGS, SUFFIXES, StrayLink
 from fleet_slip.ingest.mapping import FilePattern, Mapping
-
-SUFFIXES = (
-    ".csv", ".csv.gz", ".csv.zst", ".parquet", ".pq", ".mf4", ".mdf", ".mat", ".h5", ".hdf5",
-    ".blf", ".asc", ".log", ".trc", ".mcap", ".tdms", ".vbo",
-)  # fmt: skip
 
 _COMPANIONS = (
     ".toml", ".dbc", ".kcd", ".sym", ".arxml", ".a2l", ".md", ".json", ".yaml", ".yml", ".pdf",
     ".png", ".jpg", ".py", ".sh", ".tdms_index",
 )  # fmt: skip
 """Suffixes of files beside logs that are not logs."""
-_BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
-"""First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
 
 WILDCARDS = frozenset("*?[")
 
@@ -178,7 +169,7 @@ def _begins_as_log(file: Path) -> bool:
     with suppress(OSError):
         if file.is_file():  # a pipe would be waited for
             with file.open("rb") as stream:
-                return stream.read(max(map(len, _BEGINNINGS))).startswith(_BEGINNINGS)
+                return stream.read(max(map(len, BEGINNINGS))).startswith(BEGINNINGS)
     return False
 
 

@@ -138,7 +138,7 @@ def test_runs_of_equal_values_are_not_unrolled(tmp_path: Path) -> None:
     one = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3 * 10**6, "i1")), pa.array([0.0]))
     pq.write_table(pa.table(dict.fromkeys(COLUMNS, one)), file)
     assert file.stat().st_size < 100_000
-    assert "3,000,000 rows or more" in failure(file)
+    assert "it has more than 1,000,000 rows" in failure(file)
 
 
 def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
     index = pq.read_metadata(file)
     index.set_file_path("../../secret.parquet")
     index.write_metadata_file(file)
-    assert "its values are in other files" in failure(file)
+    assert "cannot be read" in failure(file)
 
 
 def test_a_flipped_bit_of_a_footer_is_an_error(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_columns_that_unfold_to_many_bytes_are_not_read(
         pa.table({**numbers, "text": text}), file, compression="zstd", use_dictionary=False
     )
     assert file.stat().st_size < 10**7 / source.BYTES_PER_BYTE
-    assert "bytes decompress to" in failure(file)
+    assert "it decompresses to more than" in failure(file)
 
 
 # MDF
@@ -283,7 +283,7 @@ def blf(content: bytes, packed: bytes | None = None) -> bytes:
 @pytest.mark.parametrize(
     ("size", "message"),
     [
-        (0, "decoding its .* took more than 1 s"),
+        (0, "decoding it took more than 1 s"),
         (15, "cannot be read: Could not find next object"),
         (2**32 - 1, "an object in it is damaged, or ends too early"),
     ],
@@ -313,7 +313,7 @@ def test_what_a_trace_unfolds_to_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(source, "FREE_MEMORY", 2**26)
-    assert "need more than" in trace(tmp_path, "log.blf", blf(bytes(2**27)))
+    assert "needs more than" in trace(tmp_path, "log.blf", blf(bytes(2**27)))
 
 
 @pytest.mark.parametrize("name", ["log.asc.gz", "log.db", "log.mf4"])

@@ -1,10 +1,8 @@
 """CAN traces: written by python-can, with databases and payloads by cantools."""
 
-from collections import Counter
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import can
 import cantools
@@ -15,16 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleet_slip.errors import ConfigError, InputError
-from fleet_slip.ingest.formats import can as can_frames
-from fleet_slip.ingest.formats.can import (
-    CanFrames,
-    FrameBlock,
-    open_can_trace,
-    physical,
-    raw_numbers,
-)
+from fleet_slip.ingest.formats.can import open_can_trace, physical, raw_numbers
 from fleet_slip.ingest.formats.file_formats import CanBus, FileFormats, read_can_database
-from fleet_slip.ingest.formats.source import Budget, Spool
+from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.mapping import load_mapping
 from tests.support.can_files import Frame, asc_line, write_asc, write_blf
 from tests.support.catalog import CATALOG
@@ -165,7 +156,7 @@ def test_a_message_on_two_buses_must_be_told_apart(tmp_path: Path) -> None:
     log = read(file, MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "2"'))
     assert log.drives["ax"].to_pylist() == AX_COUNTS
     text = MAPPING.replace('"car.dbc"', '"car.dbc"\nchannel = "9"')
-    assert "not on the bus 9, but on 2, 3" in failure(file, text)
+    assert "not on the bus 9, but on the buses 2, 3" in failure(file, text)
 
 
 def test_a_database_that_does_not_fit_is_refused(tmp_path: Path) -> None:
@@ -274,34 +265,6 @@ def test_bus_logging_says_what_is_not_in_it(tmp_path: Path) -> None:
     assert "no message Motion (0x100)" in failure(tmp_path / "bus.mf4")
 
 
-@given(
-    st.lists(
-        st.tuples(st.floats(0, 9), st.sampled_from("ab"), st.binary(min_size=2, max_size=9)),
-        max_size=20,
-    ),
-    st.integers(1, 30),
-)
-def test_frames_that_are_kept_are_those_that_came(
-    came: list[tuple[float, str, bytes]], piece: int
-) -> None:
-    with mock.patch.object(can_frames, "PIECE_FRAMES", piece):
-        frames = CanFrames(Spool())
-        for time, on, data in came:
-            payload = np.frombuffer(data, dtype=np.uint8)[np.newaxis]
-            one, size = np.zeros(1, dtype=np.int64), np.array([len(data)])
-            frames.extend(FrameBlock(one, one > 0, np.array([time]), np.array([on]), size, payload))
-        assert frames.buses == sorted({bus for _, bus, _ in came})
-        for bus in ("a", "b", None):
-            mine = [(time, data) for time, on, data in came if bus in {None, on}]
-            assert frames.sizes_on(bus) == Counter(len(data) for _, data in mine)
-            found = [
-                (time, payload.tobytes())
-                for times, payloads in frames.take(bus, 2)
-                for time, payload in zip(times, payloads, strict=True)
-            ]
-            assert found == [(time, data[:2]) for time, data in mine]
-
-
 def test_a_trace_is_asked_for_one_message_after_the_other(tmp_path: Path) -> None:
     frames = [motion(i) for i in range(50)] + [mux(i, 0, 1.0) for i in range(50)]
     (tmp_path / "car.dbc").write_text(DBC)
@@ -339,7 +302,7 @@ def test_buses_have_the_numbers_of_the_trace(tmp_path: Path, suffix: str, fd: bo
 
     for bus, count in ((1, 1000), (2, -2000)):
         assert set(read(file, text(bus)).drives["ax"].to_pylist()) == {count}
-    assert "not on the bus 0, but on 1, 2" in failure(file, text(0))
+    assert "not on the bus 0, but on the buses 1, 2" in failure(file, text(0))
     assert "is on the buses 1, 2" in failure(file, dated)
 
 

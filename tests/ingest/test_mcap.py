@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 import pytest
 from mcap.writer import CompressionType
@@ -17,8 +16,7 @@ from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.format_values import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
-from tests.support.measured import failure, own_clock, read_measured
-from tests.support.reported import call
+from tests.support.measured import own_clock, read_measured
 
 HEADER = """std_msgs/Header header
 {}
@@ -129,53 +127,23 @@ def test_a_topic_of_which_a_part_cannot_be_decoded_is_refused(tmp_path: Path) ->
     )
 
 
-def test_a_field_with_a_text_far_down_is_one_of_texts(tmp_path: Path) -> None:
-    messages: list[Any] = [{"a": i / 4, "b": i, "c": None} for i in range(20)]
-    messages[0]["b"] = messages[0]["c"] = None
-    messages[17] |= {"b": "late", "c": 5}
+def test_a_field_is_one_of_texts_or_of_numbers(tmp_path: Path) -> None:
+    messages: list[Any] = [{"a": i / 4, "b": i, "c": None, "d": str(i)} for i in range(20)]
+    messages[0]["b"] = messages[17]["d"] = None
+    messages[17]["c"] = 5
     file = write_json(tmp_path / "log.mcap", messages)
     with mcap_log.open_mcap(Budget.for_file(file), FileFormats()) as source:
-        (base,) = source.bases(["imu.a", "imu.b", "imu.c"])
-        found = pl.concat(base)
-        assert found.height == 20
-        assert found["imu.a"].to_list() == [i / 4 for i in range(20)]
-        expected = [None, *(str(i) for i in range(1, 20))]
-        expected[17] = "late"
-        assert found["imu.b"].to_list() == expected
-        assert found["imu.c"].to_list() == [None] * 17 + [5.0, None, None]
-        assert found[OWN_TIME].is_sorted()  # two channels of one topic, in the file's order
-        assert next(f.columns for f in source.batches(["imu.a"])) == [OWN_TIME, "imu.a"]
-
-
-def test_what_is_in_it_is_listed(tmp_path: Path) -> None:
-    file = write(tmp_path / "log.mcap")
-    shown = json.loads(call(tmp_path, "mapping", "suggest", str(file), "--json"))
-    found = {one["channel"]: (one["rate_hz"], one["signal"]) for one in shown["channels"]}
-    assert found["/joints.velocity[1]"] == (pytest.approx(100), None)
-    assert found["/imu/data.linear_acceleration.x"][1] == "ax"
-    assert found["/imu/data.angular_velocity.z"][1] == "yaw_rate"
-    assert "/imu/data.header.frame_id" in found
-
-
-def test_what_is_not_in_it_is_named(tmp_path: Path) -> None:
-    file = write(tmp_path / "log.mcap")
-    absent = mapping(ax={"column": "/imu/data.linear_acceleration.w", "unit": "m/s^2"})
-    assert "Did the mapping mean '/imu/data.linear_acceleration.z'" in failure(file, absent)
-    absent = mapping(ax={"column": "/imu.x", "unit": "m/s^2"})
-    assert "no column '/imu.x'" in failure(file, absent)
-    text = mapping(ax={"column": "/joints.name[0]", "unit": "m/s^2"})
-    assert "100 not_a_number; first: ax = 'fl'" in failure(file, text)
-
-
-def test_a_chunk_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
-    file = write(tmp_path / "log.mcap", CompressionType.NONE)
-    data = bytearray(file.read_bytes())
-    at = data.index(np.float64(AX[50]).tobytes())
-    data[at] ^= 1
-    file.write_bytes(data)
-    assert "crc validation failed" in failure(file, mapping())
-
-
-def test_messages_in_another_encoding_are_named(tmp_path: Path) -> None:
-    file = write_json(tmp_path / "log.mcap", [{"a": 1.0}] * 2, ("protobuf", "protobuf"))
-    assert "no message in it can be decoded (protobuf)" in failure(file, mapping())
+        (base,) = source.bases(["imu.a", "imu.b", "imu.c", "imu.d"])
+        rows = pl.concat(base)
+        assert rows["imu.a"].to_list() == [i / 4 for i in range(20)]
+        assert rows["imu.b"].to_list() == [None, *range(1, 20)]
+        assert rows["imu.c"].to_list() == [None] * 17 + [5.0, None, None]
+        assert rows["imu.d"].to_list() == [*map(str, range(17)), None, "18", "19"]
+        assert rows[OWN_TIME].is_sorted()  # two channels of one topic, in the file's order
+    messages[19]["b"] = "late"
+    file = write_json(tmp_path / "log.mcap", messages)
+    with mcap_log.open_mcap(Budget.for_file(file), FileFormats()) as source:
+        with pytest.raises(InputError, match=r"'imu.b' has texts in some messages and numbers"):
+            list(source.batches(["imu.b"]))
+        with pytest.raises(InputError, match=r"no column 'imu.e'"):
+            list(source.batches(["imu.e"]))

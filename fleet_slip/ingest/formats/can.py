@@ -13,13 +13,11 @@ import logging
 import math
 import pickle
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
-from itertools import chain, islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,7 @@ from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Budget,
     Channel,
-    FormatSource,
+    Source,
     Spool,
     clock_start_s,
     is_missing_state,
@@ -94,13 +92,19 @@ def physical(signal: Any, raw: NDArray[Any]) -> FloatArray:
     return np.asarray(raw.astype(np.float64) * scale + offset, dtype=np.float64)
 
 
+def with_multiplexers(message: Any, signal: Any) -> list[Any]:
+    """Return a signal, the one that selects it if it is multiplexed, that one's, and so on."""
+    chain = [signal]
+    while chain[-1].multiplexer_ids is not None:
+        chain.append(message.get_signal_by_name(chain[-1].multiplexer_signal))
+    return chain
+
+
 def is_sent(message: Any, signal: Any, payloads: Bytes) -> BoolArray:
     """Return in which frames a multiplexed signal is; in all, if it is not multiplexed."""
     sent = np.ones(len(payloads), dtype=np.bool_)
-    while signal.multiplexer_ids is not None:
-        selector = message.get_signal_by_name(signal.multiplexer_signal)
-        sent &= np.isin(raw_integers(selector, payloads), list(signal.multiplexer_ids))
-        signal = selector
+    for selected, selector in pairwise(with_multiplexers(message, signal)):
+        sent &= np.isin(raw_integers(selector, payloads), list(selected.multiplexer_ids))
     return sent
 
 
@@ -114,72 +118,34 @@ def _bits(signal: Any) -> list[tuple[int, int]]:
     return [(place // 8, 7 - place % 8) for place in places]
 
 
-@dataclass(frozen=True)
-class FrameBlock:
-    """Frames in the order of the file: identifiers, flags for 29 bits, times in s, buses.
-
-    `data`, shape (frames, bytes), is padded to the longest frame; `sizes` are the bytes of each.
-    """
-
-    numbers: IntArray
-    extended: BoolArray
-    times_s: FloatArray
-    buses: NDArray[Any]
-    sizes: IntArray
-    data: Bytes
-
-    def where(self, chosen: Any) -> "FrameBlock":
-        """Return some of them, by flags or places."""
-        return FrameBlock(*(column[chosen] for column in vars(self).values()))
+Frames = pl.DataFrame
+"""Frames in the order of the file: `key` of the message, `OWN_TIME`, `bus`, `size` in bytes, and
+`payload`, padded to the longest."""
 
 
-def joined(blocks: Sequence[FrameBlock]) -> FrameBlock:
-    """Return several blocks as one."""
-    widest = max(block.data.shape[1] for block in blocks)
-    columns = list(zip(*(vars(block).values() for block in blocks), strict=True))
-    columns[-1] = tuple(np.pad(data, ((0, 0), (0, widest - data.shape[1]))) for data in columns[-1])
-    return FrameBlock(*map(np.concatenate, columns))
+def frame_table(
+    identifiers: IntArray,
+    extended: BoolArray,
+    times_s: FloatArray,
+    buses: Sequence[str] | IntArray,
+    sizes: IntArray,
+    payloads: Bytes,
+) -> Frames:
+    """Return frames as a table; payloads have shape (frames, bytes)."""
+    width = payloads.shape[1]
+    columns = {
+        "key": identifiers << 1 | extended,
+        OWN_TIME: times_s,
+        "bus": pl.Series(buses).cast(pl.String),
+        "size": np.minimum(sizes, width),
+        "payload": pl.Series(payloads, dtype=pl.Array(pl.UInt8, width)),
+    }
+    return pl.DataFrame(columns)
 
 
-class CanFrames:
-    """The frames of one message, in the order in which they came."""
-
-    def __init__(self, spool: Spool) -> None:
-        """Begin without frames; those beyond the limit of memory go to `spool`."""
-        self._spool = spool
-        self._waiting: list[FrameBlock] = []
-        self._frame_counts: Counter[tuple[str, int]] = Counter()
-
-    def extend(self, block: FrameBlock) -> None:
-        """Keep frames of the message."""
-        buses = block.buses.astype(np.str_)
-        for bus in np.unique(buses).tolist():
-            for size, frames in zip(*np.unique_counts(block.sizes[buses == bus]), strict=True):
-                self._frame_counts[bus, int(size)] += int(frames)
-        self._waiting.append(replace(block, buses=buses))
-        if sum(len(block.sizes) for block in self._waiting) >= PIECE_FRAMES:
-            self._spool.add(self, pickle.dumps(joined(self._waiting)))
-            self._waiting = []
-
-    @property
-    def buses(self) -> list[str]:
-        """The buses that the message is on, sorted."""
-        return sorted({bus for bus, _ in self._frame_counts})
-
-    def sizes_on(self, bus: str | None) -> Counter[int]:
-        """Return how many frames have how many bytes, on a bus or on all."""
-        sizes = Counter[int]()
-        for (frame_bus, size), frames in self._frame_counts.items():
-            sizes[size] += frames if bus in {None, frame_bus} else 0
-        return +sizes
-
-    def take(self, bus: str | None, size: int) -> Iterator[tuple[FloatArray, Bytes]]:
-        """Yield times and first bytes of the payloads on a bus, or on all, piece by piece."""
-        pieces = map(pickle.loads, self._spool.read(self))
-        for block in chain(pieces, [joined(self._waiting)] if self._waiting else []):
-            selected = block if bus is None else block.where(block.buses == bus)
-            if selected.sizes.size:
-                yield selected.times_s, selected.data[:, :size]
+def _key(message: Any) -> int:
+    """Return the identifier of a message, and in bit 0 whether it has 29 bits."""
+    return int(message.frame_id << 1 | message.is_extended_frame)
 
 
 def parse_database(bus: CanBus) -> Any:
@@ -199,8 +165,8 @@ def parse_database(bus: CanBus) -> Any:
 # A trace, read by python-can.
 
 SUFFIXES = {".blf", ".asc", ".log", ".trc"}
-AT_ONCE = 2**14
-"""Frames of python-can that are kept together."""
+AT_ONCE = 2**16
+"""Frames that are read at once."""
 
 
 _ASC_TIME = re.compile(r"\s*(-?\d+[.,]\d+)\s+(.*)", re.DOTALL)
@@ -238,7 +204,7 @@ class _AscLines:
         """Leave the file open: python-can calls this at its end."""
 
 
-def _read_trace(budget: Budget, zone: str | None) -> Iterator[FrameBlock]:
+def _read_trace(budget: Budget, zone: str | None) -> Iterator[Frames]:
     """Yield the data frames of a trace. Raises `InputError`."""
     if budget.file.suffix.lower() not in SUFFIXES:
         raise InputError(
@@ -266,7 +232,7 @@ def _read_trace(budget: Budget, zone: str | None) -> Iterator[FrameBlock]:
             local = datetime.fromtimestamp(trace.start_timestamp, UTC).replace(tzinfo=None)
             shift_s = clock_start_s(local, zone) - trace.start_timestamp
         for frames in _data_frames(trace):
-            yield _block_of(frames, shift_s, bus_offset=int(is_blf))
+            yield _table_of(frames, shift_s, bus_offset=int(is_blf))
         if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
             raise InputError(
                 f"{quote_name(budget.file)}: an object in it is damaged, or ends too early. Copy "
@@ -274,7 +240,7 @@ def _read_trace(budget: Budget, zone: str | None) -> Iterator[FrameBlock]:
             )
 
 
-def _read_asc(file: Path, can: Any, zone: str | None) -> Iterator[FrameBlock]:
+def _read_asc(file: Path, can: Any, zone: str | None) -> Iterator[Frames]:
     """Yield the data frames of an ASC trace, with dates if the mapping states their time zone."""
     with file.open(encoding="cp1252", errors="replace") as text:
         lines = _AscLines(text, can)
@@ -287,7 +253,7 @@ def _read_asc(file: Path, can: Any, zone: str | None) -> Iterator[FrameBlock]:
         for frames in _data_frames(timed()):
             start = lines.start if zone is not None else None
             start_s = 0.0 if start is None else clock_start_s(start, zone)
-            yield _block_of(frames, start_s, bus_offset=1)
+            yield _table_of(frames, start_s, bus_offset=1)
 
 
 def _data_frames(frames: Iterable[Any]) -> Iterator[list[Any]]:
@@ -304,29 +270,29 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
     return False
 
 
-def _block_of(frames: list[Any], start_s: float, bus_offset: int) -> FrameBlock:
+def _table_of(frames: list[Any], start_s: float, bus_offset: int) -> Frames:
     """Return frames of python-can, which counts the buses of ASC and BLF from 0, they from 1."""
-    payloads = b"".join(bytes(frame.data).ljust(MAX_FRAME_BYTES, b"\0") for frame in frames)
+    sizes = np.array([len(frame.data) for frame in frames])
+    width = max(int(sizes.max()), 1)
+    payloads = b"".join(bytes(frame.data).ljust(width, b"\0") for frame in frames)
     buses = (frame.channel for frame in frames)
-    return FrameBlock(
+    return frame_table(
         np.array([frame.arbitration_id for frame in frames]),
         np.array([frame.is_extended_id for frame in frames]),
         start_s + np.array([frame.timestamp for frame in frames]),
-        np.array([str(bus + bus_offset if isinstance(bus, int) else bus) for bus in buses]),
-        np.array([len(frame.data) for frame in frames]),
-        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, MAX_FRAME_BYTES),
+        [str(bus + bus_offset if isinstance(bus, int) else bus) for bus in buses],
+        sizes,
+        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, width),
     )
 
 
-_Key = tuple[int, bool]
-"""Number of a message, and whether it is of 29 bits."""
-
-
-class CanSource(FormatSource):
+class CanSource(Source):
     """The messages of a CAN trace, or of a file with bus logging."""
 
+    has_clock = True
+
     def __init__(
-        self, file: Path, formats: FileFormats, blocks: Callable[[], Iterator[FrameBlock]]
+        self, file: Path, formats: FileFormats, read_frames: Callable[[], Iterator[Frames]]
     ) -> None:
         """Take a file, its keys in the mapping, and the function that reads its frames."""
         if formats.can is None:
@@ -334,21 +300,21 @@ class CanSource(FormatSource):
                 f'{quote_name(file)}: this format needs [can] with database = "….dbc" in the '
                 f"mapping {formats.name!r}."
             )
-        self._file, self._bus, self._spool, self._blocks = file, formats.can, Spool(), blocks
-        self._formats = formats
-        self._database = parse_database(formats.can)
-        self._messages = {message.name: message for message in self._database.messages}
-        self._identifiers_to_keep: set[_Key] = set()
-        self._numbers: set[_Key] = set()
-        """Identifiers of the messages in the trace, after it was read."""
+        self._file, self._bus, self._formats = file, formats.can, formats
+        self._spool, self._read_frames = Spool(), read_frames
+        self._messages = {m.name: m for m in parse_database(formats.can).messages}
+        self._spooled: set[int] = set()
+        self._counts = pl.DataFrame()
+        """Number of frames by key, bus and size, after the trace was read."""
 
     def channels(self) -> list[Channel]:
         """Return the signals of all messages of the trace that the database contains."""
-        self._want({_key(message) for message in self._database.messages})
+        self._spool_messages(self._messages)
+        present = set(self._counts["key"])
         return [
             Channel(f"{message.name}.{signal.name}", signal.unit or "", message.name)
-            for message in self._database.messages
-            if _key(message) in self._numbers
+            for message in self._messages.values()
+            if _key(message) in present
             for signal in message.signals
         ]
 
@@ -358,61 +324,62 @@ class CanSource(FormatSource):
         signals = self._messages[name].signals if name in self._messages else ()
         signal = next((s for s in signals if s.name == signal_name and is_possible(s)), None)
         if signal is None:
-            names = [
-                f"{m}.{s.name}" for m, signals in self._messages.items() for s in signals.signals
-            ]
+            names = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
             raise missing_column(self._bus.database, column, names)
         if not math.isfinite(signal.scale) or not signal.scale:
             raise InputError(
-                f"{quote_name(self._bus.database)}: the conversion of {column!r} is not linear "
-                "(one "
-                "factor and offset). Make it so, or map another signal."
+                f"{quote_name(self._bus.database)}: the conversion of {column!r} is not one factor "
+                "and offset. Make it so, or map another signal."
             )
         return name, signal
 
-    def prepare(self, places_by_base: dict[str, dict[str, Any]]) -> None:
-        """Read the trace for some messages."""
-        self._want({_key(self._messages[name]) for name in places_by_base})
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each message that has one of the columns. Raises `InputError`."""
+        self._spool_messages({self.find(column)[0] for column in columns})
+        return super().bases(columns)
 
-    def _want(self, keys: set[_Key]) -> None:
+    def _spool_messages(self, names: Iterable[str]) -> None:
         """Read the trace, once more if it was read without these messages."""
-        if not self._numbers or not keys <= self._identifiers_to_keep:
-            self._identifiers_to_keep |= keys
-            self._spool.clear()
-            self._frames = {key: CanFrames(self._spool) for key in self._identifiers_to_keep}
-            self._numbers = set()
-            for block in self._blocks():
-                self._keep(block)
-            if not self._numbers:
-                raise InputError(
-                    f"{quote_name(self._file)}: it has no CAN frames. Record it again."
-                )
+        keys = {_key(self._messages[name]) for name in names}
+        if not self._counts.is_empty() and keys <= self._spooled:
+            return
+        self._spooled |= keys
+        self._spool.clear()
+        counts = []
+        for frames in self._read_frames():
+            counts.append(frames.group_by("key", "bus", "size").len())
+            wanted_frames = frames.filter(pl.col("key").is_in(self._spooled))
+            for piece in wanted_frames.partition_by("key", maintain_order=True):
+                self._spool.add(piece["key"][0], pickle.dumps(piece))
+        if not counts:
+            raise InputError(f"{quote_name(self._file)}: it has no CAN frames. Record it again.")
+        self._counts = pl.concat(counts).group_by("key", "bus", "size").agg(pl.sum("len"))
 
     def read(self, name: str, signals: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield the signals of one message; rows are frames that have one of them."""
-        message, needed = self._messages[name], max(map(needed_bytes, signals.values()))
-        frames = self._require_usable(message, next(iter(signals)), needed)
-        states = {
-            column
-            for column, signal in signals.items()
-            if signal.choices and self._has_states(message, signal)
-        }
-        names = {
-            column
-            for column in states
-            if not self._formats.reads_number(column, map(str, signals[column].choices.values()))
-        }
-        for times_s, payloads in frames.take(self._bus.channel, needed):
-            frame = {OWN_TIME: pl.Series(times_s)}
+        message = self._messages[name]
+        self._require_usable(message, signals)
+        states = {c for c, signal in signals.items() if self._has_states(message, signal)}
+        for times_s, payloads in self._frames_of(message):
+            values = {OWN_TIME: pl.Series(times_s)}
             has_value = np.zeros(len(times_s), dtype=np.bool_)
             for column, signal in signals.items():
                 sent = is_sent(message, signal, payloads)
                 has_value |= sent
-                raw = raw_numbers(signal, payloads)
-                frame[column] = _values(
-                    signal, raw, sent, as_names=column in names, is_state=column in states
-                ).alias(column)
-            yield pl.DataFrame(frame).filter(has_value)
+                values[column] = self._values(column, signal, payloads, sent, column in states)
+            yield pl.DataFrame(values).filter(has_value)
+
+    def _frames_of(self, message: Any) -> Iterator[tuple[FloatArray, Bytes]]:
+        """Yield times and payloads of the frames on the bus of the mapping, piece by piece."""
+        for piece in map(pickle.loads, self._spool.read(_key(message))):
+            on_bus = pl.lit(value=True) if self._bus.channel is None else self._is_on_bus
+            frames = piece.filter(on_bus)
+            if frames.height:
+                yield frames[OWN_TIME].to_numpy(), frames["payload"].to_numpy()
+
+    @property
+    def _is_on_bus(self) -> pl.Expr:
+        return pl.col("bus") == self._bus.channel
 
     def _has_states(self, message: Any, signal: Any) -> bool:
         """Return True if the names of a signal are states, and at least half of its values named.
@@ -420,82 +387,62 @@ class CanSource(FormatSource):
         A quantity, with a unit or a factor, has names for missing values alone.
         """
         is_quantity = signal.is_float or signal.scale != 1 or signal.offset != 0
-        if is_quantity or not names_states(map(str, signal.choices.values())):
+        if is_quantity or not names_states(map(str, (signal.choices or {}).values())):
             return False
         named = total = 0
-        for _, payloads in self._frames[_key(message)].take(
-            self._bus.channel, needed_bytes(signal)
-        ):
+        for _, payloads in self._frames_of(message):
             sent = is_sent(message, signal, payloads)
-            named += int(
-                (np.isin(raw_numbers(signal, payloads), list(signal.choices)) & sent).sum()
-            )
+            named += int(np.isin(raw_numbers(signal, payloads)[sent], list(signal.choices)).sum())
             total += int(sent.sum())
         return 2 * named > total
 
-    def _require_usable(self, message: Any, column: str, needed: int) -> CanFrames:
-        """Return the frames of a message. Raises `InputError` if their sizes differ."""
-        frames = self._frames[_key(message)]
-        if _key(message) not in self._numbers:
-            known_ids = sum(_key(m) in self._numbers for m in self._database.messages)
+    def _values(
+        self, column: str, signal: Any, payloads: Bytes, sent: BoolArray, is_state: bool
+    ) -> pl.Series:
+        """Return a signal, null where it was not sent: names, or numbers but those for no value."""
+        raw = raw_numbers(signal, payloads)
+        choices = {value: str(text) for value, text in (signal.choices or {}).items()}
+        if is_state and not self._formats.reads_number(column, choices.values()):
+            names = [choices.get(v) if s else None for v, s in zip(raw.tolist(), sent, strict=True)]
+            return pl.Series(column, names, dtype=pl.String)
+        absent = [v for v, text in choices.items() if not is_state or is_missing_state(text)]
+        if is_state:  # a value without a name is missing
+            absent += list(set(np.unique(raw).tolist()) - set(choices))
+        values = pl.Series(column, physical(signal, raw))
+        return values.set(pl.Series(~sent | np.isin(raw, absent)), None)
+
+    def _require_usable(self, message: Any, signals: dict[str, Any]) -> None:
+        """Raise `InputError` for frames that are absent, on several buses, or too short."""
+        counts = self._counts.filter(pl.col("key") == _key(message))
+        database, title = self._bus.database, f"{message.name} ({message.frame_id:#x})"
+        if counts.is_empty():
+            present = self._counts["key"].unique()
+            matches = present.is_in([_key(m) for m in self._messages.values()]).sum()
             raise InputError(
-                f"{quote_name(self._file)}: no message {message.name} ({message.frame_id:#x}). Of "
-                "the "
-                f"{len(self._numbers)} identifiers in the trace, {known_ids} are in "
-                f"{self._bus.database}. Is it the database of this car and bus?"
+                f"{quote_name(self._file)}: no message {title}. Of the {len(present)} identifiers "
+                f"in the trace, {matches} are in {database}. Is it the database of this car and "
+                "bus?"
             )
-        buses = frames.buses
-        if self._bus.channel is None and len(buses) > 1:
+        buses = sorted(counts["bus"].unique())
+        if len(buses) > 1 if self._bus.channel is None else self._bus.channel not in buses:
+            on_it = "" if self._bus.channel is None else f"not on the bus {self._bus.channel}, but "
             raise InputError(
-                f"{quote_name(self._file)}: the message {message.name} is on the buses "
-                f"{', '.join(buses)}. Choose one in the mapping: [can] channel = "
+                f"{quote_name(self._file)}: the message {message.name} is {on_it}on "
+                f"the buses {', '.join(buses)}. Choose one in the mapping: [can] channel = "
                 f'"{buses[0]}".'
             )
-        if self._bus.channel is not None and self._bus.channel not in buses:
-            raise InputError(
-                f"{quote_name(self._file)}: the message {message.name} is not on the bus "
-                f"{self._bus.channel}, but on {', '.join(buses)}. Choose one in the mapping: [can] "
-                f'channel = "{buses[0]}".'
-            )
-        sizes = frames.sizes_on(self._bus.channel)
-        short = sum(number for size, number in sizes.items() if size < needed)
-        if short:
-            raise InputError(
-                f"{quote_name(self._file)}: {short:,} of {sizes.total():,} frames of "
-                f"{message.name} ({message.frame_id:#x}) are too short: {column} ends "
-                f"in byte {needed}, the longest has {max(sizes, default=0)}; buses: "
-                f"{', '.join(buses)}. Is {self._bus.database} the database of this car and bus?"
-            )
-        return frames
-
-    def _keep(self, block: FrameBlock) -> None:
-        """Keep the frames of the wanted messages, and note the numbers of all."""
-        keys = block.numbers << 1 | block.extended
-        order = np.argsort(keys, kind="stable")
-        distinct, firsts = np.unique(keys[order], return_index=True)
-        for key, chosen in zip(distinct.tolist(), np.split(order, firsts[1:]), strict=True):
-            identifier = key >> 1, bool(key & 1)
-            self._numbers.add(identifier)
-            if identifier in self._frames:
-                self._frames[identifier].extend(block.where(chosen))
-
-
-def _values(
-    signal: Any, raw: NDArray[Any], sent: BoolArray, *, as_names: bool, is_state: bool
-) -> pl.Series:
-    """Return a signal, null where it was not sent: names, or numbers but those for no value."""
-    choices = {value: str(text) for value, text in (signal.choices or {}).items()}
-    if as_names:
-        names = [choices.get(v) if s else None for v, s in zip(raw.tolist(), sent, strict=True)]
-        return pl.Series(names, dtype=pl.String)
-    absent = [v for v, text in choices.items() if not is_state or is_missing_state(text)]
-    if is_state and raw.size:  # a value without a name is missing
-        absent += list(set(np.unique(raw).tolist()) - set(choices))
-    return pl.Series(physical(signal, raw)).set(pl.Series(~sent | np.isin(raw, absent)), None)
-
-
-def _key(message: Any) -> _Key:
-    return message.frame_id, message.is_extended_frame
+        if self._bus.channel is not None:
+            counts = counts.filter(self._is_on_bus)
+        for column, signal in signals.items():
+            end = max(map(needed_bytes, with_multiplexers(message, signal)))
+            short = counts.filter(pl.col("size") < end)["len"].sum()
+            if short:
+                raise InputError(
+                    f"{quote_name(self._file)}: {short:,} of {counts['len'].sum():,} frames of "
+                    f"{title} are too short: {column} ends in byte {end}, the longest has "
+                    f"{max(counts['size'])}; buses: {', '.join(buses)}. Is {database} the "
+                    "database of this car and bus?"
+                )
 
 
 @contextmanager

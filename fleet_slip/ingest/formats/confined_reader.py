@@ -40,21 +40,32 @@ from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 
 
 class Format(NamedTuple):
-    """The first bytes of a format's files, the module that opens them, and its packages."""
+    """A binary format: first bytes and suffixes of its files, its module, and its packages."""
 
+    name: str
     begins: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
     module: str
     packages: tuple[str, ...]
 
 
+_MDF = ("asammdf",)
 FORMATS = {
-    "mdf": Format((b"MDF     ", b"UnFinMF "), "mdf", ("asammdf",)),
-    "mdf_bus": Format((), "mdf", ("asammdf", "cantools")),
-    "mcap": Format((b"\x89MCAP0\r\n",), "mcap", ("mcap.stream_reader", "mcap_ros2.decoder")),
-    "tdms": Format((b"TDSm",), "tdms", ("nptdms",)),
-    "mat": Format((b"MATLAB 5.0 MAT-file",), "matlab", ("scipy.io",)),
-    "mat73": Format((b"\x89HDF\r\n\x1a\n",), "matlab", ("h5py",)),
-    "can_trace": Format((b"LOGG",), "can", ("can", "cantools")),
+    "mdf": Format("an MDF file", (b"MDF     ", b"UnFinMF "), (".mf4", ".mdf"), "mdf", _MDF),
+    "mdf_bus": Format("bus logging", (), (), "mdf", (*_MDF, "cantools")),
+    "mcap": Format("an MCAP file", (b"\x89MCAP0\r\n",), (".mcap",), "mcap", ("mcap_ros2.decoder",)),
+    "tdms": Format("a TDMS file", (b"TDSm",), (".tdms",), "tdms", ("nptdms",)),
+    "mat": Format(
+        "a MATLAB file of version 5", (b"MATLAB 5.0 MAT-file",), (), "matlab", ("scipy.io",)
+    ),
+    "mat73": Format(
+        "a MATLAB file of version 5 or 7.3",
+        (b"\x89HDF\r\n\x1a\n",),
+        (".mat", ".h5", ".hdf5"),
+        "matlab",
+        ("h5py",),
+    ),
+    "can_trace": Format("a BLF file", (b"LOGG",), (".blf",), "can", ("can", "cantools")),
 }
 """Each has `open_FORMAT` in its module."""
 SIZES = struct.Struct("<QQ")
@@ -65,14 +76,11 @@ class Job:
     """The task of a reader: a file and its limits."""
 
     format: str
-    file: str
-    size: int
+    budget: Budget
     formats: FileFormats
     cwd: str
     folder: str
     """For its temporary files."""
-    limits: tuple[int, int, int]
-    """Bytes of memory and of a temporary file, and seconds of a processor."""
 
 
 def open_here(name: str, budget: Budget, formats: FileFormats) -> AbstractContextManager[Source]:
@@ -91,9 +99,9 @@ def serve(control: int) -> None:
             name, descriptors, *_ = socket.recv_fds(asking, 100, 1)
             if not descriptors:
                 return
-            _, module, packages = FORMATS[name.decode()]
-            importlib.import_module(f"{__package__}.{module}")
-            for package in packages:
+            file_format = FORMATS[name.decode()]
+            importlib.import_module(f"{__package__}.{file_format.module}")
+            for package in file_format.packages:
                 with contextlib.suppress(ImportError):  # the reader reports the missing package
                     importlib.import_module(package)
             reader = os.fork()
@@ -125,18 +133,19 @@ class _Reader:
             job: Job = pickle.load(requests)  # noqa: S301 - of our own parent
             os.chdir(job.cwd)
             tempfile.tempdir = job.folder
-            confine(parent, job.file, job.folder, *job.limits)
-            budget = Budget(Path(job.file), job.size)
+            confine(parent, job)
+            file = os.fspath(job.budget.file)
 
             def open_it() -> bool:
-                self._source = opened.enter_context(open_here(job.format, budget, job.formats))
+                source = open_here(job.format, job.budget, job.formats)
+                self._source = opened.enter_context(source)
                 return self._source.has_clock
 
-            if not self._answer(job.file, open_it):
+            if not self._answer(file, open_it):
                 return
             for line in requests:
                 name, *arguments = json.loads(line)
-                self._answer(job.file, partial(getattr(self, name), *arguments))
+                self._answer(file, partial(getattr(self, name), *arguments))
                 if name == "rows":
                     self._look_ahead(*arguments)
 
@@ -254,24 +263,22 @@ _PERM, _NOSYS = 1, 38
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
-def confine(parent: int, file: str, folder: str, memory: int, disk: int, seconds: int) -> None:
+def confine(parent: int, job: Job) -> None:
     """Confine this process, a child of `parent`, to a file and a folder; it cannot be undone.
 
-    `memory` are the bytes that it may take beyond what it has, `disk` those of a temporary file,
-    `seconds` those of a processor. The process ends with its parent; if the machine runs out of
-    memory, the kernel kills it first.
+    The process ends with its parent; if the machine runs out of memory, the kernel kills it first.
     """
     _call(_LIBC.prctl(_PDEATHSIG, signal.SIGKILL, 0, 0, 0))
     if os.getppid() != parent:
         os._exit(1)
     Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + memory)
-    _limit(resource.RLIMIT_FSIZE, disk)
-    _limit(resource.RLIMIT_CPU, seconds)
+    _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + job.budget.memory)
+    _limit(resource.RLIMIT_FSIZE, job.budget.unfolded)
+    _limit(resource.RLIMIT_CPU, int(10 * job.budget.seconds) + 1)
     _limit(resource.RLIMIT_CORE, 0)
     _call(_LIBC.prctl(_NO_NEW_PRIVS, 1, 0, 0, 0))
-    _close_files(file, folder)
+    _close_files(os.fspath(job.budget.file), job.folder)
     _forbid_calls()
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
-from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
+from fleet_slip.ingest.formats.source import Budget, Channel, Source, find_column
 
 # The layout of a CSV file: encoding, separator, and the lines of header and data.
 
@@ -74,10 +74,8 @@ _FIRST_ROWS = 100
 """Number of first rows; one of them must have as many fields as the header has names."""
 
 
-class CsvSource(FormatSource):
+class CsvSource(Source):
     """A CSV file, or one that is compressed."""
-
-    has_clock = False
 
     def __init__(self, budget: Budget, csv_format: CsvFormat, numbers: PlainNumbers) -> None:
         """Take a file and how it is written; it is opened to be read."""

@@ -19,7 +19,7 @@ from fleet_slip.ingest.formats.source import (
     MAX_COLUMNS,
     Budget,
     Channel,
-    FormatSource,
+    Source,
     as_column,
     load_library,
     missing_column,
@@ -89,10 +89,8 @@ class Matrix:
         return np.asarray(self._values[place])
 
 
-class Vectors(FormatSource):
+class Vectors(Source):
     """The vectors of an open file. Time is one of them."""
-
-    has_clock = False
 
     def __init__(
         self, matrices: Mapping[str, Matrix], budget: Budget, refused: Mapping[str, str]

@@ -2,16 +2,16 @@
 
 A column is `TOPIC.FIELD`, such as `/imu/data.linear_acceleration.y`, and `/joints.velocity[2]` of
 an array. The time of a message is its header's stamp, else the time of publication. The file is
-read once for its topics, and once more for the columns of a mapping.
+read once for its topics, and once more for each topic with columns of a mapping.
 """
 
-import io
 import json
 import re
 from array import array
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import islice
 from typing import Any
 
 import polars as pl
@@ -23,8 +23,7 @@ from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Budget,
     Channel,
-    FormatSource,
-    Spool,
+    Source,
     load_library,
     missing_column,
 )
@@ -106,19 +105,14 @@ def _decoder_of(channel: Any, schema: Any) -> Decode | None:
     return decode_plain
 
 
-_Fields = dict[str, str]
-"""Paths of fields in the messages of one topic, by column."""
-
-
-class McapSource(FormatSource):
+class McapSource(Source):
     """The topics of an MCAP file."""
+
+    has_clock = True
 
     def __init__(self, budget: Budget) -> None:
         """Take the file."""
-        self._file, self._spool = budget.file, Spool()
-        self._decoded: dict[str, _Fields] = {}
-        self._numbers: set[str] = set()
-        self._texts: set[str] = set()
+        self._file = budget.file
 
     def channels(self) -> list[Channel]:
         """Return the numbers and texts in the first message of each topic."""
@@ -136,23 +130,46 @@ class McapSource(FormatSource):
         topic = max(topics, key=len)
         return topic, column[len(topic) + 1 :]
 
-    def prepare(self, places_by_base: dict[str, _Fields]) -> None:
-        """Decode columns and put them aside, unless they are. Raises `InputError`."""
-        if any(
-            not fields.keys() <= self._decoded.get(topic, {}).keys()
-            for topic, fields in places_by_base.items()
-        ):
-            self._decode(places_by_base)
-        for topic, fields in places_by_base.items():
-            for column in fields.keys() - self._numbers - self._texts:
-                names = [f"{topic}.{name}" for name in self._topics[topic]]
-                raise missing_column(self._file, column, names)
+    def read(self, topic: str, fields: dict[str, str]) -> Iterator[pl.DataFrame]:
+        """Yield fields of a topic, texts or numbers. Raises `InputError` for a field without any.
 
-    def read(self, topic: str, places: _Fields) -> Iterator[pl.DataFrame]:
-        """Yield fields of a topic."""
-        texts = [pl.col(column).cast(pl.String) for column in places if column in self._texts]
-        for piece in self._spool.read(topic):
-            yield pl.read_ipc_stream(piece).select(OWN_TIME, *places).with_columns(texts)
+        A field whose first messages have no value is one of numbers.
+        """
+        rows = self._rows(topic, [parse_path(name) for name in fields.values()])
+        texts: dict[str, bool] = {}
+        absent = set(fields)
+        while piece := list(islice(rows, PIECE_ROWS)):
+            times_s, *values_of_fields = zip(*piece, strict=True)
+            columns = [pl.Series(OWN_TIME, times_s, dtype=pl.Float64)]
+            for column, values in zip(fields, values_of_fields, strict=True):
+                types = {isinstance(value, str) for value in values if value is not None}
+                is_text = texts.setdefault(column, types == {True})
+                if types - {is_text}:
+                    raise InputError(
+                        f"{quote_name(self._file)}: {column!r} has texts in some messages and "
+                        "numbers in others. Map another field."
+                    )
+                absent -= {column} if types else set()
+                kind = pl.String if is_text else pl.Float64
+                columns.append(pl.Series(column, values, dtype=kind, strict=False))
+            yield pl.DataFrame(columns)
+        for column in absent:
+            names = [f"{topic}.{name}" for name in self._topics[topic]]
+            raise missing_column(self._file, column, names)
+
+    def _rows(self, topic: str, paths: Sequence[_Path]) -> Iterator[list[Any]]:
+        """Yield the time in s and the values of fields of each message of a topic."""
+        for channel, decode, message in self._messages():
+            if channel.topic != topic:
+                continue
+            if decode is None:
+                raise InputError(
+                    f"{quote_name(self._file)}: topic {topic!r} has messages in an encoding that "
+                    f"is not supported ({channel.message_encoding!r}). Map another topic."
+                )
+            content = decode(message.data)
+            values = (value_at(content, path) for path in paths)
+            yield [stamp_s(content, message.publish_time), *values]
 
     @cached_property
     def _topics(self) -> dict[str, list[str]]:
@@ -187,53 +204,6 @@ class McapSource(FormatSource):
                 elif kind == "Channel" and record.id not in channels:
                     decode = _decoder_of(record, schemas.get(record.schema_id))
                     channels[record.id] = record, decode
-
-    def _decode(self, fields_by_topic: dict[str, _Fields]) -> None:
-        """Put columns of some topics aside."""
-        self._spool.clear()
-        self._decoded, self._numbers, self._texts = {}, set(), set()
-        waiting: dict[str, list[list[Any]]] = {topic: [] for topic in fields_by_topic}
-        paths = {
-            topic: [parse_path(name) for name in fields.values()]
-            for topic, fields in fields_by_topic.items()
-        }
-        for channel, decode, message in self._messages():
-            topic = channel.topic
-            if topic not in fields_by_topic:
-                continue
-            if decode is None:
-                raise InputError(
-                    f"{quote_name(self._file)}: topic {topic!r} has messages in an encoding that "
-                    "is "
-                    f"not supported ({channel.message_encoding!r}). Record it in one encoding, or "
-                    "map another topic."
-                )
-            content = decode(message.data)
-            values = [value_at(content, path) for path in paths[topic]]
-            waiting[topic].append([stamp_s(content, message.publish_time), *values])
-            if len(waiting[topic]) >= PIECE_ROWS:
-                self._put_aside(topic, fields_by_topic[topic], waiting[topic])
-                waiting[topic] = []
-        for topic, rows in waiting.items():
-            self._put_aside(topic, fields_by_topic[topic], rows)
-        self._decoded = fields_by_topic
-
-    def _put_aside(self, topic: str, fields: _Fields, rows: list[list[Any]]) -> None:
-        times_s, *values = zip(*rows, strict=True) if rows else [()] * (1 + len(fields))
-        columns = [pl.Series(OWN_TIME, times_s, dtype=pl.Float64)]
-        columns += [self._column(*pair) for pair in zip(fields, values, strict=True)]
-        content = io.BytesIO()
-        pl.DataFrame(columns).write_ipc_stream(content)
-        self._spool.add(topic, content.getvalue())
-
-    def _column(self, column: str, values: Sequence[Any]) -> pl.Series:
-        """Return some values of a column: all of it are numbers, or texts."""
-        present = [value for value in values if value is not None]
-        if all(isinstance(value, int | float) for value in present):
-            self._numbers |= {column} if present else set()
-            return pl.Series(column, values, dtype=pl.Float64, strict=False)
-        self._texts.add(column)
-        return pl.Series(column, [v if v is None else str(v) for v in values], dtype=pl.String)
 
 
 @contextmanager

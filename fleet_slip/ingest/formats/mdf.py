@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.can import Bytes, CanSource, FrameBlock
+from fleet_slip.ingest.formats.can import Bytes, CanSource, Frames, frame_table
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import (
     OWN_TIME,
     Budget,
     Channel,
-    FormatSource,
+    Source,
     as_column,
     clock_start_s,
     is_missing_state,
@@ -158,8 +158,10 @@ _EXTENDED = 1 << 31
 _IDENTIFIER = (1 << 29) - 1
 
 
-class MdfSource(FormatSource):
+class MdfSource(Source):
     """An open MDF file. A channel of several groups is named `CHANNEL@GROUP`."""
+
+    has_clock = True
 
     def __init__(self, mdf: Any, budget: Budget, formats: FileFormats) -> None:
         """Take a file opened by asammdf, and its format in the mapping."""
@@ -320,7 +322,7 @@ class MdfSource(FormatSource):
                 "the file again."
             )
 
-    def frames(self) -> Iterator[FrameBlock]:
+    def frames(self) -> Iterator[Frames]:
         """Yield the CAN frames of bus logging. Raises `InputError`."""
         groups = [number for number, _ in self._mdf.channels_db.get(f"{_FRAME}ID", ())]
         groups = [n for n in groups if self._mdf.groups[n].channel_group.cycles_nr]
@@ -346,14 +348,9 @@ class MdfSource(FormatSource):
                 if "IDE" in samples:
                     extended |= samples["IDE"].astype(np.int64) != 0
                 sizes = samples.get("DataLength", np.full(len(numbers), payloads.shape[1]))
-                yield FrameBlock(
-                    numbers & _IDENTIFIER,
-                    extended,
-                    self._times_s(window[0]),
-                    samples.get("BusChannel", np.zeros(len(numbers))).astype(np.int64),
-                    np.minimum(sizes.astype(np.int64), payloads.shape[1]),
-                    payloads,
-                )
+                buses = samples.get("BusChannel", np.zeros(len(numbers))).astype(np.int64)
+                times_s, sizes = self._times_s(window[0]), sizes.astype(np.int64)
+                yield frame_table(numbers & _IDENTIFIER, extended, times_s, buses, sizes, payloads)
 
     def _places(self, name: str) -> list[tuple[int, int]]:
         places = self._mdf.channels_db.get(name, ())

@@ -1,36 +1,52 @@
 """Opens measured files of any format: text and Parquet here, others by a confined process.
 
-The first bytes identify the format; for text also the mapping and the file's suffix.
+The first bytes identify the format; for text also the mapping and the file's suffix. The process
+that forks readers (`confined_reader`) is started once, and ends with this one. A reader is not
+trusted: its answers are checked.
 """
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+import atexit
+import json
+import os
+import pickle
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from functools import cache
 from pathlib import Path, PosixPath
+from tempfile import TemporaryDirectory
+from threading import Lock
+from typing import Any
 
 import polars as pl
 import pyarrow as pa
 
+from fleet_slip import errors
 from fleet_slip.base import quote_name
-from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.confined import open_confined
-from fleet_slip.ingest.formats.confined_reader import FORMATS
+from fleet_slip.errors import FleetSlipError, InputError
+from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Format, Job
 from fleet_slip.ingest.formats.csv import CsvSource
 from fleet_slip.ingest.formats.file_formats import CsvFormat, FileFormats
-from fleet_slip.ingest.formats.parquet_footer import MAGIC
-from fleet_slip.ingest.formats.source import Budget, Source, unreadable
-from fleet_slip.ingest.formats.tables import open_parquet
+from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
+from fleet_slip.ingest.formats.tables import MAGIC, open_parquet
 from fleet_slip.ingest.formats.vbo import VBO_BEGINS, VboSource
 
+_PARQUET = Format("a Parquet file", (MAGIC,), (".parquet", ".pq"), "tables", ())
+SUFFIXES = (
+    *(".csv", ".csv.gz", ".csv.zst", ".vbo", ".asc", ".log", ".trc"),
+    *(suffix for kind in (_PARQUET, *FORMATS.values()) for suffix in kind.suffixes),
+)
+"""How the names of logs end."""
+BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
+"""First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
 [_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
-_BINARY = {
-    (".parquet", ".pq"): "a Parquet file",
-    (".mf4", ".mdf"): "an MDF file",
-    (".mat", ".h5", ".hdf5"): "a MATLAB file of version 5 or 7.3",
-    (".mcap",): "an MCAP file",
-    (".tdms", ".tdms_index"): "a TDMS file",
-}
 
 
 class StrayLink(PosixPath):
@@ -43,8 +59,7 @@ def require_unchanged_log(log: Path) -> Iterator[None]:
     if isinstance(log, StrayLink):
         raise InputError(
             f"{quote_name(log)}: a symbolic link out of its folder, not followed. Give the file by "
-            "its "
-            "own path."
+            "its own path."
         )
     if not log.is_file():
         problem = "is not a regular file" if log.exists() else "no such file"
@@ -73,10 +88,7 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         start = stream.read(_HDF5_AT + len(_HDF5))
     for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
-            raise InputError(
-                f"{quote_name(file)}: it is an archive. Unpack it with {program} and give the "
-                "files."
-            )
+            raise InputError(f"{quote_name(file)}: it is an archive. Unpack it with {program}.")
     suffix = file.suffix.lower()
     begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
     name = next(
@@ -90,12 +102,11 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
         return open_parquet(budget)
     if name:
         return open_confined(name, budget, formats)
-    for suffixes, kind in _BINARY.items():
-        if suffix in suffixes:
+    for file_format in (_PARQUET, *FORMATS.values()):
+        if suffix in file_format.suffixes:
             raise InputError(
-                f"{quote_name(file)}: not {kind}, despite its suffix. Export it again, or correct "
-                "the "
-                "suffix."
+                f"{quote_name(file)}: not {file_format.name}, despite its suffix. Export it again, "
+                "or correct the suffix."
             )
     if VBO_BEGINS.match(start) and formats.csv == CsvFormat():
         return nullcontext(VboSource(budget, formats.plain_numbers))
@@ -116,3 +127,168 @@ def file_errors(file: Path) -> Iterator[None]:
         pl.exceptions.PanicException,
     ) as error:
         raise unreadable(file, error) from None
+
+
+# Readers of binary formats, each a process that the kernel confines to its file.
+
+_SERVE = (
+    "import sys; sys.path[:] = sys.argv[2:]; "
+    "from fleet_slip.ingest.formats.confined_reader import serve; serve(int(sys.argv[1]))"
+)
+_ENVIRONMENT = {
+    "POLARS_MAX_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_MMAP_THRESHOLD_": "1000000000",
+    "MALLOC_TRIM_THRESHOLD_": "1000000000",
+    "TZ": "UTC",
+}
+"""Else libraries reserve memory for threads that a reader does not need. Clocks without a zone are
+in UTC, so that the result does not depend on the zone of this machine."""
+_INHERITED = ("LD_LIBRARY_PATH",)
+_MAX_TEXT_BYTES = 2**26
+_ONE_AT_A_TIME = Lock()
+
+
+@cache
+def _server(_pid: int) -> tuple["subprocess.Popen[bytes]", socket.socket]:
+    """Start the server that forks readers. A forked process starts its own."""
+    ours, theirs = socket.socketpair()
+    inherited = {name: os.environ[name] for name in _INHERITED if name in os.environ}
+    with theirs:
+        process = subprocess.Popen(  # noqa: S603 - our own interpreter
+            [sys.executable, "-I", "-X", "utf8", "-c", _SERVE, str(theirs.fileno())]
+            + [str(Path(place).absolute()) for place in sys.path],
+            env=_ENVIRONMENT | inherited,
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+    atexit.register(_end, process, ours)
+    return process, ours
+
+
+def _end(process: "subprocess.Popen[bytes]", control: socket.socket) -> None:
+    control.close()
+    process.kill()
+    process.wait()
+
+
+def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
+    """Return the socket of a new reader, and the handle to kill it."""
+    ours, theirs = socket.socketpair()
+    handles: list[int] = []
+    with _ONE_AT_A_TIME, theirs:
+        for _ in range(2):  # the server may have ended since the last file: then another forks
+            process, control = _server(os.getpid())
+            with suppress(OSError):
+                socket.send_fds(control, [name.encode()], [theirs.fileno()])
+                _, handles, *_ = socket.recv_fds(control, 1, 1)
+            if handles:
+                break
+            _server.cache_clear()
+            _end(process, control)
+    if not handles:
+        ours.close()
+        raise budget.crashed()
+    return ours, handles[0]
+
+
+class ConfinedSource(Source):
+    """A file read by another process, whose answers are checked."""
+
+    def __init__(self, channel: socket.socket, budget: Budget) -> None:
+        """Take the reader's socket and the file's limits."""
+        self._channel, self._budget = channel, budget
+        self.has_clock = bool(self._receive()[0])
+
+    def channels(self) -> list[Channel]:
+        """Return all that can be read, in the file's order."""
+        return [Channel(*map(str, fields)) for fields in self._ask("channels")[0]]
+
+    def unreadable(self) -> list[str]:
+        """Return why parts of the file are not read."""
+        return [str(text) for text in self._ask("unreadable")[0]]
+
+    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
+        """Return the rows of each time base that has one of the columns. Raises `InputError`."""
+        return [self._read(number) for number in self._ask("bases", list(columns))[0]]
+
+    def _read(self, base: int) -> Iterator[pl.DataFrame]:
+        while True:
+            names, content = self._ask("rows", base)
+            if names is None:
+                return
+            try:
+                table = pa.ipc.open_stream(content).read_all()
+                table.validate(full=True)
+                frame = pl.DataFrame(table)
+                frame.columns = [str(name) for name in names]
+            except (pa.ArrowException, pl.exceptions.PolarsError, OSError, ValueError):
+                raise self._budget.crashed() from None
+            yield frame
+
+    def _ask(self, *question: Any) -> tuple[Any, bytearray]:
+        """Send a question; return the reader's answer and rows. Raises `InputError`."""
+        with suppress(OSError):  # then nothing comes back
+            self._channel.sendall(json.dumps(question).encode() + b"\n")
+        return self._receive()
+
+    def _receive(self) -> tuple[Any, bytearray]:
+        """Receive an answer and rows. Raises `InputError`."""
+        until_s = time.monotonic() + self._budget.seconds
+        text, size = SIZES.unpack(self._take(SIZES.size, until_s))
+        if text > _MAX_TEXT_BYTES or size > self._budget.memory:
+            raise self._budget.crashed()
+        try:
+            answer = json.loads(self._take(text, until_s))
+        except (ValueError, RecursionError):
+            raise self._budget.crashed() from None
+        return self._require_answer(answer), self._take(size, until_s)
+
+    def _require_answer(self, answer: Any) -> Any:
+        if not isinstance(answer, dict) or not {"found", "error"} & answer.keys():
+            raise self._budget.crashed()
+        if "found" in answer:
+            return answer["found"]
+        if answer["error"] == "MemoryError":
+            raise self._budget.over_memory()
+        kind = getattr(errors, str(answer["error"]), InputError)
+        is_ours = isinstance(kind, type) and issubclass(kind, FleetSlipError)
+        raise (kind if is_ours else InputError)(str(answer.get("text")))
+
+    def _take(self, size: int, until_s: float) -> bytearray:
+        """Receive so many bytes. Raises `InputError` if they do not come in time."""
+        taken = bytearray(size)
+        remaining = memoryview(taken)
+        while remaining:
+            self._channel.settimeout(max(until_s - time.monotonic(), 1e-3))
+            try:
+                received = self._channel.recv_into(remaining)
+            except TimeoutError:
+                raise self._budget.over_time() from None
+            except OSError:
+                received = 0
+            if not received:
+                raise self._budget.crashed()
+            remaining = remaining[received:]
+        return taken
+
+
+@contextmanager
+def open_confined(name: str, budget: Budget, formats: FileFormats) -> Iterator[Source]:
+    """Open a file of a format for reading by another process. Raises `InputError`."""
+    with TemporaryDirectory(prefix="fleet-slip-", ignore_cleanup_errors=True) as folder:
+        channel, handle = _fork_reader(name, budget)
+        try:
+            channel.sendall(pickle.dumps(Job(name, budget, formats, str(Path.cwd()), folder)))
+            yield ConfinedSource(channel, budget)
+        finally:
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(handle, signal.SIGKILL)
+            select.select([handle], [], [])  # until it is gone, and its locks
+            os.close(handle)
+            channel.close()

@@ -74,9 +74,12 @@ class Channel:
 
 
 class Source(ABC):
-    """A file that is open for reading."""
+    """A file that is open for reading.
 
-    has_clock = True
+    A format implements `find` and `read`; a source of several files implements `bases`.
+    """
+
+    has_clock = False
     """True if its times are in `OWN_TIME`."""
 
     @abstractmethod
@@ -87,7 +90,14 @@ class Source(ABC):
         """Return why parts of the file are not read."""
         return []
 
-    @abstractmethod
+    def find(self, column: str) -> tuple[str, Any]:
+        """Return the name of a column's time base, and its place there. Raises `InputError`."""
+        raise NotImplementedError
+
+    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
+        """Yield the rows of some columns of a base, in bounded batches, at least one."""
+        raise NotImplementedError
+
     def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
         """Return the rows of each time base that has one of the columns; without a clock of one.
 
@@ -95,35 +105,16 @@ class Source(ABC):
         base as text, 64-bit floats or integers, dates or timestamps, and `OWN_TIME` with a clock.
         Raises `InputError`, for a missing or ambiguous column too.
         """
+        places_by_base: dict[str, dict[str, Any]] = {}
+        for column in columns:
+            base, place = self.find(column)
+            places_by_base.setdefault(base, {})[column] = place
+        return [self.read(base, places) for base, places in places_by_base.items()]
 
     def batches(self, columns: Sequence[str]) -> Iterator[pl.DataFrame]:
         """Yield the rows of each time base that has one of the columns, base by base."""
         for base in self.bases(columns):
             yield from base
-
-
-class FormatSource(Source):
-    """A file of a format: finds columns, and reads those of one base."""
-
-    @abstractmethod
-    def find(self, column: str) -> tuple[str, Any]:
-        """Return the name of a column's time base, and its place there. Raises `InputError`."""
-
-    @abstractmethod
-    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
-        """Yield the rows of some columns of a base, in bounded batches, at least one."""
-
-    def prepare(self, places_by_base: dict[str, dict[str, Any]]) -> None:
-        """Get ready to read some columns of some bases, where a file is read as a whole first."""
-
-    def bases(self, columns: Sequence[str]) -> list[Iterator[pl.DataFrame]]:
-        """Return the rows of each time base that has one of the columns. Raises `InputError`."""
-        places_by_base: dict[str, dict[str, Any]] = {}
-        for column in columns:
-            base, place = self.find(column)
-            places_by_base.setdefault(base, {})[column] = place
-        self.prepare(places_by_base)
-        return [self.read(base, places) for base, places in places_by_base.items()]
 
 
 def load_library(file: Path, package: str) -> Any:
@@ -150,27 +141,22 @@ def as_column(file: Path, name: str, values: np.ndarray[Any, Any]) -> pl.Series:
     Integers of 64 bits may be identifiers, whose digits a float would lose. Raises `InputError` for
     other types.
     """
-    if values.ndim != 1:
+    kind = values.dtype.kind
+    if values.ndim != 1 or kind not in "SUOMiufb":
+        shape = " x ".join(map(str, values.shape))
         raise InputError(
-            f"{quote_name(file)}: channel {name!r} has {' x '.join(map(str, values.shape))} "
-            "values, "
-            "not one a row. Map one of its columns."
+            f"{quote_name(file)}: channel {name!r} has {shape} values of the type {values.dtype}, "
+            "not one number or text a row. Map another one, or one of its columns."
         )
-    if values.dtype.kind == "S":
+    if kind == "S":
         return pl.Series(name, [text.decode("utf-8", "replace").strip("\0") for text in values])
-    if values.dtype.kind in "UO":
+    if kind in "UO":
         return pl.Series(name, [str(text) for text in values], pl.String)
-    if values.dtype.kind == "M":
+    if kind == "M":
         return pl.Series(name, values.astype("M8[us]"))
-    if values.dtype.kind not in "iufb":
-        raise InputError(
-            f"{quote_name(file)}: channel {name!r} is of the type {values.dtype}, neither a number "
-            "nor "
-            "text. Map another one."
-        )
-    is_long = values.dtype.kind in "iu" and values.dtype.itemsize == 8
-    kind = values.dtype.newbyteorder("=") if is_long else np.dtype(np.float64)
-    return pl.Series(name, np.ascontiguousarray(values, dtype=kind))
+    is_long = kind in "iu" and values.dtype.itemsize == 8
+    number = values.dtype.newbyteorder("=") if is_long else np.dtype(np.float64)
+    return pl.Series(name, np.ascontiguousarray(values, dtype=number))
 
 
 _NO_STATE = re.compile(
@@ -197,22 +183,15 @@ def find_column(file: Path, names: Sequence[str], column: str) -> int:
         raise InputError(
             f"{quote_name(file)}: {len(names):,} columns, at most {MAX_COLUMNS:,} are read."
         )
-    matches = [i for i, name in enumerate(names) if name == column]
-    if len(matches) > 1:
-        where = ", ".join(str(i + 1) for i in matches[:5])
+    same = [name for name in names if re.sub(r"@\d+$", "", name) == column]
+    if len(same) > 1:
         raise InputError(
-            f"{quote_name(file)}: {len(matches)} columns are called {column!r} (number {where}). "
-            "Rename all but one."
+            f"{quote_name(file)}: {len(same)} columns are called {column!r}. Map one of "
+            f"{', '.join(map(repr, same[:5]))}, or rename all but one."
         )
-    if not matches:
-        several = [name for name in names if name.rpartition("@")[0] == column]
-        if len(several) > 1 and all(name.rpartition("@")[2].isdigit() for name in several):
-            raise InputError(
-                f"{quote_name(file)}: {len(several)} columns are called {column!r}. Choose one: "
-                f"{', '.join(map(repr, several[:5]))}."
-            )
+    if column not in names:
         raise missing_column(file, column, names)
-    return matches[0]
+    return names.index(column)
 
 
 def describe_unknown(signal: str, signals: Iterable[str]) -> str:
@@ -228,12 +207,8 @@ def missing_column(file: object, column: str, names: Sequence[str]) -> MissingCo
     """Return the error of a column that is not among a file's."""
     folded = {name.casefold(): name for name in names}
     matches = difflib.get_close_matches(column.casefold(), folded, n=3, cutoff=0.6)
-    similar = [folded[match] for match in matches]
-    hint = (
-        f" Did the mapping mean {' or '.join(repr(name[:80]) for name in similar)}?"
-        if similar
-        else ""
-    )
+    similar = " or ".join(repr(folded[match][:80]) for match in matches)
+    hint = f" Did the mapping mean {similar}?" if similar else ""
     present = ", ".join(repr(name[:80]) for name in names[:_SHOWN_COLUMNS])
     more = f" and {len(names) - _SHOWN_COLUMNS:,} more" if len(names) > _SHOWN_COLUMNS else ""
     return MissingColumnError(
@@ -257,77 +232,68 @@ FREE_S, BYTES_PER_S = 60.0, 10**5
 
 @dataclass(frozen=True)
 class Budget:
-    """The limits of decoding a file."""
+    """The limits of decoding a file.
+
+    Attributes
+    ----------
+    size
+        Bytes of the file.
+    rows, unfolded, memory
+        Maximum number of rows, of bytes after decompression, and of bytes of a reader's memory.
+    seconds
+        Maximum time of decoding, in s.
+    """
 
     file: Path
     size: int
-    """Bytes of the file."""
+    rows: int
+    unfolded: int
+    memory: int
+    seconds: float
 
     @classmethod
     def for_file(cls, file: Path) -> "Budget":
         """Return the budget of a file. Raises `OSError`."""
-        return cls(file, file.stat().st_size)
-
-    @property
-    def rows(self) -> int:
-        """Maximum number of rows."""
-        return max(FREE_ROWS, ROWS_PER_BYTE * self.size)
-
-    @property
-    def unfolded(self) -> int:
-        """Maximum number of bytes after decompression."""
-        return max(FREE_BYTES, BYTES_PER_BYTE * self.size)
-
-    @property
-    def memory(self) -> int:
-        """Maximum bytes of memory of a confined reader."""
-        return FREE_MEMORY + MEMORY_PER_BYTE * self.size
-
-    @property
-    def seconds(self) -> float:
-        """Maximum time of decoding, in s."""
-        return max(FREE_S, self.size / BYTES_PER_S)
+        size = file.stat().st_size
+        return cls(
+            file,
+            size,
+            rows=max(FREE_ROWS, ROWS_PER_BYTE * size),
+            unfolded=max(FREE_BYTES, BYTES_PER_BYTE * size),
+            memory=FREE_MEMORY + MEMORY_PER_BYTE * size,
+            seconds=max(FREE_S, size / BYTES_PER_S),
+        )
 
     def require_rows(self, rows: int) -> None:
         """Raise `InputError` for more rows than a file of its size can have."""
         if rows > self.rows:
-            raise self._too_much(
-                f"{rows:,} rows or more in {self.size:,} bytes; the limit for a file of this size "
-                f"is {self.rows:,}"
-            )
+            raise self.exceeded(f"it has more than {self.rows:,} rows")
 
     def require_unfolded(self, size: int) -> None:
         """Raise `InputError` for more bytes than a file of its size can unfold to."""
         if size > self.unfolded:
-            raise self._too_much(
-                f"its {self.size:,} bytes decompress to {size:,} or more; the limit for a file of "
-                f"this size is {self.unfolded:,}"
-            )
-
-    def over_memory(self) -> InputError:
-        """Return the error of a file whose reader asked for more memory, or longer files."""
-        return self._too_much(
-            f"its {self.size:,} bytes need more than {self.memory:,} in memory or "
-            f"{self.unfolded:,} in a temporary file"
-        )
+            raise self.exceeded(f"it decompresses to more than {self.unfolded:,} bytes")
 
     def crashed(self) -> InputError:
         """Return the error of a file whose reader ended without a word, or talks nonsense."""
-        return self._too_much(
-            f"its reader crashed, or was stopped because it took more than {self.memory:,} bytes "
-            "of memory"
+        return self.exceeded(f"its reader crashed, or took more than {self.memory:,} bytes")
+
+    def over_memory(self) -> InputError:
+        """Return the error of a file whose reader asked for more memory, or longer files."""
+        return self.exceeded(
+            f"its reader needs more than {self.memory:,} bytes, or {self.unfolded:,} in a "
+            "temporary file"
         )
 
     def over_time(self) -> InputError:
         """Return the error of a file that took too long."""
-        return self._too_much(
-            f"decoding its {self.size:,} bytes took more than {self.seconds:,.0f} s"
-        )
+        return self.exceeded(f"decoding it took more than {self.seconds:,.0f} s")
 
-    def _too_much(self, problem: str) -> InputError:
+    def exceeded(self, problem: str) -> InputError:
+        """Return the error of a file that is too much for its size."""
         return InputError(
-            f"{quote_name(self.file)}: {problem}. Is it damaged? If it is a real recording, "
-            "export it as uncompressed CSV."
+            f"{quote_name(self.file)}: {problem}, the limit for its {self.size:,} bytes. Is it "
+            "damaged? If it is a real recording, export it as uncompressed CSV."
         )
 
     def metered(self, batches: Iterator[pl.DataFrame]) -> Iterator[pl.DataFrame]:
@@ -378,16 +344,14 @@ class Spool:
 
     def read(self, key: Hashable) -> Iterator[bytes]:
         """Yield the pieces of a key."""
-        return self._read(self._pieces.get(key, ()))
+        for start, size in self._pieces.get(key, ()):
+            self._file.seek(start)
+            yield self._file.read(size)
 
     def take(self, key: Hashable) -> Iterator[bytes]:
         """Yield the pieces of a key, and forget where they are: of thousands that takes memory."""
-        return self._read(self._pieces.pop(key, ()))
-
-    def _read(self, pieces: Iterable[tuple[int, int]]) -> Iterator[bytes]:
-        for start, size in pieces:
-            self._file.seek(start)
-            yield self._file.read(size)
+        yield from self.read(key)
+        self._pieces.pop(key, None)
 
     def clear(self) -> None:
         """Forget all pieces."""

@@ -1,7 +1,7 @@
 """Reads Parquet: text, numbers, dates and timestamps."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import date
 from pathlib import Path
@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.formats.parquet_footer import MAGIC, RowGroup, read_row_groups
-from fleet_slip.ingest.formats.source import Budget, Channel, FormatSource, find_column
+from fleet_slip.ingest.formats.source import Budget, Channel, Source, find_column
 
+MAGIC = b"PAR1"
 BATCH_ROWS = 2**16
 """Parquet is read in batches of this many rows."""
 
@@ -33,19 +33,23 @@ _FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
 _END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
 
 
-class ParquetSource(FormatSource):
+class ParquetSource(Source):
     """An open Parquet file. Keys in the names of its folders, `car=A7`, are columns of text.
 
     The null partition of Hive is a missing value.
     """
 
-    has_clock = False
-
     def __init__(self, stream: pa.NativeFile, budget: Budget) -> None:
         """Take the bytes of a file, and its limits."""
         self._file, self._stream = budget.file, stream
-        _require_within(budget, read_footer(stream, budget.file))
-        self._schema = pq.ParquetFile(stream).schema_arrow
+        _require_footer(stream, budget)
+        parquet = pq.ParquetFile(stream)
+        # Not its columns: for some damaged footers pyarrow aborts the process that asks for one.
+        metadata = parquet.metadata
+        groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+        budget.require_rows(sum(abs(group.num_rows) for group in groups))
+        budget.require_unfolded(sum(abs(group.total_byte_size) for group in groups))
+        self._schema = parquet.schema_arrow
         keys = partition_keys(budget.file).items()
         self._keys = {name: text for name, text in keys if name not in self._schema.names}
 
@@ -106,29 +110,11 @@ def partition_keys(file: Path) -> dict[str, str | None]:
     return {key: None if text == NULL_PARTITION else text for key, text in keys.items()}
 
 
-def read_footer(stream: pa.NativeFile, file: Path) -> list[RowGroup]:
-    """Return the row groups of a file. Raises `InputError` for a large footer, `ValueError`."""
-    size = stream.size()
-    tail = stream.read_at(8, max(0, size - 8))
-    length = int.from_bytes(tail[:4], "little") + len(tail)
-    if tail[4:] == MAGIC and length > MAX_FOOTER_BYTES:
-        raise InputError(
-            f"{quote_name(file)}: its footer is too large. Write fewer columns or row groups."
-        )
-    return read_row_groups(stream.read_at(min(length, size), max(0, size - length)))
-
-
-def _require_within(budget: Budget, groups: Sequence[RowGroup]) -> None:
-    """Raise `InputError` for more rows or bytes than a file can have, or those of another file."""
-    rows = (max([group.rows, *(chunk.values for chunk in group.chunks)]) for group in groups)
-    budget.require_rows(sum(rows))
-    budget.require_unfolded(sum(group.size_bytes for group in groups))
-    if any(chunk.is_in_other_file for group in groups for chunk in group.chunks):
-        raise InputError(
-            f"{quote_name(budget.file)}: its values are in other files: it is the index of a "
-            "dataset. "
-            "Give the files themselves."
-        )
+def _require_footer(stream: pa.NativeFile, budget: Budget) -> None:
+    """Raise `InputError` for a footer whose parsing would take too much memory."""
+    tail = stream.read_at(8, max(0, stream.size() - 8))
+    if tail[4:] == MAGIC and int.from_bytes(tail[:4], "little") > MAX_FOOTER_BYTES:
+        raise budget.exceeded(f"its footer has more than {MAX_FOOTER_BYTES:,} bytes")
 
 
 def is_readable(kind: pa.DataType) -> bool:

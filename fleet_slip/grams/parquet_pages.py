@@ -1,17 +1,16 @@
 """Reads the footer and the page headers of a Parquet file, before anything is decoded.
 
-They are structs in the compact protocol of Thrift (`parquet.thrift`). pyarrow is not used here:
-asked for a column of a row group, it aborts the process for some damaged footers.
+They are structs in the compact protocol of Thrift (`parquet.thrift`). pyarrow does not expose page
+headers, and aborts the process for some damaged footers if asked for a column of a row group.
 """
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-DELTA_BYTE_ARRAY = 7
-"""Encoding of texts by their common prefixes: a small page can decode to any size."""
-
 _DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
-MAGIC, _TAIL_BYTES = b"PAR1", 8
+_MAGIC, _TAIL_BYTES = b"PAR1", 8
+_MAX_FOOTER_BYTES = 2**24
+"""Size of a footer: parsing a larger one would take too much memory."""
 _MAX_HEADER_BYTES, _DEEPEST, _MAX_VARINT_BYTES = 2**16, 12, 10
 
 
@@ -26,10 +25,9 @@ class ColumnChunk(NamedTuple):
 
 
 class RowGroup(NamedTuple):
-    """Rows of a file that are stored together; `size_bytes` are those of the decoded pages."""
+    """Rows of a file that are stored together."""
 
     rows: int
-    size_bytes: int
     chunks: tuple[ColumnChunk, ...]
 
 
@@ -38,17 +36,16 @@ class PageHeader(NamedTuple):
 
     size_bytes: int
     values: int
-    encoding: int
     has_checksum: bool
     is_dictionary: bool
 
 
 def read_row_groups(content: bytes) -> list[RowGroup]:
-    """Return the row groups of a file, or of its last bytes. Raises `ValueError` for damage."""
+    """Return the row groups of a file. Raises `ValueError` for damage, and for a large footer."""
     tail = content[-_TAIL_BYTES:]
     size = int.from_bytes(tail[:4], "little")
-    if tail[4:] != MAGIC or size + _TAIL_BYTES > len(content):
-        raise ValueError("a file without a footer")
+    if tail[4:] != _MAGIC or size > min(_MAX_FOOTER_BYTES, len(content) - _TAIL_BYTES):
+        raise ValueError("a file without a footer, or with a large one")
     end = len(content) - _TAIL_BYTES
     try:
         footer, _ = _read_struct(memoryview(content)[end - size : end], 0)
@@ -56,11 +53,7 @@ def read_row_groups(content: bytes) -> list[RowGroup]:
         raise ValueError("the footer ends in a struct") from None
     groups = _checked(footer, 4, list) if footer.get(3) else []
     return [
-        RowGroup(
-            _checked(group, 3, int),
-            _checked(group, 2, int),
-            tuple(map(_column_chunk, _checked(group, 1, list))),
-        )
+        RowGroup(_checked(group, 3, int), tuple(map(_column_chunk, _checked(group, 1, list))))
         for group in groups
     ]
 
@@ -90,7 +83,6 @@ def read_page_headers(content: bytes, chunk: ColumnChunk) -> Iterator[PageHeader
         yield PageHeader(
             _checked(fields, 2, int),
             _checked(about, 1, int),
-            _checked(about, 4 if kind == _DATA_V2 else 2, int),
             has_checksum=4 in fields,
             is_dictionary=kind == _DICTIONARY,
         )
