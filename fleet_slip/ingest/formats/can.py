@@ -324,7 +324,9 @@ class CanSource(Source):
         signals = self._messages[name].signals if name in self._messages else ()
         signal = next((s for s in signals if s.name == signal_name and is_possible(s)), None)
         if signal is None:
-            names = [f"{m}.{s.name}" for m, of in self._messages.items() for s in of.signals]
+            names = [
+                f"{m}.{s.name}" for m, message in self._messages.items() for s in message.signals
+            ]
             raise missing_column(self._bus.database, column, names)
         if not math.isfinite(signal.scale) or not signal.scale:
             raise InputError(

@@ -54,7 +54,7 @@ FORMATS = {
     "mdf": Format("an MDF file", (b"MDF     ", b"UnFinMF "), (".mf4", ".mdf"), "mdf", _MDF),
     "mdf_bus": Format("bus logging", (), (), "mdf", (*_MDF, "cantools")),
     "mcap": Format("an MCAP file", (b"\x89MCAP0\r\n",), (".mcap",), "mcap", ("mcap_ros2.decoder",)),
-    "tdms": Format("a TDMS file", (b"TDSm",), (".tdms",), "tdms", ("nptdms",)),
+    "tdms": Format("a TDMS file", (b"TDSm",), (".tdms", ".tdms_index"), "tdms", ("nptdms",)),
     "mat": Format(
         "a MATLAB file of version 5", (b"MATLAB 5.0 MAT-file",), (), "matlab", ("scipy.io",)
     ),
