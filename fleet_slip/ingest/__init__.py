@@ -8,7 +8,7 @@ The processing of a row, one module a step, in this order:
    its format (`formats`); several time bases become one table.
 3. `checked_columns` checks each row by itself: values in SI units, or the reason why it is refused.
 4. `drives` checks the order of time, splits rows into drives, and collects them until they end.
-5. `ticks` resamples a drive to 100 Hz (`resampling`) and rounds its signals to counts.
+5. `ticks` resamples a drive to 100 Hz and rounds its signals to counts.
 6. `logs` processes batches of logs: `recordings` detects erased drives and duplicates, `logs`
    writes data files and commits them.
 

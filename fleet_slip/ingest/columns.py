@@ -19,9 +19,13 @@ import polars as pl
 from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalog.signals import HALF_TURN, Identifier, Signal, SignalCatalog
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, Identifier, Signal, SignalCatalog
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
+
+STEP_S = float(SAMPLE_TIME_S)
+TIME_EPSILON_S = 1e-6
+"""Times that differ by less are equal: a float64 of seconds since 1970 resolves 0.24 µs."""
 
 _TERM = r"(?:°|[^\W\d]+\d?)(?:(?:\^|\*\*)-?\d)?"
 _EXPRESSION = re.compile(rf"(?:1/)?{_TERM}(?:[*/ ]{_TERM})*")

@@ -11,8 +11,8 @@ import polars as pl
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.ingest.checked_columns import describe_refused
+from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.formats.source import Spool
-from fleet_slip.ingest.resampling import STEP_S, TIME_EPSILON_S
 
 MAX_DRIVE_S = 2**19 * STEP_S
 """A longer drive is cut after this time, some 87 minutes, so that it fits into memory."""
@@ -50,6 +50,11 @@ class DriveRows:
         """The median time between two rows of each base; that of a tick for a single row."""
         steps_s = {base: rows["time"].diff().median() for base, rows in self.bases.items()}
         return {b: step if isinstance(step, float) else STEP_S for b, step in steps_s.items()}
+
+    def interval_of(self, signal: str) -> float:
+        """Return the usual time between the samples of a signal's time base."""
+        bases = (base for base, rows in self.bases.items() if signal in rows.columns)
+        return self.intervals_s.get(next(bases, -1), STEP_S)
 
     @cached_property
     def frame(self) -> pl.DataFrame:
@@ -243,4 +248,4 @@ def _spill(rows: pl.DataFrame, spool: Spool) -> set[int]:
 
 def _rows_of(content: bytearray, schema: pl.Schema) -> pl.DataFrame:
     values = np.frombuffer(content).reshape(-1, len(schema))
-    return pl.DataFrame(values, schema.names()).fill_nan(None).cast(dict(schema))
+    return pl.DataFrame(values, schema.names()).fill_nan(None).cast(schema)
