@@ -357,7 +357,9 @@ def on_grid(
     gridded = []
     for values in (np.unwrap((course - heading)[~np.isnan(course)]), speed[~np.isnan(course)]):
         placed = np.full(ticks.size, np.nan)
-        placed[chosen] = interpolate(fixes.astype(np.float64), values, ticks[chosen], MAX_TICKS_BETWEEN)
+        placed[chosen] = interpolate(
+            fixes.astype(np.float64), values, ticks[chosen], MAX_TICKS_BETWEEN
+        )
         gridded.append(placed)
     return gridded[0] + heading, gridded[1]
 
