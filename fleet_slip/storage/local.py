@@ -13,11 +13,10 @@ import stat
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
-from urllib.parse import unquote, urlsplit
 
 from fleet_slip.base import require_extra
 from fleet_slip.errors import StorageError
@@ -110,26 +109,12 @@ class LocalFolder(Folder):
             os.fsync(descriptor)
 
     def remove(self, file: StoredFile) -> bool:
-        """Delete exactly the listed file; return False if it is gone or was replaced.
-
-        Compares it before and after moving it aside; puts it back if a repair replaced it.
-        """
         path = self.path / file.path
-        if self._stored_file(path) != file:
-            return False
-        aside = path.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
         with storage_errors(path):
-            try:
-                path.rename(aside)
-            except FileNotFoundError:
+            if self._stored_file(path) != file:
                 return False
-            moved = self._stored_file(aside)
-            same = moved is not None and replace(moved, path=file.path) == file
-            if not same:
-                with contextlib.suppress(FileExistsError):
-                    path.hardlink_to(aside)
-            aside.unlink()
-        return same
+            path.unlink(missing_ok=True)
+        return True
 
     def delete(self, path: str) -> None:
         with storage_errors(self.path / path):
@@ -155,21 +140,21 @@ class LocalFolder(Folder):
         Calls `waiting` once if another process holds it. A read-only file system needs no lock.
         """
         lock = self.path / name
-        with contextlib.ExitStack() as stack:
-            with storage_errors(lock):
-                try:
-                    lock.parent.mkdir(parents=True, exist_ok=True)
-                    file = stack.enter_context(_opened(lock, os.O_WRONLY | os.O_CREAT))
-                except OSError as error:
-                    if error.errno != errno.EROFS:
-                        raise
-                    file = None
-                if file is not None:
-                    try:
-                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    except BlockingIOError:
-                        waiting()
-                        fcntl.flock(file, fcntl.LOCK_EX)
+        with storage_errors(lock):
+            try:
+                lock.parent.mkdir(parents=True, exist_ok=True)
+                lock.touch()
+            except OSError as error:
+                if error.errno != errno.EROFS:
+                    raise
+                yield
+                return
+        with _regular_file(lock, os.O_WRONLY) as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                waiting()
+                fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
     def _read_or_none(self, path: str) -> bytes | None:
@@ -193,35 +178,23 @@ class LocalFolder(Folder):
 
 
 @contextlib.contextmanager
-def _opened(file: Path, flags: int) -> Iterator[int]:
-    """Open a regular file, no link or pipe; yield its descriptor."""
-    safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-    try:
-        descriptor = os.open(file, flags | safe, 0o666)
-    except OSError:
-        if file.is_symlink() or file.is_fifo():
-            raise _no_file(file) from None
-        raise
-    try:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise _no_file(file)
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-@contextlib.contextmanager
 def _regular_file(file: Path, flags: int) -> Iterator[int]:
-    """Open a regular file. Raises `StorageError`."""
-    with storage_errors(file), _opened(file, flags) as descriptor:
-        yield descriptor
-
-
-def _no_file(path: Path) -> StorageError:
-    return StorageError(
-        f"{path}: a link, a folder or a pipe instead of a regular file. Find out who put it "
+    """Open a regular file, no link or pipe; yield its descriptor. Raises `StorageError`."""
+    refused = StorageError(
+        f"{file}: a link, a folder or a pipe instead of a regular file. Find out who put it "
         "there and remove it, or restore the file from a backup."
     )
+    safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    with storage_errors(file):
+        if file.is_symlink() or file.is_fifo():
+            raise refused
+        descriptor = os.open(file, flags | safe, 0o666)
+        try:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise refused
+            yield descriptor
+        finally:
+            os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -258,11 +231,9 @@ def _flush(folder: Path) -> None:
 # The location of a data root: a folder of a file system, or the URL of an object store.
 
 DEFAULT_ROOT = Path("data")
-UNFIT_CHARACTERS = "\\*?["
-"""The backslash becomes a slash in Delta; the others are patterns to DuckDB."""
-
-_ESCAPE = re.compile("%[0-9A-Fa-f]{2}")
-"""An escaped character of a URL, as which the Delta library reads a path."""
+_UNFIT = re.compile(r"[\\*?\[]|%[0-9A-Fa-f]{2}|[\x00-\x1f\x7f-\x9f\ud800-\udfff\u2028\u2029]")
+"""The backslash becomes a slash in Delta, and escapes their characters; others are patterns to
+DuckDB, or cannot be printed."""
 
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 _OBJECT_URL = re.compile(
@@ -274,7 +245,7 @@ _OBJECT_URL = re.compile(
 def data_root(root: Folder | Path | str | None = None) -> Folder:
     """Return the data root: the argument, else ./data.
 
-    With `://` it is a URL: `s3://BUCKET/PATH`, `gs://`, `az://CONTAINER/PATH`, `file:///PATH`.
+    With `://` it is a URL: `s3://BUCKET/PATH`, `gs://BUCKET/PATH`, `az://CONTAINER/PATH`.
     Raises `StorageError` for another, for what Delta or DuckDB misread, inside a table, and where
     the clock is before 1970, which Delta cannot write.
     """
@@ -289,15 +260,9 @@ def data_root(root: Folder | Path | str | None = None) -> Folder:
 
 
 def _local(path: Path) -> Folder:
-    unfit = [c for c in str(path) if not c.isprintable() or c in UNFIT_CHARACTERS]
-    if unfit:
+    if match := _UNFIT.search(str(path.absolute())):
         raise StorageError(
-            f"{path}: a data root cannot have {unfit[0]!r} in its path. Choose another."
-        )
-    if match := _ESCAPE.search(str(path.absolute())):
-        raise StorageError(
-            f"{path}: a data root cannot have {match[0]!r} in its full path: Delta reads it as one "
-            "character. Choose another."
+            f"{path}: a data root cannot have {match[0]!r} in its full path. Choose another."
         )
     for folder in (place := Path(os.path.realpath(path)), *place.parents):
         # Vacuum removes all files in a table that are not part of it.
@@ -312,11 +277,6 @@ def _local(path: Path) -> Folder:
 
 def _at_url(url: str) -> Folder:
     # A refused URL is not shown, as it may contain a password.
-    if url.startswith("file://"):
-        parts = urlsplit(url)
-        if parts.netloc not in ("", "localhost") or parts.query or parts.fragment:
-            raise StorageError("a data root at a file URL is written as file:///PATH.")
-        return _local(Path(unquote(parts.path)))
     match = _OBJECT_URL.fullmatch(url)
     if match is None:
         raise StorageError(

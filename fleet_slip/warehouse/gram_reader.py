@@ -1,7 +1,6 @@
 """Reader of the Gram rows of a warehouse, for one cohort after another."""
 
 import contextlib
-import shlex
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -18,11 +17,9 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import TURNED
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import (
-    ALL_DRIVES,
     LONGEST_PAUSE_S,
     RECEIVED_FILES,
     RECEIVER,
-    TRAINING_DRIVES,
 )
 from fleet_slip.errors import DataError, NotComputedError
 from fleet_slip.regression.gram import GramTable, packed_size
@@ -319,20 +316,13 @@ def _require_complete(
     if not backlog.missing and not backlog.stale:
         return
     files = opened().files(predicate)
-    if not files and feature_set != CALIBRATION:  # that may come from another root
-        unknown = find_backlog(logs, grams, catalog.identity(PLAIN)).missing
-        if unknown:
-            raise NotComputedError(
-                f"{feature_set} features are missing: {len(unknown)} log files have no Gram rows "
-                f"yet. Run: fleet-slip gram && fleet-slip gram --features {feature_set}"
-            )
     missing = [file for file in backlog.missing if file.path in files]
+    if not files and feature_set != CALIBRATION:  # that may come from another root
+        missing = list(find_backlog(logs, grams, catalog.identity(PLAIN)).missing)
     if missing or backlog.stale & files:
-        everything = predicate.text in {ALL_DRIVES, TRAINING_DRIVES}
-        cohort = "" if everything else f" --cohort {shlex.quote(predicate.text)}"
         raise NotComputedError(
-            f"{feature_set} features are missing for {len(missing)} of {len(files)} log files of "
-            f"the cohort. Run: fleet-slip gram --features {feature_set}{cohort}"
+            f"{feature_set} features are missing for {len(missing)} log files. Run: "
+            f"fleet-slip gram && fleet-slip gram --features {feature_set}"
         )
 
 
