@@ -441,7 +441,8 @@ def _stamp(snapshot: Snapshot) -> object:
     log, version = snapshot.table.folder / LOG, snapshot.version
     if version is None or log.stamp(f"{version + 1:020}.json") is not None:
         return None
-    return log.stamp(f"{version:020}.json"), log.stamp(LATEST)
+    commit = log.stamp(f"{version:020}.json")
+    return None if commit is None else (commit, log.stamp(LATEST))
 
 
 FENCE = "fleet_slip.fence"
