@@ -12,7 +12,6 @@ import pytest
 import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import Combination, Definition
-from fleet_slip.cli.app import app
 from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError
 from fleet_slip.export.compile import compile_program, make_checks
@@ -132,9 +131,11 @@ def test_a_version_exported_again_has_the_same_steps_in_the_same_order(
 @pytest.fixture(scope="module")
 def document(smoke_root: Path) -> Any:
     fleet = fleet_slip.open(smoke_root)
-    ((name, text),) = export_texts(fleet.models.get("smoke"), fleet.warehouse, "json").items()
-    assert name == "smoke-1.json"
-    return json.loads(text)
+    one, again = (
+        export_texts(fleet.models.get("smoke"), fleet.warehouse, "json") for _ in range(2)
+    )
+    assert one == again
+    return json.loads(one["smoke-1.json"])
 
 
 def test_the_checks_hold_and_are_of_no_drive_of_the_logs(document: Any) -> None:
@@ -159,14 +160,6 @@ def test_the_document_proves_what_it_is_of(smoke_root: Path, document: Any) -> N
     document["sha256"] = stated
 
 
-def test_an_export_is_the_same_again(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    one, other = (
-        export_texts(fleet.models.get("smoke"), fleet.warehouse, "json") for _ in range(2)
-    )
-    assert one == other
-
-
 def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> None:
     fleet = fleet_slip.open(smoke_root)
     with pytest.raises(QuestionError, match="no version"):
@@ -174,18 +167,6 @@ def test_what_cannot_be_exported_is_said(smoke_root: Path, tmp_path: Path) -> No
     with pytest.raises(UsageError, match="Choose from: json"):
         fleet.models.export("smoke", "pascal", tmp_path)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_command_writes_the_files_and_names_them(
-    smoke_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    target = tmp_path / "new" / "folder"
-    words = ["--root", str(smoke_root), "export", "smoke@1", "--to", "json", "--json"]
-    with pytest.raises(SystemExit) as ended:
-        app([*words, "--output", str(target)])
-    assert ended.value.code == 0
-    (path,) = json.loads(capsys.readouterr().out)["files"]
-    assert json.loads(Path(path).read_text())["model"]["reference"] == "smoke@1"
 
 
 @pytest.mark.parametrize("ticks", [1, 3, 4, 5, 10**12])
