@@ -20,8 +20,8 @@ from typing import Any
 
 import fleet_slip
 from fleet_slip.export.c import c_header, c_source
-from fleet_slip.export.compile import compile_program
 from fleet_slip.export.files import export_files
+from fleet_slip.export.stepping import compile_program
 from fleet_slip.export.templating import c_prefix
 from fleet_slip.models.registry import ModelVersion
 from tests.support.catalog import CATALOG

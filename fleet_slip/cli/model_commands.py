@@ -65,7 +65,7 @@ def show(
 
     Example: fleet-slip show waterford
     """
-    from fleet_slip.export.costs import costs_content, describe_costs
+    from fleet_slip.export.c import costs_content, describe_costs
 
     version = fleet_of(context).models.get(model)
     if json:

@@ -12,13 +12,17 @@ from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
 from fleet_slip.catalog.signals import COUNT_MAX, SAMPLE_TIME_S
 from fleet_slip.columns.column_sql import PLAIN_SQL, SqlLayers, attribute_sql
 from fleet_slip.errors import ConfigError, RefusedError, UsageError
-from fleet_slip.export.c import c_header, c_source
+from fleet_slip.export.c import c_header, c_source, count_costs
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
-from fleet_slip.export.compile import TestVector, checks_csv, compile_program, make_checks
-from fleet_slip.export.costs import count_costs
 from fleet_slip.export.fmu import fmu
 from fleet_slip.export.program import Program, Target
-from fleet_slip.export.stepping import Estimator
+from fleet_slip.export.stepping import (
+    Estimator,
+    TestVector,
+    checks_csv,
+    compile_program,
+    make_checks,
+)
 from fleet_slip.export.templating import c_prefix, distinct, file_prefix, fill_in_version
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.warehouse.warehouse import Warehouse

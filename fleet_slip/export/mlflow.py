@@ -21,9 +21,9 @@ from fleet_slip.base import install_command, pluralize
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.config import parse_document
 from fleet_slip.errors import ConfigError, StorageError, UsageError
-from fleet_slip.export.compile import TestVector
 from fleet_slip.export.files import Subject, document_of, render
 from fleet_slip.export.program import Program
+from fleet_slip.export.stepping import TestVector
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import predict
 from fleet_slip.models.registry import ModelVersion

@@ -1,18 +1,29 @@
-"""Estimates of a published version tick by tick, for test benches: `Fleet.estimator`."""
+"""A program in Python, tick by tick, for test benches (`Fleet.estimator`), and its test vectors."""
 
-from collections.abc import Callable, Mapping
+import csv
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from fractions import Fraction
 from functools import partial
+from io import StringIO
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+
+from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
 from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
+from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
-from fleet_slip.export.compile import compile_program
-from fleet_slip.export.program import Car, Program
+from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
+from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.models.manifest import Manifest
+from fleet_slip.models.predict import Predictor
 
 _OPERATIONS: Mapping[str, Callable[..., int | None]] = {
     **COMPUTED,
@@ -241,3 +252,219 @@ def _fraction(value: Any) -> Fraction:
         return Fraction(value)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{value!r} is not a number. Give a number.") from None
+
+
+def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
+    """Return the program of a published version.
+
+    Raises what `write_program` raises, and `QuestionError` or `DataError` for definitions that
+    contradict each other.
+    """
+    # The kernel compiles the same definitions, and raises for those that it cannot compute.
+    _ = Predictor.from_manifest(catalog.signals, manifest).plan.program
+    return write_program(catalog, manifest)
+
+
+# Checks are ticks of synthetic drives, with the angle at each. An export contains no logged data.
+# The angles come from the kernel of the warehouse, which does not use programs, in exact integers.
+
+SMOOTH_TICKS = 300
+HOSTILE_TICKS = 200
+
+Sample = tuple[int | None, ...]
+"""The counts of a tick in the order of the program's signals; None where missing."""
+
+
+@dataclass(frozen=True)
+class TestVector:
+    """A synthetic drive, and the angle at each tick."""
+
+    name: str
+    car: Mapping[str, object]
+    """Facts of the car, as in logs."""
+    facts: tuple[int | None, ...]
+    """Facts as whole numbers, in the order of the program; None: unknown."""
+    numbers: tuple[int | None, ...]
+    """Numbers in counts, in the order of the program; None: unknown."""
+    samples: tuple[Sample, ...]
+    """Counts at each tick."""
+    angles: tuple[int | None, ...]
+    """Counts of the program's angle at each tick; None: no angle."""
+    states: tuple[tuple[int, ...], ...] = ()
+    """Values of the steps `state` after each tick, if there are any."""
+
+    @property
+    def written(self) -> set[str]:
+        """Names of the attributes that the JSON document contains."""
+        return {name for name in vars(self) if name != "car" and (name != "states" or self.states)}
+
+
+def make_checks(
+    signals: SignalCatalog, manifest: Manifest, program: Program
+) -> tuple[TestVector, ...]:
+    """Return a smooth drive and adversarial ones, with the angle at every tick."""
+    hostile = _hostile_car(program)
+    drives: dict[str, tuple[Car, Iterable[Sample]]] = {
+        "smooth": (UNKNOWN_CAR, _smooth(program)),
+        "extremes": (hostile, _extremes(program, np.random.default_rng(1))),
+        "holes": (UNKNOWN_CAR, _holes(program, np.random.default_rng(2))),
+        "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
+    }
+    return tuple(
+        _check(signals, manifest, program, name, car, samples)
+        for name, (car, samples) in drives.items()
+    )
+
+
+def angles_by_kernel(
+    signals: SignalCatalog,
+    manifest: Manifest,
+    program: Program,
+    car: Car,
+    samples: Sequence[Sample],
+) -> list[int | None]:
+    """Compute the angle of each tick from the columns of the kernel, in exact integers."""
+    predictor = Predictor.from_manifest(signals, manifest)
+    drive = drive_counts(program, predictor, car, samples)
+    return angles_of_columns(program, compute_columns(predictor.plan, drive))
+
+
+def drive_counts(
+    program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
+) -> DriveCounts:
+    """Convert samples of consecutive ticks to a drive of the warehouse."""
+    names = [signal.name for signal in program.signals]
+    valid = [_valid(sample, program.signals) for sample in samples]
+    counts = {
+        name: pa.array(values, pa.int16())
+        for name, values in zip(names, zip(*valid, strict=True), strict=True)
+    }
+    rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
+    facts = {name: car.facts.get(name) for name in predictor.plan.facts}
+    return counts_of(rows, predictor.plan, facts, car.numbers)
+
+
+def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
+    """Compute the angle of each row from the columns of the terms, shape (terms, rows)."""
+    angle = program.angle
+    missing: BoolArray = np.any(np.isnan(columns), axis=0)
+    counts = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
+    total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
+    for (_, coefficient), column in zip(angle.terms, counts, strict=True):
+        total += coefficient * column
+    rounded = [max(-angle.limit, min(angle.limit, int(value >> angle.bits))) for value in total]
+    return [None if lacks else value for value, lacks in zip(rounded, missing, strict=True)]
+
+
+def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
+    """Replace counts outside the valid range by None."""
+    return tuple(
+        count if count is not None and signal.min_count <= count <= signal.max_count else None
+        for count, signal in zip(sample, signals, strict=True)
+    )
+
+
+def _check(
+    signals: SignalCatalog,
+    manifest: Manifest,
+    program: Program,
+    name: str,
+    car: Car,
+    samples: Iterable[Sample],
+) -> TestVector:
+    ticks = tuple(samples)
+    angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
+    counts = car.fact_counts(program), car.number_counts(program)
+    return TestVector(name, car.facts, *counts, ticks, angles)
+
+
+def _smooth(program: Program) -> Iterable[Sample]:
+    """Yield a drive without missing counts: every signal oscillates with its own period."""
+    for tick in range(SMOOTH_TICKS):
+        yield tuple(_swing(signal, tick, 60 + 14 * i) for i, signal in enumerate(program.signals))
+
+
+def _swing(signal: Input, tick: int, period: int) -> int:
+    """Return a count of a triangular wave with the height of an eighth of the range."""
+    height = (signal.max_count - signal.min_count) // 8
+    middle = (signal.min_count + signal.max_count) // (4 if signal.min_count >= 0 else 2)
+    distance = abs(2 * (tick % period) - period)  # from the middle of the period, 0 to `period`
+    return middle + height * distance // period - height // 2
+
+
+def _hostile_car(program: Program) -> Car:
+    """Return a car with extreme facts and numbers."""
+    facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
+    numbers = {
+        number.name: COUNT_MAX if i % 2 else -COUNT_MAX for i, number in enumerate(program.numbers)
+    }
+    return Car(facts, numbers)
+
+
+def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield the ends of the ranges, together and separately, and counts just beyond them."""
+    for tick in range(HOSTILE_TICKS):
+        if tick % 40 < 10:
+            high = tick % 80 < 40
+            yield tuple(s.max_count if high else s.min_count for s in program.signals)
+        else:
+            yield tuple(_extreme(signal, random) for signal in program.signals)
+
+
+def _extreme(signal: Input, random: np.random.Generator) -> int | None:
+    within = (signal.min_count, signal.max_count, -1, 0, 1, signal.max_count // 2)
+    beyond = (signal.min_count - 1, signal.max_count + 1, None)
+    if random.random() < 0.98:
+        return within[random.integers(len(within))]
+    return beyond[random.integers(len(beyond))]
+
+
+def _holes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a drive with gaps, long and short, and missing single values."""
+    gap = 0
+    for _ in range(HOSTILE_TICKS):
+        starts = random.random() < 0.05
+        gap = gap - 1 if gap else (1, 2, 30)[random.integers(3)] if starts else 0
+        yield tuple(
+            None
+            if gap or random.random() < 0.01
+            else int(random.integers(0, signal.max_count // 4 + 1))
+            for signal in program.signals
+        )
+
+
+def _standstill(program: Program, random: np.random.Generator) -> Iterable[Sample]:
+    """Yield a start from standstill: features that divide by speed have no value at first."""
+    for tick in range(HOSTILE_TICKS):
+        yield tuple(
+            int(random.integers(-2, 3)) + signal.max_count * tick // (8 * HOSTILE_TICKS)
+            for signal in program.signals
+        )
+
+
+def checks_csv(program: Program, checks: Sequence[TestVector]) -> str:
+    """Return a CSV file with a row for each tick: the columns of the SQL statement, and the angle.
+
+    An empty cell is a missing value, or no angle.
+    """
+    facts = tuple(dict.fromkeys(fact.name for fact in program.facts))
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    columns = [signal.column for signal in program.signals]
+    numbers = [number.name for number in program.numbers]
+    writer.writerow(["drive_id", "tick", *columns, *facts, *numbers, "expected_angle"])
+    signal_scales = [signal.scale for signal in program.signals]
+    number_scales = [number.grain for number in program.numbers]
+    for check in checks:
+        car = [*(check.car.get(name) for name in facts), *_physical(check.numbers, number_scales)]
+        for tick, (sample, angle) in enumerate(zip(check.samples, check.angles, strict=True)):
+            values = _physical(sample, signal_scales)
+            writer.writerow([check.name, tick, *values, *car, angle])
+    return text.getvalue()
+
+
+def _physical(counts: Sequence[int | None], scales: Sequence[Decimal]) -> list[str | None]:
+    return [
+        None if count is None else f"{count * scale:f}"
+        for count, scale in zip(counts, scales, strict=True)
+    ]

@@ -9,10 +9,10 @@ import numpy as np
 import onnxruntime
 import polars as pl
 
-from fleet_slip.export.compile import Sample
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import UNKNOWN
 from fleet_slip.export.program import Car, Program
+from fleet_slip.export.stepping import Sample
 from fleet_slip.models.registry import ModelVersion
 
 

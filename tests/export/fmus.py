@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from fleet_slip.export.compile import Sample
 from fleet_slip.export.program import Car, Program
+from fleet_slip.export.stepping import Sample
 
 TICK_S = 0.01
 

@@ -11,8 +11,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.export.c import MAX_UNSIGNED
-from fleet_slip.export.compile import angles_by_kernel, compile_program
-from fleet_slip.export.stepping import Estimator
+from fleet_slip.export.stepping import Estimator, angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
     DEADLINE_S,

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.export.c import cost_on_board
 from fleet_slip.export.c_gram import sets_on_board
-from fleet_slip.export.costs import cost_on_board
 from fleet_slip.export.files import export_files
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import STRICT, learned, run_compiled, write_counter

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import fleet_slip
 from fleet_slip.errors import RefusedError
-from fleet_slip.export.costs import (
+from fleet_slip.export.c import (
     cost_on_board,
     costs_content,
     describe_costs,

@@ -24,16 +24,16 @@ from fleet_slip.evaluation.identify import (
 )
 from fleet_slip.evaluation.single_track import LabelledDrive
 from fleet_slip.evaluation.tuning import Coordinates
-from fleet_slip.export.compile import (
+from fleet_slip.export.c import count_costs
+from fleet_slip.export.files import export_files, program_content, with_states
+from fleet_slip.export.program import UNKNOWN_CAR, Program
+from fleet_slip.export.stepping import (
+    Estimator,
     Sample,
     angles_by_kernel,
     compile_program,
     make_checks,
 )
-from fleet_slip.export.costs import count_costs
-from fleet_slip.export.files import export_files, program_content, with_states
-from fleet_slip.export.program import UNKNOWN_CAR, Program
-from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.vehicle.parameters import VehicleMeasures

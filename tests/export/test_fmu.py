@@ -11,8 +11,8 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import ConfigError
 from fleet_slip.export import fmu
-from fleet_slip.export.compile import angles_by_kernel, compile_program
 from fleet_slip.export.files import export_files
+from fleet_slip.export.stepping import angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import needs_cc
 from tests.export.fmus import Fmu, drive_fmu, run_fmpy, simulate_with_fmpy, unpack

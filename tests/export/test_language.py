@@ -31,15 +31,15 @@ from fleet_slip.catalog.definitions import (
 )
 from fleet_slip.catalog.features import Feature
 from fleet_slip.columns.column_sql import with_columns
-from fleet_slip.export.compile import (
+from fleet_slip.export.files import program_content
+from fleet_slip.export.program import Car, Program
+from fleet_slip.export.stepping import (
+    Estimator,
     Sample,
     angles_by_kernel,
     angles_of_columns,
     compile_program,
 )
-from fleet_slip.export.files import program_content
-from fleet_slip.export.program import Car, Program
-from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.manifest import Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain

@@ -10,9 +10,9 @@ import pytest
 import fleet_slip
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.errors import ConfigError
-from fleet_slip.export.compile import compile_program, drive_counts
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import FloatName, error_bound
+from fleet_slip.export.stepping import compile_program, drive_counts
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.engines import in_si, open_session, run_drives

@@ -14,9 +14,8 @@ from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import Combination, Definition
 from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError
-from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
-from fleet_slip.export.stepping import Estimator
+from fleet_slip.export.stepping import Estimator, compile_program, make_checks
 from fleet_slip.storage.documents import checksum
 from tests.export import plain
 from tests.export.models import DEFINITIONS, LEARNING, MODELS, export_texts, model_of

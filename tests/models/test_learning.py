@@ -13,8 +13,8 @@ from fleet_slip.catalog.catalog import FirstStageModel, integer_combination
 from fleet_slip.catalog.definitions import Combination
 from fleet_slip.columns.drive_columns import ColumnPlan, compute_columns
 from fleet_slip.errors import DataError, QuestionError, StorageError
-from fleet_slip.export.compile import compile_program, make_checks
 from fleet_slip.export.files import program_content
+from fleet_slip.export.stepping import compile_program, make_checks
 from fleet_slip.grams.drive_sums import read_drives
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import ModelVersion
