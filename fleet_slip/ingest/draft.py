@@ -17,7 +17,7 @@ from fleet_slip.base import quote_name
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import CHOOSE, WHEEL_PREFIX, TimeBase
+from fleet_slip.ingest.columns import TimeBase
 from fleet_slip.ingest.file_groups import FileGroup
 from fleet_slip.ingest.guess import (
     Guess,
@@ -68,13 +68,11 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     time = guess_time(profile, {guess.column for guess in guesses.values()}, bases, group)
 
     rasters = guess_rasters(profile, time, guesses, group)
-    guesses = {
-        name: guess.because(f"its times are in {raster}", time=raster)
-        if (raster := rasters.get(guess.column))
-        else guess
-        for name, guess in guesses.items()
-    }
-    guesses = {name: _doubted(guess) for name, guess in guesses.items()}
+    for name, guess in guesses.items():
+        if raster := rasters.get(guess.column):
+            guesses[name] = guess.because(f"its times are in {raster}", time=raster)
+        if guess.is_weak and guess.readings:
+            guesses[name] = guesses[name].doubted("name and unit are ambiguous")
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SATELLITE_SPEED}  # which stand together
@@ -83,13 +81,6 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     notes = (*_notes(profile, guesses), *_refused(profile))
     absent = tuple(name for name in signals.signals if name not in guesses)
     return Draft(file, profile, time, sure, doubtful, drive_keys, absent, notes)
-
-
-def _doubted(guess: Guess) -> Guess:
-    """Return a guess, doubtful if its name may mean something else and it has no unit."""
-    if guess.is_weak and guess.readings:
-        return guess.doubted("name and unit are ambiguous")
-    return guess
 
 
 def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
@@ -126,11 +117,9 @@ def _notes(profile: FileProfile, guesses: dict[str, Guess]) -> Iterator[str]:
 
 def _refused(profile: FileProfile) -> Iterator[str]:
     """Yield the channels that could not be read, with reasons."""
-    more = len(profile.refused) - _MAX_REFUSED
-    for reason in profile.refused[:_MAX_REFUSED]:
-        yield f"not read: {reason}"
-    if more > 0:
-        yield f"not read: {more:,} channels more."
+    yield from (f"not read: {reason}" for reason in profile.refused[:_MAX_REFUSED])
+    if len(profile.refused) > _MAX_REFUSED:
+        yield f"not read: {len(profile.refused) - _MAX_REFUSED:,} channels more."
 
 
 def signal_keys(guess: Guess) -> dict[str, Any]:
@@ -211,22 +200,21 @@ def _drive(draft: Draft) -> str:
 
 def _signals(draft: Draft) -> str:
     lines = ["[signals]"]
-    for name, guess in draft.guesses.items():
-        lines += comment(f"{name}: {'; '.join(guess.reasons)}")
-        if guess.component != "east":  # stands beside north
-            if guess.readings:
-                lines += comment(f"Choose the unit: {_choices(guess)}.")
-            lines += _lines(name, guess, draft.guesses)
-            if name == COURSE:
-                lines += comment("antenna_x_m and antenna_y_m: to be filled in")
-    for name, guess in draft.questions.items():
-        doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
-        lines += comment(f"Doubtful: {name}: {doubts}")
-        if guess.component != "east":
-            if guess.readings:
-                lines += comment(f"Choose the unit too: {_choices(guess)}.")
-            for rival in (guess, *guess.rivals):
-                lines += [f"# {line}" for line in _lines(name, rival, draft.questions)]
+    guesses = {**draft.guesses, **draft.questions}
+    for name, guess in guesses.items():
+        prefix, reasons = "", f"{name}: {'; '.join(guess.reasons)}"
+        if name in draft.questions:
+            doubts = "; ".join(guess.doubts) or "its name and unit fit several columns"
+            prefix, reasons = "# ", f"Doubtful: {name}: {doubts}"
+        lines += comment(reasons)
+        if guess.component == "east":  # stands beside north
+            continue
+        if guess.readings:
+            lines += comment(f"Choose the unit: {_choices(guess)}.")
+        for candidate in (guess, *guess.rivals):
+            lines += [f"{prefix}{line}" for line in _lines(name, candidate, guesses)]
+        if name == COURSE:
+            lines += comment("antenna_x_m and antenna_y_m: to be filled in")
     if draft.absent:
         lines += comment(f"No channel looks like {', '.join(draft.absent)}.")
     return "\n".join(lines) + "\n"
@@ -263,33 +251,3 @@ def _value(value: object) -> str:
         text = ", ".join(f"{key} = {_value(item)}" for key, item in value.items())
         return f"{{ {text} }}"
     return json.dumps(value, ensure_ascii=False)
-
-
-# Questions for the open keys of a draft.
-
-
-def open_keys(draft: Draft, text: str) -> dict[str, list[str]]:
-    """Return the keys that a draft leaves open, with the usual values of units."""
-    keys = [key for key in ("day", "vehicle_id", "vehicle_model") if f"\n# {key} = " in text]
-    units = {
-        name: [str(reading["unit"]) for reading in guess.readings]
-        for name, guess in draft.guesses.items()
-        if guess.readings
-    }
-    return {**{key: [] for key in keys}, **units}
-
-
-def answer_key(text: str, key: str, answer: str) -> str:
-    """Return a draft with the value of an open key, unchanged for an empty answer."""
-    if not answer:
-        return text
-    if key in {"day", "vehicle_id", "vehicle_model"}:
-        value = answer if key == "day" else _value(answer)
-        return re.sub(rf"(?m)^# {key} = .*$", lambda _: f"{key} = {value}", text, count=1)
-    is_velocity = key.startswith(WHEEL_PREFIX) and answer in {"km/h", "m/s"}
-    more = f", radius_m = {RADIUS_M}" if is_velocity else ""
-    line = re.compile(rf'(?m)^({key} = .*unit = )"{CHOOSE}"')
-    if line.search(text):
-        return line.sub(lambda match: f"{match[1]}{_value(answer)}{more}", text, count=1)
-    more = more.replace(", radius_m", f"\n{key}.radius_m")
-    return text.replace(f'{key}.unit = "{CHOOSE}"', f"{key}.unit = {_value(answer)}{more}")

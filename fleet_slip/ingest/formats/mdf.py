@@ -37,37 +37,32 @@ from fleet_slip.ingest.formats.source import (
 # are refused. It also rounds the bounds of ranges, and matches other rows in a long block than in a
 # short one.
 
-_NONE, _FORMULA, _RANGES_TO_NUMBERS, _VALUES_TO_TEXT, _RANGES_TO_TEXT, _TABLE, _PLAIN, _TEXT = (
-    "none", "formula", "ranges to numbers", "values to text", "ranges to text", "table", "plain",
-    "text",
-)  # fmt: skip
 _KINDS = {
-    b"##CC": {
-        0: _NONE, 1: _PLAIN, 2: _PLAIN, 3: _FORMULA, 4: _TABLE, 5: _TABLE, 6: _RANGES_TO_NUMBERS,
-        7: _VALUES_TO_TEXT, 8: _RANGES_TO_TEXT, 9: _TEXT, 10: _TEXT, 11: _TEXT,
-    },
+    b"##CC": dict(enumerate(
+        ("none", "plain", "plain", "formula", "table", "table", "ranges", "names of values",
+         "names of ranges", "text", "text", "text")
+    )),
     b"CC": {
-        65535: _NONE, 0: _PLAIN, 1: _TABLE, 2: _TABLE, 6: _PLAIN, 9: _PLAIN, 10: _FORMULA,
-        11: _TEXT, 12: _RANGES_TO_TEXT,
+        65535: "none", 0: "plain", 1: "table", 2: "table", 6: "plain", 9: "plain", 10: "formula",
+        11: "text", 12: "names of ranges",
     },
 }  # fmt: skip
-"""The function of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
+"""The kind of each type of conversion, of MDF 4 and of MDF 3; others are refused."""
 _NOT_COMPUTED = "its conversion is a formula, which is not evaluated"
 
 Array = np.ndarray[Any, Any]
 
 
-def conversion_of(channel: Any) -> Any:
-    """Return a channel's conversion, or None. Raises `ValueError` if asammdf lost it."""
+def conversion_of(channel: Any, *, is_time: bool) -> Any:
+    """Return a channel's conversion, or None. Raises `ValueError` for one not to be applied.
+
+    asammdf applies those of times itself, and drops those that it cannot read.
+    """
     if channel.conversion is None and channel.conversion_addr:
         raise ValueError("its conversion cannot be read, or is of an unknown type")
-    return channel.conversion
-
-
-def require_arithmetic(conversion: Any) -> None:
-    """Raise `ValueError` for one that asammdf may not apply itself, as it does to times."""
-    if _kind_of(conversion) not in {_NONE, _PLAIN}:
+    if is_time and _kind_of(channel.conversion) not in {"none", "plain"}:
         raise ValueError("times with a formula or a table as conversion are not supported")
+    return channel.conversion
 
 
 def to_physical(conversion: Any, raw: Array, *, as_numbers: bool = False) -> Array:
@@ -76,13 +71,13 @@ def to_physical(conversion: Any, raw: Array, *, as_numbers: bool = False) -> Arr
     Raises `ValueError` for other conversions.
     """
     kind = _kind_of(conversion)
-    if kind == _NONE:
+    if kind == "none":
         return raw
-    if kind == _FORMULA:
+    if kind == "formula":
         raise ValueError(_NOT_COMPUTED)
-    if kind in {_VALUES_TO_TEXT, _RANGES_TO_TEXT, _RANGES_TO_NUMBERS}:
+    if kind.startswith(("ranges", "names")):
         return _by_ranges(conversion, kind, raw, as_numbers=as_numbers)
-    if kind == _TABLE and np.any(np.diff(_listed(conversion, "raw")) < 0):
+    if kind == "table" and np.any(np.diff(_listed(conversion, "raw")) < 0):
         raise ValueError("the table of its conversion is not sorted")
     if any(not isinstance(part, bytes) for part in conversion.referenced_blocks.values()):
         raise ValueError("its conversion refers to other conversions, which is not supported")
@@ -93,17 +88,16 @@ def to_physical(conversion: Any, raw: Array, *, as_numbers: bool = False) -> Arr
 def state_names(conversion: Any) -> list[str]:
     """Return the names of states in a conversion's table."""
     blocks = {} if conversion is None else conversion.referenced_blocks or {}
-    texts = (text for text in blocks.values() if isinstance(text, bytes))
-    return [text.decode("utf-8", "replace") for text in texts]
+    return [_decoded(text) for text in blocks.values() if isinstance(text, bytes)]
 
 
 def _kind_of(conversion: Any) -> str:
     if conversion is None:
-        return _NONE
-    kinds, number = _KINDS[conversion.id], conversion.conversion_type
-    if number not in kinds:
+        return "none"
+    number = conversion.conversion_type
+    if number not in _KINDS[conversion.id]:
         raise ValueError(f"conversions of type {number} are not supported")
-    return kinds[number]
+    return _KINDS[conversion.id][number]
 
 
 def _listed(conversion: Any, name: str) -> Array:
@@ -116,7 +110,7 @@ def _listed(conversion: Any, name: str) -> Array:
 
 def _by_ranges(conversion: Any, kind: str, raw: Array, *, as_numbers: bool) -> Array:
     """Apply a table of ranges, or of single values. Integers include the upper end."""
-    points = kind == _VALUES_TO_TEXT
+    points = kind == "names of values"
     lower, upper = (_listed(conversion, "val" if points else end) for end in ("lower", "upper"))
     order = np.argsort(lower, kind="stable")
     lower, upper = np.append(lower[order], np.inf), np.append(upper[order], -np.inf)
@@ -124,28 +118,29 @@ def _by_ranges(conversion: Any, kind: str, raw: Array, *, as_numbers: bool) -> A
     ends = (raw.dtype.kind in "iub") | (lower == upper)
     inside = (raw < upper[place]) | (ends[place] & (raw == upper[place]))
     place = np.where(inside & (place >= 0), place, len(order))
-    if kind == _RANGES_TO_NUMBERS:
+    if kind == "ranges":
         return np.append(_listed(conversion, "phys")[order], conversion.default)[place]
-    texts = conversion.referenced_blocks
-    parts = [*(texts[f"text_{number}"] for number in order), texts["default_addr"]]
-    if any(isinstance(part, bytes) and b"{X}" in part for part in parts):  # of MDF 3
+    blocks = conversion.referenced_blocks
+    parts = [*(blocks[f"text_{number}"] for number in order), blocks["default_addr"]]
+    names = [_decoded(part) if isinstance(part, bytes) else None for part in parts]
+    if any("{X}" in name for name in names if name):  # of MDF 3
         raise ValueError(_NOT_COMPUTED)
-    named = [part for part in parts[:-1] if isinstance(part, bytes)]
-    if parts[-1] is None and len(named) == len(order):  # a state without a name is missing
-        parts[-1] = b"" if names_states(part.decode("utf-8", "replace") for part in named) else None
-    if all(isinstance(part, bytes) for part in parts):
-        if as_numbers:
-            absent = [
-                not part or is_missing_state(part.decode("utf-8", "replace")) for part in parts
-            ]
-            return np.where(np.array(absent)[place], np.nan, raw)
+    if parts[-1] is None and None not in names[:-1] and names_states(filter(None, names)):
+        parts[-1], names[-1] = b"", ""  # a state without a name is missing
+    if None not in names and not as_numbers:
         return np.array(parts, dtype=bytes)[place]
+    if None not in names:
+        absent = np.array([not name or is_missing_state(name) for name in names])
+        return np.where(absent[place], np.nan, raw)
     values = np.full(raw.shape, np.nan)  # of which some have a name instead
     for number in np.unique(place).tolist():
-        part, selected = parts[number], place == number
-        if not isinstance(part, bytes):
-            values[selected] = to_physical(part, raw[selected])
+        if names[number] is None:
+            values[place == number] = to_physical(parts[number], raw[place == number])
     return values
+
+
+def _decoded(text: bytes) -> str:
+    return text.decode("utf-8", "replace")
 
 
 WINDOW_RECORDS = 2**17
@@ -184,23 +179,21 @@ class MdfSource(Source):
 
     def find(self, column: str) -> tuple[str, tuple[int, int]]:
         """Return the group of a channel, and the numbers of both. Raises `InputError`."""
-        places, name = self._places(column), column
-        if not places:
-            name, _, group = column.rpartition("@")
-            groups = self._mdf.groups
-            places = [
-                (number, index)
-                for number, index in self._places(name)
-                if group in {str(number), getattr(groups[number].channel_group, "acq_name", "")}
-            ]
+        name, _, group = column.rpartition("@")
+        groups = self._mdf.groups
+        places = self._places(column) or [
+            (number, index)
+            for number, index in self._places(name)
+            if group in {str(number), getattr(groups[number].channel_group, "acq_name", "")}
+        ]
         if not places:
             raise missing_column(self._file, column, [channel.name for channel in self.channels()])
         if len(places) > 1:
-            titles = ", ".join(repr(f"{name}@{number}") for number, _ in places[:5])
+            called = groups[places[0][0]].channels[places[0][1]].name
+            names = ", ".join(repr(f"{called}@{number}") for number, _ in places[:5])
             raise InputError(
                 f"{quote_name(self._file)}: {len(places)} channels are called {column!r}. Choose "
-                "one: "
-                f"{titles}."
+                f"one: {names}."
             )
         return f"group {places[0][0]}", places[0]
 
@@ -248,8 +241,8 @@ class MdfSource(Source):
         if len(signals[0]) < records:
             raise InputError(
                 f"{quote_name(self._file)}: group {number} has {start + len(signals[0]):,} "
-                "samples, "
-                "fewer than it states: the file is truncated. Copy it again."
+                "samples, fewer "
+                "than it states: the file is truncated. Copy it again."
             )
         return list(signals)
 
@@ -257,16 +250,15 @@ class MdfSource(Source):
         """Return the physical values of a channel, or None without any raw ones."""
         channel = self._mdf.groups[number].channels[index]
         try:
-            conversion = conversion_of(channel)
-            if raw is not None:
-                as_numbers = self._formats.reads_number(column, state_names(conversion))
-                return to_physical(conversion, raw, as_numbers=as_numbers)
-            require_arithmetic(conversion)
+            conversion = conversion_of(channel, is_time=raw is None)
+            if raw is None:
+                return None
+            as_numbers = self._formats.reads_number(column, state_names(conversion))
+            return to_physical(conversion, raw, as_numbers=as_numbers)
         except ValueError as error:
             raise InputError(
                 f"{quote_name(self._file)}: channel {channel.name!r}: {error}. Export it again "
-                "with "
-                "physical values, or map another channel."
+                "with physical values, or map another channel."
             ) from None
 
     def _release(self) -> None:
@@ -284,28 +276,22 @@ class MdfSource(Source):
         if master is None or kind not in {_TIME_SYNC, None}:
             raise InputError(
                 f"{quote_name(self._file)}: channel {name!r} is in group {number}, whose master is "
-                "not "
-                "time but an angle, a distance or an index. Map another channel."
+                "not time but an angle, a distance or an index. Map another channel."
             )
         self._physical(number, master, None)
 
     def _require_inside(self, number: int, index: int) -> None:
         """Raise `InputError` for a channel outside of its record: asammdf would read beyond it."""
         group, channel = self._mdf.groups[number], self._mdf.groups[number].channels[index]
-        cg = group.channel_group
-        start = getattr(channel, "start_offset", None)  # MDF 3 counts bits
+        start = getattr(channel, "start_offset", None)
         if start is None:
             start = 8 * channel.byte_offset + channel.bit_offset
-            within = channel.pos_invalidation_bit < 8 * cg.invalidation_bytes_nr
-            flagged = within or not cg.invalidation_bytes_nr
-        else:
+        else:  # MDF 3 counts bits
             start += 8 * getattr(channel, "additional_byte_offset", 0)
-            flagged = True
-        if not flagged or start + channel.bit_count > 8 * cg.samples_byte_nr:
+        if start + channel.bit_count > 8 * group.channel_group.samples_byte_nr:
             raise InputError(
                 f"{quote_name(self._file)}: channel {channel.name!r} lies outside of the records "
-                "of its "
-                "group: the file is damaged. Copy it again."
+                "of its group: the file is damaged. Copy it again."
             )
 
     def _require_data(self, number: int, name: str) -> None:

@@ -28,9 +28,9 @@ MAX_FOOTER_BYTES = 2**24
 MAX_TEXT = 1_000
 """Characters of one text in Parquet: a dictionary can repeat a long one for the price of a bit."""
 
-_PER_DAY = {unit: 86_400 * 10**power for unit, power in {"s": 0, "ms": 3, "us": 6, "ns": 9}.items()}
+_PER_DAY = {"d": 1, "ms": 86_400 * 10**3, "us": 86_400 * 10**6, "ns": 86_400 * 10**9}
 _FIRST_DAY = date.min.toordinal() - date(1970, 1, 1).toordinal()
-_END_DAY = date.max.toordinal() + 1 - date(1970, 1, 1).toordinal()
+_LAST_DAY = date.max.toordinal() - date(1970, 1, 1).toordinal()
 
 
 class ParquetSource(Source):
@@ -88,7 +88,7 @@ class ParquetSource(Source):
         )
         for batch in parquet.iter_batches(BATCH_ROWS, columns=inside):
             plain = {name: plain_column(batch.column(name), name, self._file) for name in inside}
-            yield pl.DataFrame(pa.table(plain)).with_columns(keys)
+            yield _in_calendar(pl.DataFrame(pa.table(plain))).with_columns(keys)
 
 
 @contextmanager
@@ -119,17 +119,15 @@ def _require_footer(stream: pa.NativeFile, budget: Budget) -> None:
 
 def is_readable(kind: pa.DataType) -> bool:
     """Return True if a column of this type is text, a number or a time."""
-    if pa.types.is_dictionary(kind):
-        kind = kind.value_type
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
     tests = (_is_text, pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal)
     times = (pa.types.is_date, pa.types.is_timestamp, pa.types.is_null)
     return any(is_it(kind) for is_it in (*tests, *times))
 
 
-def _is_text(arrow_type: pa.DataType) -> bool:
-    if pa.types.is_dictionary(arrow_type):
-        arrow_type = arrow_type.value_type
-    return bool(pa.types.is_string(arrow_type) or pa.types.is_large_string(arrow_type))
+def _is_text(kind: pa.DataType) -> bool:
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind))
 
 
 def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
@@ -147,25 +145,17 @@ def plain_column(array: pa.Array, name: str, file: Path) -> pa.Array:
             )
         array = array.dictionary_decode()
     kind = array.type
-    if _is_text(kind):
+    is_time = pa.types.is_date(kind) or pa.types.is_timestamp(kind)
+    if _is_text(kind) or is_time or kind in {pa.int64(), pa.uint64()}:
         return array
-    if pa.types.is_date(kind) or pa.types.is_timestamp(kind):
-        return _in_calendar(array)
-    if kind in {pa.int64(), pa.uint64()}:
-        return array
-    if pa.types.is_decimal(kind):
-        return pc.cast(array, pa.string())
-    return pc.cast(array, pa.float64(), safe=False)
+    return pc.cast(array, pa.string() if pa.types.is_decimal(kind) else pa.float64(), safe=False)
 
 
-def _in_calendar(array: pa.Array) -> pa.Array:
-    """Return dates or timestamps, null outside the years 1 to 9999: Polars would panic."""
-    kind = array.type
-    if pa.types.is_date32(kind):
-        counts, per_day = pc.cast(pc.cast(array, pa.int32()), pa.int64()), 1
-    else:
-        unit = "ms" if pa.types.is_date64(kind) else kind.unit
-        counts, per_day = pc.cast(array, pa.int64()), _PER_DAY[unit]
-    first, end = (max(-(2**63), min(2**63 - 1, days * per_day)) for days in (_FIRST_DAY, _END_DAY))
-    inside = pc.and_(pc.greater_equal(counts, first), pc.less(counts, end))
-    return pc.if_else(inside, array, pa.scalar(None, kind))
+def _in_calendar(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return dates and timestamps as null outside the years 1 to 9999: Polars would panic."""
+    inside = []
+    for name, kind in frame.schema.items():
+        if kind.is_temporal():
+            days = pl.col(name).to_physical() // _PER_DAY[getattr(kind, "time_unit", "d")]
+            inside.append(pl.when(days.is_between(_FIRST_DAY, _LAST_DAY)).then(name))
+    return frame.with_columns(inside)
