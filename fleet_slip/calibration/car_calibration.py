@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import pluralize
+from fleet_slip.base import Record, document_of, pluralize
 from fleet_slip.calibration.receiver_delay import (
     NO_RECEIVERS,
     SYSTEMATIC_STD_S,
@@ -143,7 +143,7 @@ the number of cars: (3 x 1.2533 x 1.4826)^2 for normal deviates."""
 
 
 @dataclass(frozen=True)
-class Roads:
+class Roads(Record):
     """Roads of a fleet.
 
     Attributes
@@ -158,10 +158,17 @@ class Roads:
         Number of cars that determined it.
     """
 
+    DOCUMENT = "banked lean_mps2 uncertainty cars"
+
     banked: bool
     lean: Fraction | None
     uncertainty: float
     cars: int
+
+    @property
+    def lean_mps2(self) -> float | None:
+        """The camber as a float."""
+        return None if self.lean is None else float(self.lean)
 
     @property
     def hide_offsets(self) -> bool:
@@ -555,39 +562,19 @@ class Calibration(Answer):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `calibrate --json` prints."""
-        roads = self.evidence.roads
-        return {
+        document = {
             "logs_version": self.logs_version,
             "grams_version": self.grams_version,
             "numbers": {
                 name: vars(definition) | {"grain": str(definition.grain)}
                 for name, definition in CALIBRATION_PARAMETERS.items()
             },
-            "cars": {
-                car: {name: vars(parameter) for name, parameter in parameters.items()}
-                for car, parameters in self.cars.items()
-            },
+            "cars": self.cars,
             "missing": {car: reasons for car, reasons in self.missing.items() if reasons},
-            "roads": {
-                "banked": roads.banked,
-                "lean_mps2": None if roads.lean is None else float(roads.lean),
-                "uncertainty": roads.uncertainty,
-                "cars": roads.cars,
-            },
-            "receivers": {
-                "cars": {
-                    car: {
-                        "receiver": delay.receiver,
-                        "delay_s": delay.value,
-                        "uncertainty_s": delay.uncertainty,
-                        "drives": delay.drives,
-                        "rows": delay.rows,
-                    }
-                    for car, delay in self.receivers.cars.items()
-                },
-                "types": self._types_of_receivers(),
-            },
+            "roads": self.evidence.roads,
+            "receivers": {"cars": self.receivers.cars, "types": self._types_of_receivers()},
         }
+        return {key: document_of(value) for key, value in document.items()}
 
 
 def calibration_of(opened: OpenedGrams, predicate: Predicate) -> Calibration:

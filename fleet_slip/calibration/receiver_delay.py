@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.base import Record
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import LATE_PARTS, MAX_COURSE_DELAY, MIN_COURSE_DELAY
 from fleet_slip.catalog.signals import RECEIVER, SAMPLE_TIME_S
@@ -46,13 +47,15 @@ OUTLIER_RATIO = 100.0
 
 
 @dataclass(frozen=True)
-class ReceiverDelay:
+class ReceiverDelay(Record):
     """The delay of a car's receiver behind its accelerometer, s; few drives tell no error.
 
     `information` is how much a wrong lag adds to the sum of squares, per s^2; `differing` the sum
     over drives of their own pulls by it: on average the noise times one less than the drives.
     `receiver` is its type; None if no drive says it, or drives say several.
     """
+
+    DOCUMENT = "receiver delay_s=value uncertainty_s=uncertainty drives rows"
 
     value: float
     uncertainty: float | None
