@@ -30,21 +30,17 @@ LOGS = "read_parquet(getvariable('log_files'), union_by_name => true, hive_parti
 
 _SEPARATOR = ",\n            "
 
-BITS = 63
-"""Bits of a BIGINT without the sign."""
-
-MAX_SUMS = 8_000
-"""Maximum number of sums in a grouping. DuckDB 2.0.0 ends with SIGFPE if the sums of a group, 24
-bytes each, exceed its block of 262,144 bytes."""
+MAX_COLUMNS = 63
+"""Maximum number of columns of a statement: bits of a BIGINT without the sign."""
 
 
 def has_statement(catalog: Catalog, feature_set: str) -> bool:
     """Return True if SQL can compute a feature set; otherwise only the kernel can."""
     resolved = catalog.feature_set(feature_set)
-    k, windows = len(resolved.columns), catalog.definitions(feature_set)
-    slopes = any(isinstance(row.made, Slope) for row in rows_behind(windows).values())
+    columns = rows_behind(catalog.definitions(feature_set)).values()
+    slopes = any(isinstance(row.made, Slope) for row in columns)
     divided = resolved.change_ticks or resolved.block_ticks
-    return not (divided or slopes) and k + k * (k + 1) // 2 <= MAX_SUMS
+    return not (divided or slopes) and len(resolved.columns) <= MAX_COLUMNS
 
 
 def gram_statement(
@@ -96,14 +92,9 @@ def gram_statement(
 
 
 def _absent_mask(names: Sequence[str]) -> str:
-    """Return SQL of a bit mask of the columns that a row lacks; a list of masks for many."""
-    if len(names) < BITS:
-        kind = "INTEGER" if len(names) < 32 else "BIGINT"
-        return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
-    step = BITS - 1
-    masks = [_absent_mask(names[start : start + step]) for start in range(0, len(names), step)]
-    # The last columns come first, so that lists sort as a single large number would.
-    return f"[{', '.join(f'({mask})::BIGINT' for mask in reversed(masks))}]"
+    """Return SQL of a bit mask of the columns that a row lacks."""
+    kind = "INTEGER" if len(names) < 32 else "BIGINT"
+    return " + ".join(f"({name} IS NULL)::{kind} * {1 << i}" for i, name in enumerate(names))
 
 
 FILES_PER_QUERY = 16

@@ -4,7 +4,7 @@ The standard is at https://bitol-io.github.io/open-data-contract-standard/v3.1.0
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.metadata import version as package_version
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +41,9 @@ _MINIMUM_ZERO = frozenset(
 
 
 def data_contract(warehouse: "Warehouse") -> str:
-    """Return the contract of the views `log`, `drives`, `grams` and `models` as YAML.
+    """Return the contract of the views `log`, `drives`, `grams` and `models` as JSON.
+
+    JSON is YAML, the format of the standard.
 
     Raises `StorageError` if there is no data root.
     """
@@ -80,7 +82,7 @@ def data_contract(warehouse: "Warehouse") -> str:
         },
         "schema": schema,
     }
-    return "\n".join(_yaml(document)) + "\n"
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
 
 
 def _property(
@@ -112,20 +114,3 @@ def _property(
     if unit:
         column["customProperties"] = [{"property": "unit", "value": unit}]
     return column
-
-
-def _yaml(value: Any, indent: str = "") -> Iterator[str]:
-    """Yield the lines of a value as block YAML, with scalars as in JSON."""
-    is_mapping = isinstance(value, dict)
-    items = value.items() if is_mapping else ((None, item) for item in value)
-    for key, item in items:
-        start = f"{indent}{key}:" if is_mapping else f"{indent}-"
-        if not isinstance(item, dict | list):
-            yield f"{start} {json.dumps(item, ensure_ascii=False)}"
-        elif is_mapping:
-            yield start
-            yield from _yaml(item, f"{indent}  ")
-        else:
-            first, *lines = _yaml(item, f"{indent}  ")
-            yield f"{start} {first.lstrip()}"
-            yield from lines

@@ -12,14 +12,12 @@ from datetime import date
 from decimal import Decimal
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake import DeltaTable, Field
 from deltalake.schema import Schema
 from deltalake.transaction import AddAction
 
-from fleet_slip.arrays import IntArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import FleetSlipError
@@ -112,18 +110,22 @@ def read_kept_drives(
     table: Table, files: Sequence[TableFile], without: Collection[str] = ()
 ) -> pa.Table:
     """Return the rows of log files but for some drives, ordered and typed for a new file."""
-    parts = [_read(table, file, without) for file in files]
-    rows = pa.concat_tables(parts, promote_options="default").combine_chunks()
-    order = _order(rows)
-    if (np.diff(order) != 1).any():
-        rows = rows.take(order)
+    stored = [_read(table, file) for file in files]
+    rows = pa.concat_tables(stored, promote_options="default").combine_chunks()
+    names = rows["drive_id"].cast(pa.string())
+    order = pc.sort_indices(
+        pa.table({"drive_id": names, "tick": rows["tick"]}),
+        sort_keys=[("drive_id", "ascending"), ("tick", "ascending")],
+    )
+    is_unwanted = pc.is_in(names, pa.array(sorted(without), pa.string()))
+    rows = rows.take(order.filter(pc.invert(is_unwanted.combine_chunks()).take(order)))
     optional = [name for name in table.optional if name in rows.column_names]
     empty = {name for name in optional if rows[name].null_count == len(rows)}
     names = dict.fromkeys([*table.schema.names, *rows.column_names])
     return rows.select([name for name in names if name in rows.column_names and name not in empty])
 
 
-def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
+def _read(table: Table, file: TableFile) -> pa.Table:
     stored = table.read(file.path)
     columns = {}
     for field in table.schema:
@@ -141,17 +143,7 @@ def _read(table: Table, file: TableFile, without: Collection[str]) -> pa.Table:
         else:
             columns[field.name] = column.cast(field.type)
     retired = [name for name in stored.schema.names if name not in table.schema.names]
-    rows = pa.table(columns | {name: stored[name] for name in retired})
-    ids = rows["drive_id"].combine_chunks()
-    unwanted = pc.is_in(ids.dictionary, pa.array(sorted(without), ids.dictionary.type))
-    return rows.filter(pc.invert(unwanted.take(ids.indices)))
-
-
-def _order(rows: pa.Table) -> IntArray:
-    ids = rows["drive_id"].combine_chunks()
-    rank = np.argsort(np.argsort(np.array(ids.dictionary.to_pylist(), dtype=object)))
-    drive = rank[ids.indices.to_numpy()] if len(rank) else np.empty(0, dtype=np.int64)
-    return np.lexsort((rows["tick"].to_numpy(), drive))
+    return pa.table(columns | {name: stored[name] for name in retired})
 
 
 def without_rows(

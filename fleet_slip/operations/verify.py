@@ -7,7 +7,6 @@ names against the erasure log. `repair` rebuilds Gram rows and checkpoints.
 
 import contextlib
 import os
-import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence, Set
 from concurrent.futures import Executor
@@ -470,11 +469,8 @@ def _list_unreferenced(
         with contextlib.suppress(StorageError):  # of a damaged log, which is reported as such
             for file in find_unreferenced(snapshot.table):
                 advice = "fleet-slip compact removes it in time"
-                removed_ns = snapshot.removals.get(file.path, 0) * 10**6
                 if snapshot.version is None:
                     advice = "if the table had a Delta log, restore that from a backup"
-                elif max(file.modified_ns, removed_ns) > time.time_ns():
-                    advice = "its date is in the future, so compact keeps it: check the clocks"
                 problem = f"no version refers to it; {advice}"
                 report.note("unreferenced", path_below(warehouse, file), problem)
     for file in find_temporary_files(warehouse):
@@ -483,9 +479,6 @@ def _list_unreferenced(
 
 
 # Comparison of stored Gram rows with the kernel and with SQL, bit for bit.
-
-SQL_COSTS = 4
-"""Checks of plain features per check of windows, whose SQL takes minutes for a file."""
 
 
 @dataclass(frozen=True)
@@ -538,7 +531,7 @@ def _check(warehouse: Warehouse, count: int, progress: Progress, begin: int) -> 
     for name in wide:
         missing = find_backlog(logs, grams, catalog.identity(name)).missing
         computed = [file for file in logs.files if file not in missing]
-        work += [(file, name) for file in _evenly(computed, max(1, count // SQL_COSTS), begin)]
+        work += [(file, name) for file in _evenly(computed, count, begin)]
     drives = Counter[bool]()
     for file, name in work:
         drives[name == PLAIN] += _compare_ways(warehouse, grams, file, name)

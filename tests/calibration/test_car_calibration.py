@@ -22,7 +22,6 @@ from fleet_slip.calibration.car_calibration import (
 from fleet_slip.calibration.sensor_relations import (
     EVEN,
     EXCLUDED,
-    FLAT,
     KINDS,
     NO_CAR,
     NO_COURSE,
@@ -42,9 +41,7 @@ from fleet_slip.catalog.course import TURNED, turned_scale
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget
-from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import ExactSums, fit
 from fleet_slip.warehouse.erasure_log import ErasureSubject
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support import cars
@@ -168,19 +165,6 @@ def test_the_numbers_are_the_same_in_any_order(fleet: Any) -> None:
     ]
 
 
-def test_least_squares_is_the_exact_fit() -> None:
-    rng = np.random.default_rng(1)
-    names = ("yaw_rate", "course_rate", "slowness")
-    gram = Gram.from_counts(names, rng.integers(-3000, 3000, (50, 3)))
-    expected = fit(gram, names[1:], "yaw_rate").model
-    scales = {name: CATALOG.input_scales[name] for name in names}
-    found = solve_rational(FLAT.system(ExactSums(gram, {n: {n: scales[n]} for n in names}), 0))
-    assert found is not None
-    assert found[0] == expected.intercept * scales["yaw_rate"]
-    for slope, coefficient, name in zip(found[1:], expected.coefficients, names[1:], strict=True):
-        assert slope == coefficient * scales["yaw_rate"] / scales[name]
-
-
 def test_the_wheels_tell_the_radius_and_the_steering_the_wheelbase() -> None:
     rng = np.random.default_rng(3)
     rows = [gram_row("car", n, biased(rng, TRUE)) for n in range(4)]
@@ -275,14 +259,6 @@ def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
         hypot(31**0.5 / 3 * 0.05 / 21**0.5, 0.25 - float(leaning.lean))
     )
     assert estimate_roads(True, offsets[:9]).lean is estimate_roads(False, offsets).lean is None
-
-
-def test_counts_are_rounded_to_the_grain_halves_away_from_zero() -> None:
-    one = CALIBRATION_PARAMETERS["speed_ratio"]
-    grain = Fraction(one.grain)
-    assert [one.count(grain * Fraction(n, 2)) for n in (3, -3, 2, 1, -1, 0)] == [2, -2, 1, 1, -1, 0]
-    assert one.count(grain * (2**15 - 1)) == 2**15 - 1
-    assert one.count(grain * 2**15) is one.count(grain * -(10**9)) is None
 
 
 @pytest.mark.parametrize(
@@ -447,11 +423,6 @@ def told() -> dict[str, CalibratedParameter]:
         sums |= collect_sums([pa.RecordBatch.from_pylist(rows)], kinds_by_set(SIGNALS.label)[name])
     stated = CarEvidence(CATALOG, sums).parameters("car")
     return {name: one for name, one in stated.items() if isinstance(one, CalibratedParameter)}
-
-
-def test_the_sets_have_the_columns() -> None:
-    for name, columns in BY_SET.items():
-        assert set(columns) <= set(CATALOG.feature_set(name).columns)
 
 
 def test_a_late_receiver_tells_the_speed_ratio(told: dict[str, CalibratedParameter]) -> None:

@@ -3,7 +3,6 @@
 import math
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from fleet_slip.calibration.receiver_delay import (
     course_delays,
     receiver_delays,
     with_pooled,
-    with_types,
 )
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.errors import RefusedError
@@ -97,35 +95,6 @@ def test_a_car_of_few_drives_is_as_sure_as_usual_drives_make_it() -> None:
     found = with_pooled({"a": few, "b": known})
     assert found["b"] == known
     assert found["a"].uncertainty == pytest.approx(math.sqrt(1 / 10_000 + 0.003**2))
-
-
-def test_a_car_of_few_drives_takes_the_delay_of_its_type_and_one_of_many_its_own() -> None:
-    drives = {"many": 300, "a": 1, **dict.fromkeys("bcdefghijklm", 4)}
-    values = {"many": 0.1, "a": 0.15}
-    values |= {car: 0.12 + 0.003 * (n % 5 - 2) for n, car in enumerate("bcdefghijklm")}
-    cars = {
-        car: ReceiverDelay(
-            value=values[car],
-            uncertainty=math.hypot(0.03 / math.sqrt(n), 0.003),
-            drives=n,
-            rows=100,
-            information=n / 0.03**2,
-            differing=n - 1.0,
-            receiver="box",
-        )
-        for car, n in drives.items()
-    }
-    told = with_types(cars | {"other": replace(cars["a"], receiver=None)})
-    assert told.cars["other"] == replace(cars["a"], receiver=None)
-    kind = told.types["box"]
-    assert abs(told.cars["many"].value - 0.1) < 0.002
-    assert abs(told.cars["a"].value - kind.mean) < 0.2 * abs(values["a"] - kind.mean)
-    for car in "abcdefghijklm":
-        assert told.cars[car].uncertainty < cars[car].uncertainty  # type: ignore[operator]
-    assert all(one.drives == drives[car] for car, one in told.cars.items() if car in drives)
-    few = with_types({car: cars[car] for car in ("a", "b", "c")})
-    assert not few.types
-    assert few.cars["a"] == cars["a"]
 
 
 def test_the_delay_of_a_type_is_told_by_its_cars(late_fleet: LateFleet, tmp_path: Path) -> None:

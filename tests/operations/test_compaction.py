@@ -2,9 +2,7 @@
 
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import duckdb
 import numpy as np
@@ -14,8 +12,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.grams.update import update_grams
-from fleet_slip.operations.rewriting import compact, find_expired, find_unreferenced, vacuum
-from fleet_slip.operations.verify import verify
+from fleet_slip.operations.rewriting import compact, find_unreferenced, vacuum
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import Change
@@ -136,48 +133,6 @@ def test_vacuum_leaves_what_a_running_job_is_writing(six: Warehouse) -> None:
     assert vacuum(six, 1).files == (f"models/{old.name}",)
     six.logs.snapshot().commit(Change(add=[action]))
     assert six.logs.snapshot().rows == 609
-
-
-def test_a_folder_that_is_gone_before_it_is_listed_is_passed_over(
-    six: Warehouse, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As the one of a query that went beyond its memory and is over."""
-    spill = path_of(six.root) / ".spill-1"
-    spill.mkdir()
-    scandir = os.scandir
-
-    def late(path: Any) -> Any:
-        if Path(path) == spill:
-            spill.rmdir()
-        return scandir(path)
-
-    monkeypatch.setattr(os, "scandir", late)
-    assert not vacuum(six).files
-    assert not spill.exists()
-
-
-def test_verify_says_of_files_dated_in_the_future_that_compact_keeps_them(six: Warehouse) -> None:
-    compact(six)
-    (path, *_) = sorted(file.path for file in find_unreferenced(six.logs))
-    future = time.time() + 86_400
-    os.utime(path_of(six.logs.folder) / path, (future, future))
-    assert f"logs/{path}" not in vacuum(six, 0).files
-    (finding,) = verify(six).findings
-    assert finding.path == f"logs/{path}"
-    assert "its date is in the future, so compact keeps it: check the clocks" in finding.problem
-
-
-def test_vacuum_puts_back_a_file_that_was_written_again_meanwhile(six: Warehouse) -> None:
-    rows = log_rows("g", random_counts(np.random.default_rng(2), 9))
-    path = path_of(six.logs.folder) / six.logs.write_file("again", rows, DAY).path
-    os.utime(path, (0, 0))
-    (judged,) = find_expired(six, 1)
-    content = path.read_bytes()
-    assert six.logs.write_file("again", rows, DAY).path != judged.path  # a name has one writer
-    six.logs.folder.put(judged.path, content)  # as a repair does
-    assert not judged.folder.remove(judged)
-    assert path.read_bytes() == content
-    assert not judged.folder.remove(replace(judged, path="gone.parquet"))
 
 
 @pytest.mark.parametrize("hours", [-24 * 400, 24 * 400])

@@ -19,11 +19,8 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.compute import compute_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import (
-    Located,
     Retention,
-    drives_by_file,
     forget,
-    locate,
     quarantined_of,
     retain,
 )
@@ -62,23 +59,6 @@ def test_afterwards_every_coefficient_is_that_of_a_world_where_the_car_never_dro
     assert with_all != coefficients(without)
     for query in ("SELECT * EXCLUDE file FROM grams ORDER BY ALL", "FROM log_counts ORDER BY ALL"):
         assert ask(warehouse.root, query) == ask(without.root, query)
-
-
-def test_a_car_is_found_in_files_with_and_without_compute_grams_and_no_other_is_opened(
-    tmp_path: Path,
-) -> None:
-    warehouse = fill(tmp_path, "alfa", "beta")
-    land(warehouse, "other", drive("gamma", 7))
-    update_grams(warehouse)
-    land(warehouse, "later", drive("gamma", 8), drive("beta", 8))  # without Gram rows
-    (other,) = (path for path in warehouse.logs.snapshot().paths if "other" in path)
-    Path(other).write_bytes(b"no Parquet file")
-    subject = ErasureSubject("vehicle", "beta")
-    logs = warehouse.logs.snapshot()
-    found = drives_by_file(logs, subject, locate(warehouse.grams.snapshot(), subject))
-    assert sorted(found.values(), key=min) == [{f"beta-{number}"} for number in (0, 1, 2, 8)]
-    with pytest.raises(StorageError):
-        drives_by_file(logs, subject, Located(frozenset(), {}))
 
 
 def test_with_now_no_byte_below_the_root_names_the_car_not_even_in_older_versions(

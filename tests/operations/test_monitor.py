@@ -152,15 +152,6 @@ def test_limits_are_the_prediction_interval_of_one_more_day() -> None:
     assert limits.beyond(2.625 - 1.01 * half)
 
 
-def test_the_share_of_usual_days_beyond_the_limits_is_what_was_asked_for() -> None:
-    rng = np.random.default_rng(3)
-    beyond = 0
-    for _ in range(2000):
-        days = rng.standard_normal(7).tolist()
-        beyond += Limits.from_values(days[:6], 0.05).beyond(days[6])
-    assert beyond / 2000 == pytest.approx(0.05, abs=0.015)  # three standard errors
-
-
 def test_the_command_tells_by_its_exit_code(
     run_command: RunCommand, trained: tuple[Warehouse, ModelVersion]
 ) -> None:

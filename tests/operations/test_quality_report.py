@@ -373,31 +373,6 @@ def test_of_a_drive_without_a_log_and_a_log_at_once_that_without_is_named() -> N
     }
 
 
-@pytest.mark.parametrize("start_s", [-300, 300])
-def test_one_message_of_a_day_does_not_accuse_the_drives_of_that_day(start_s: int) -> None:
-    honest = [received("car", 3600 * hour, 60_000) for hour in range(12)]
-    forged = received("car", start_s, 8_640_000)
-    assert (
-        list(find_repeated(pa.concat_tables([*honest, forged]))) == forged["drive_id"].to_pylist()
-    )
-
-
-def test_quality_names_two_recordings_of_a_car_at_once(
-    warehouse: Warehouse, run_command: RunCommand
-) -> None:
-    rng = np.random.default_rng(1)
-    known: dict[str, Any] = {"started_at": BEGAN, "duration_s": 40.0, "source": "measured"}
-    drives = [log_rows(name, random_counts(rng, 4000), **known) for name in ("front", "rear")]
-    land(warehouse, "both", *drives)
-    update_grams(warehouse)
-    told = run_command("quality", "--json")
-    assert told.exit_code == 10
-    found = [one for one in told.json["findings"] if one["kind"] == "repeated"]
-    assert [(one["drive_id"], one["figure"]) for one in found] == [
-        ("rear", "40 s overlap with front")
-    ]
-
-
 CARS, DAYS = 12, 3
 NIGHT = DAY + timedelta(days=DAYS - 1)
 

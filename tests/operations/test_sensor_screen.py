@@ -24,7 +24,6 @@ from fleet_slip.warehouse.predicate import (
 )
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
-from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.landing import Landing
 from tests.support.model_lists import nested, write_list
 from tests.support.once import made_once
@@ -184,18 +183,6 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
     assert fleet.models.publish("m", asked).new
 
 
-def test_a_champion_of_more_columns_needs_drives_for_them_too(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cohort = fleet.cohort("day = DATE '2026-10-05'")
-    assert fleet.models.publish("m", cohort.select(model="ay, yaw_rate")).new
-    strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={"max_columns_per_drive": 0.6})
-    monkeypatch.setattr(training_checks, "load_thresholds", lambda _: strict)
-    with pytest.raises(RefusedError, match=r"3 columns on 4 drives, more than 0\.6 a drive"):
-        fleet.models.publish("m", cohort.select(model="ay, yaw_rate, steering_wheel"))
-    assert not fleet.models.preview("m", cohort.select(model="ay, steering_wheel")).refused
-
-
 def test_a_cohort_tells_what_it_was_before_drives_were_left_out() -> None:
     asked = "day > '2026-01-01' AND (mass_kg < 1500)"
     once = without_drives(asked, "drive", [hash_drive("drive", "a")])
@@ -228,30 +215,6 @@ def test_many_drives_are_examined_in_pieces_of_days_and_each_piece_once(
     found = fleet.cohort().examine()
     assert (found.drives, found.faults, len(asked)) == (8, {"stuck ay": 2, "stuck yaw_rate": 2}, 3)
     assert "2026-10-06" in asked[-1] and "2026-10-05" not in asked[-1]
-
-
-def test_rows_of_whole_files_are_not_read_to_tell_that_they_are_known(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
-    monkeypatch.setattr(sensor_screen, "PIECE", 150)
-    fleet, asked = fleet_slip.open(tmp_path / "data"), list[str]()
-
-    def ask(warehouse: Warehouse, predicate: Predicate) -> QualityReport:
-        asked.append(predicate.sql)
-        return QualityReport(0, 0, ())
-
-    monkeypatch.setattr(sensor_screen, "examine_drives", ask)
-    for day in range(3):
-        path = tmp_path / f"day-{day}"
-        write_counted(path, rows_of_fleet(150, START_S + 86_400 * day, seed=day))
-        fleet.import_onboard_grams(path)
-        fleet.cohort().examine()
-        assert len(asked) == day + 1
-        assert f"2024-05-0{day + 1}" in asked[-1]
-    fleet.cohort().examine()
-    assert len(asked) == 3
 
 
 def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(

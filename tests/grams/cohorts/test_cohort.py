@@ -1,14 +1,9 @@
 """Cohorts of Gram rows: which drives have which signals, their folds, and the reader."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import (
     FULL,
@@ -26,10 +21,7 @@ from fleet_slip.grams.cohort import (
 from fleet_slip.grams.update import update_grams
 from fleet_slip.regression.gram import Gram, GramTable
 from fleet_slip.regression.inference import DriveMoments
-from fleet_slip.warehouse import gram_reader
-from fleet_slip.warehouse.gram_reader import GramReader
 from fleet_slip.warehouse.predicate import parse_predicate
-from fleet_slip.warehouse.table_views import open_tables
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.counts import INPUTS, LABEL, cohort_of, driven, gram_of, rows_of, table_of
@@ -82,27 +74,6 @@ def test_the_statement_hashes_names_as_python_does(warehouse: Warehouse) -> None
         assert cohort.drives[f"{name}_hash"].to_pylist() == told.tolist()
 
 
-def test_a_part_of_a_cohort_has_the_tables_of_its_drives_alone(warehouse: Warehouse) -> None:
-    rng = np.random.default_rng(1)
-    whole = [log_rows(f"whole-{i}", random_counts(rng, 40)) for i in range(2)]
-    fewer = []
-    for i in range(3):
-        counts = random_counts(rng, 40)
-        del counts["ax"]
-        fewer.append(log_rows(f"fewer-{i}", counts))
-    land(warehouse, "one", *whole, *fewer)
-    update_grams(warehouse)
-    cohort = load_cohort(warehouse)
-    assert sorted(map(len, cohort.tables)) == [2, 3]
-    ids = np.array(cohort.drives["drive_id"].to_pylist())
-    part = cohort.filter(ids == "fewer-1")
-    assert part.drives["drive_id"].to_pylist() == ["fewer-1"]
-    (table,) = part.tables
-    assert len(table) == 1
-    assert "ax" not in table.signals
-    assert cohort.filter(np.char.startswith(ids, "whole")).tables[0].n.tolist() == [40, 40]
-
-
 COEFFICIENTS = (0.1, 0.4, 0.9, 0.2)
 
 
@@ -132,67 +103,6 @@ def test_cars_are_clusters_and_for_one_car_its_drives() -> None:
     assert (of_one.unit, len(of_one)) == ("drive", 3)
     with pytest.raises(DataError, match="wheel_fl"):
         cohort.complete_cases(["ay", "wheel_fl"])
-
-
-def land_another(warehouse: Warehouse, number: int) -> None:
-    rng = np.random.default_rng(number)
-    land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 30)))
-    update_grams(warehouse)
-
-
-@pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    """What is opened anew."""
-    found: list[object] = []
-
-    def counting(*given: Any) -> Any:
-        found.append(given)
-        return open_tables(*given)
-
-    monkeypatch.setattr(gram_reader, "open_tables", counting)
-    return found
-
-
-def test_a_reader_takes_over_what_the_last_one_opened_until_somebody_commits(
-    warehouse: Warehouse, opened: list[object], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(2):
-        land_another(warehouse, number)
-        assert [len(load_cohort(warehouse).drives) for _ in range(3)] == [number + 1] * 3
-        assert len(opened) == number + 1
-    monkeypatch.setattr(gram_reader, "MAX_USES", 3)
-    load_cohort(warehouse)
-    load_cohort(warehouse)
-    assert len(opened) == 3
-    monkeypatch.setattr(gram_reader, "MAX_REUSED_BYTES", 0)
-    load_cohort(warehouse)
-    load_cohort(warehouse)
-    assert len(opened) == 4
-
-
-def test_a_reader_that_failed_leaves_nothing(warehouse: Warehouse, opened: list[object]) -> None:
-    land_another(warehouse, 0)
-    with pytest.raises(DataError, match="as a query may"), GramReader(warehouse) as failing:
-        failing.opened(PLAIN, parse_predicate(SIGNALS, "true"))
-        raise DataError("as a query may")
-    load_cohort(warehouse)
-    assert len(opened) == 2
-
-
-def test_threads_and_processes_have_their_own(warehouse: Warehouse, opened: list[object]) -> None:
-    land_another(warehouse, 0)
-    with ThreadPoolExecutor(4) as threads:
-        found = list(threads.map(lambda _: len(load_cohort(warehouse).drives), range(16)))
-    assert found == [1] * 16
-    load_cohort(warehouse)
-    before = len(opened)
-    child = os.fork()
-    if not child:
-        load_cohort(warehouse)
-        os._exit(len(opened) - before)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
-    load_cohort(warehouse)
-    assert len(opened) == before
 
 
 TRUE = np.array([0.5, -0.2, 0.1])
@@ -251,11 +161,6 @@ def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     )
     origin = robust_weights(DriveMoments.from_table(table.about_origin()), intercept=False)
     assert np.array_equal(origin.weights, parts)
-
-
-def test_each_weight_has_its_reason() -> None:
-    found = robust_weights(DriveMoments.from_table(drives_of(4, {7: 5.0})))
-    assert "times that of the median drive: robust gives it the weight 0.0" in found.drive(7).reason
 
 
 def test_whole_numbers_beyond_64_bits_stay_exact() -> None:

@@ -141,16 +141,6 @@ def test_a_row_that_cannot_be_keeps_the_whole_file_out(
     assert gram_rows(fleet) == []
 
 
-def test_a_drive_that_is_there_is_refused_under_any_name(fleet: Fleet, send: Send) -> None:
-    send([row_of(gram_of(1))])
-    for same in (row_of(gram_of(3)), row_of(gram_of(1), drive_id="renamed")):
-        with pytest.raises(RepeatedError, match=r"row 2 .* is stored already, as VIN1-2024"):
-            send([other(GRAM), same])
-    with pytest.raises(InputError, match=r"row 2 .* appears twice"):
-        send([other(GRAM), other(gram_of(5))])
-    assert len(gram_rows(fleet)) == 1
-
-
 @pytest.mark.parametrize(
     "change",
     [
@@ -219,13 +209,6 @@ def test_an_erased_car_does_not_come_back_under_a_similar_name(
     fleet.maintenance.forget(vehicle="VIN1")
     with pytest.raises(InputError, match="was forgotten"):
         send([row_of(gram_of(3), name, drive_id="a")])
-
-
-def test_names_are_stored_without_spaces_and_composed(fleet: Fleet, send: Send) -> None:
-    row = row_of(gram_of(1), " Zoe\u0308 ", drive_id="d1\n")
-    send([row])
-    ((stored),) = gram_rows(fleet)
-    assert (stored["vehicle_id"], stored["drive_id"]) == ("Zo\u00eb", "d1")
 
 
 @pytest.mark.parametrize("subject", [{"drive": "VIN1-20240501T100000Z"}, {"vehicle": "VIN1"}])
@@ -372,9 +355,3 @@ def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason
     table = table_of([DRIVE])
     getattr(table, field).reshape(-1)[place] += np.int64(change)
     assert find_impossible(table, RANGES) == {0: reason}
-
-
-def test_each_row_is_judged_by_itself() -> None:
-    table = table_of([DRIVE, DRIVE, DRIVE])
-    table.products[1, 4] += 50_000
-    assert find_impossible(table, RANGES) == {1: INDEFINITE}

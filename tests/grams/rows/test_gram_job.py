@@ -166,18 +166,6 @@ def test_a_drive_that_one_side_lacks_differs() -> None:
     assert differing_drives({("a", KEY): A}, {("a", ("ax",)): A.restrict(("ax",))}) == ["a"]
 
 
-def test_files_are_chosen_evenly(warehouse: Warehouse) -> None:
-    rng = np.random.default_rng(2)
-    for number in range(5):
-        land(warehouse, f"f{number}", log_rows(f"d{number}", random_counts(rng, 20)))
-    update_grams(warehouse)
-    for asked, files in ((1, 1), (3, 3), (8, 5)):
-        seen: list[tuple[int, int]] = []
-        report = check_grams(warehouse, asked, lambda *step, seen=seen: seen.append(step))
-        assert (report.files, report.drives, report.rows) == (files, files, 20 * files)
-        assert seen == [(1, files)] * files
-
-
 def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
     counts = np.random.default_rng(4).integers(-9, 9, (6, 10, 2))
     grams = [Gram.from_counts(("ax", "ay"), one) for one in counts]
