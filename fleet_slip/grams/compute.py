@@ -8,7 +8,6 @@ from functools import partial
 from math import ceil
 from os import cpu_count
 
-import duckdb
 import pyarrow as pa
 
 from fleet_slip.base import Progress, no_progress, pluralize
@@ -130,17 +129,13 @@ def compute_grams(
         return
     resolved = warehouse.catalog.feature_set(feature_set)
     wide = bool(resolved.windows or resolved.block_ticks)
-    if executor is None and not wide:
-        total = sum(file.rows for file in files)
-        with open_database(reading=warehouse.logs.folder) as database:
-            for group in _groups(files, FILES_PER_QUERY):
-                yield _query(database, warehouse, group, feature_set)
-                progress(sum(file.rows for file in group), total)
-        return
-    with nullcontext(executor) if executor else LocalThreads(cpu_count() or 1) as workers:
-        size = 1 if wide else ceil(len(files) / in_flight(workers))
-        groups = _groups(files, min(FILES_PER_QUERY, max(1, size)))
-        compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=1)
+    # DuckDB has threads of its own; the kernel has one.
+    local = LocalThreads(cpu_count() or 1) if wide and not executor else nullcontext(executor)
+    with local as workers:
+        size = ceil(len(files) / in_flight(workers)) if executor else FILES_PER_QUERY
+        groups = _groups(files, 1 if wide else min(FILES_PER_QUERY, size))
+        threads = 1 if executor else None
+        compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=threads)
         task = partial(compute, warehouse, feature_set=feature_set)
         yield from _run_in_order(workers, task, groups, progress)
 
@@ -174,16 +169,6 @@ def by_sql(
     warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, threads: int | None = None
 ) -> pa.Table:
     """Return the Gram rows of log files as `jobs/gram.sql` defines them."""
-    with open_database(reading=warehouse.logs.folder, threads=threads) as database:
-        return _query(database, warehouse, files, feature_set)
-
-
-def _query(
-    database: duckdb.DuckDBPyConnection,
-    warehouse: Warehouse,
-    files: Sequence[TableFile],
-    feature_set: str,
-) -> pa.Table:
     catalog = warehouse.catalog
     paths = {warehouse.logs.uri(file.path): file.path for file in files}
     # By the statistics of the Delta log each signal is in all rows of a file or in none.
@@ -194,11 +179,14 @@ def _query(
     )
     absent = absent_columns(files, catalog.signals.stored_columns)
     statement = gram_statement(catalog, feature_set, complete=complete, absent=absent)
-    identity = catalog.identity(feature_set)
+    parameters = {"feature_set": catalog.identity(feature_set)}
     activity = f"the Gram query over {pluralize(len(files), 'log file')} in {warehouse.logs.folder}"
-    with reading_files(database, activity):
+    with (
+        open_database(reading=warehouse.logs.folder, threads=threads) as database,
+        reading_files(database, activity),
+    ):
         database.execute("SET VARIABLE log_files = $files", {"files": list(paths)})
-        rows = database.sql(statement, params={"feature_set": identity}).to_arrow_table()
+        rows = database.sql(statement, params=parameters).to_arrow_table()
     relative = pa.array([paths[path] for path in rows["file"].to_pylist()], pa.string())
     return rows.set_column(rows.schema.get_field_index("file"), "file", relative).cast(
         warehouse.computed_schema(in_time=False)
