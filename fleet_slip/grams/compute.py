@@ -132,7 +132,7 @@ def compute_grams(
     # DuckDB has threads of its own; the kernel has one.
     local = LocalThreads(cpu_count() or 1) if wide and not executor else nullcontext(executor)
     with local as workers:
-        size = ceil(len(files) / in_flight(workers)) if executor else FILES_PER_QUERY
+        size = ceil(len(files) / in_flight(executor)) if executor else FILES_PER_QUERY
         groups = _groups(files, 1 if wide else min(FILES_PER_QUERY, size))
         threads = 1 if executor else None
         compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=threads)
@@ -141,7 +141,7 @@ def compute_grams(
 
 
 def _run_in_order(
-    executor: Executor,
+    executor: Executor | None,
     task: Callable[[Sequence[TableFile]], pa.Table],
     groups: list[Sequence[TableFile]],
     progress: Progress,
