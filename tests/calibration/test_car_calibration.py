@@ -298,22 +298,6 @@ def test_what_driving_does_not_tell_is_left_out_and_why(kind: str, why: str) -> 
     assert missing["slip_lever"] == NO_RECEIVER
 
 
-def test_one_drive_of_one_car_has_no_uncertainty() -> None:
-    row = gram_row("car", 0, biased(np.random.default_rng(6), TRUE))
-    found = evidence([row])
-    one = calibrated(found, "car")["yaw_rate_offset"]
-    assert one.uncertainty is None
-    assert one.value == pytest.approx(0.013, abs=4e-3)
-
-
-def test_no_gram_rows_tell_nothing() -> None:
-    for banked in (False, True):
-        for sums in ({}, {kind: Gram.zero(c) for kind, c in KINDS.items()}):
-            told = estimate_parameters(CarTerms(CATALOG), sums, banked)
-            assert {*told.values()} == {NO_COURSE, NO_RECEIVER}
-            assert told.keys() == CALIBRATION_PARAMETERS.keys()
-
-
 def filled(warehouse: Warehouse, *names: str) -> None:
     rng = np.random.default_rng(8)
     for car in names:

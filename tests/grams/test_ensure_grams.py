@@ -51,14 +51,6 @@ def test_select_records_the_step_that_computes_gram_rows(
     assert len(runs_of(fleet, "ensure_grams")) == 1
 
 
-def test_within_a_command_it_is_a_step_of_its_run(without_windows: Fleet) -> None:
-    without_windows.models.publish("slip")
-    assert not runs_of(without_windows, "ensure_grams")
-    query = "SELECT steps::VARCHAR FROM runs WHERE command = 'publish' ORDER BY started_at DESC"
-    steps = without_windows.sql(query).fetchall()[0][0]
-    assert "ensure_grams" in steps
-
-
 def test_select_on_a_read_only_root_changes_no_file(smoke_copy: Path) -> None:
     before = state_of(smoke_copy)
     folders = [smoke_copy, *(path for path in smoke_copy.rglob("*") if path.is_dir())]

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -17,9 +17,6 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import logs
 from fleet_slip.ingest.logs import BatchCommit, ingest_files
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured_log import open_measured
-from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
-from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.documents import DocumentFolder
@@ -147,23 +144,6 @@ def test_an_erasure_of_release_02_is_an_error(warehouse: Warehouse, tmp_path: Pa
     assert is_empty(warehouse)
 
 
-def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
-    """The drives of a log of the cars a and b, one each, and its refused rows: the last of each."""
-    columns = {name: values * 2 for name, values in good_columns(20).items()}
-    columns["car"] = ["a"] * 20 + ["b"] * 20
-    columns["ax"] = list(columns["ax"])
-    columns["ax"][19] = columns["ax"][39] = "broken"
-    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
-    file = folder / "log.csv"
-    file.write_text(csv_text(columns))
-    with open_measured(file, mapping) as stream:
-        return list(stream.drives()), next(stream.quarantine())
-
-
-def cars(rows: pa.Table) -> set[str]:
-    return set(rows["vehicle_id"].cast(pa.string()).to_pylist())
-
-
 @pytest.mark.parametrize("name", [" Stra\u00dfe 1", "STRASSE 1", "stra\u00dfe 1\u00a0"])
 def test_names_are_compared_after_normalization_and_case_folding(
     warehouse: Warehouse, tmp_path: Path, name: str
@@ -196,28 +176,6 @@ def test_entries_of_names_as_they_were_typed_bar_that_name_until_it_is_allowed(
     assert erasure_log.erased({"CAR", "car"}, ()).vehicles == {"CAR", "car"}
     erasure_log.allow(ErasureSubject("vehicle", "CAR"))
     assert not erasure_log.erased({"CAR", "car"}, ())
-
-
-@pytest.mark.parametrize("kind", ["vehicle", "drive"])
-def test_the_rows_of_what_was_forgotten_are_left_out(
-    kind: Literal["vehicle", "drive"], tmp_path: Path
-) -> None:
-    drives, refused = two_cars(tmp_path)
-    of_a, of_b = drives
-    erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
-    erasure_log.begin(ErasureSubject(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
-    assert drop_erased_drives(drives, erasure_log) == [of_b]
-    assert cars(refused) == {"a", "b"}
-    assert cars(drop_erased_rejects(refused, erasure_log)) == {"b"}
-
-
-def test_the_refused_rows_of_a_drive_go_with_any_stretch_of_it(tmp_path: Path) -> None:
-    _, refused = two_cars(tmp_path)
-    stretch = f"{refused['drive_id'][0]}-2"
-    erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
-    erasure_log.begin(ErasureSubject("drive", stretch), 1, [], {})
-    assert cars(drop_erased_rejects(refused, erasure_log, {stretch})) == {"b"}
-    assert cars(drop_erased_rejects(refused, erasure_log)) == {"a", "b"}
 
 
 GONE = ("WVWGONE", "track-gone", "gone.csv", "lap-gone")

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from functools import cache
 from typing import Any
@@ -199,23 +198,6 @@ def test_vehicle_models_are_examined_one_after_the_other(
         assert together.drives > 0
     with pytest.raises(DataError, match="no drive matches"):
         examine_drives(warehouse, "mass_kg > 1e9")
-
-
-def test_signs_need_no_peers_and_offsets_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = fleet(multiply("yaw_rate", -1))
-    report = examine(whole.filter(np.arange(DRIVES) >= DRIVES - 2))
-    assert report.compared == 0
-    assert only_finding(report).kind == "reversed"
-    choose_limits(monkeypatch, min_rows=TICKS + 1)
-    assert examine(whole).drives == 0
-
-
-def test_the_order_and_number_of_drives_do_not_matter_to_a_verdict() -> None:
-    cohort = fleet(multiply("wheel_fr", 1.05))
-    (table,) = cohort.tables
-    back = np.arange(len(table))[::-1]
-    turned = replace(cohort, tables=(table.take(back),), drives=cohort.drives.take(back))
-    assert examine(turned).findings == examine(cohort).findings != ()
 
 
 def test_the_command_tells_by_its_exit_code(run_command: RunCommand, warehouse: Warehouse) -> None:

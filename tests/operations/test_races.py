@@ -317,10 +317,6 @@ def corrected() -> Mapping:
     return a_mapping(drive=LAPS, signals={**SIGNALS, "sideslip": turned})
 
 
-def names_in(fleet: Fleet) -> set[str]:
-    return {name for (name,) in fleet.sql("SELECT DISTINCT drive_name FROM log").fetchall()}
-
-
 @pytest.fixture
 def laps(tmp_path: Path) -> Fleet:
     """A file of two drives, `lap` and `slalom`."""
@@ -337,13 +333,6 @@ def test_what_is_forgotten_while_it_is_replaced_is_not_doubled(
     found = laps.sql("SELECT drive_name, count(DISTINCT drive_id) FROM log GROUP BY ALL").fetchall()
     assert all(many == 1 for _, many in found)
     assert not laps.maintenance.verify(full=True).damage
-
-
-def test_what_was_superseded_is_no_drive(laps: Fleet, tmp_path: Path) -> None:
-    laps.gram()
-    laps.ingest(tmp_path / "log.csv", corrected(), replace="all")
-    assert forget_all(laps) == 2
-    assert names_in(laps) == set()
 
 
 @pytest.mark.long

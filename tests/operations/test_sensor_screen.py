@@ -84,17 +84,6 @@ def test_drives_that_are_not_in_order_train_nothing_by_hand(
     ) == (4, 4)
 
 
-@pytest.mark.long
-def test_an_evaluation_leaves_out_drives_with_faulty_sensors(
-    fleet: Fleet, run_command: RunCommand
-) -> None:
-    assert fleet.cohort().examine().faults == {"stuck ay": 2}
-    assert run_command("publish", "m", "--models", "table1").exit_code == 0
-    evaluated = run_command("evaluate", "m", "--cohort", "true")
-    assert evaluated.exit_code == 0 and "2 drives of 6 left out" in evaluated.stderr
-    assert "4 drives, held out whole" in evaluated.stdout
-
-
 def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_path: Path) -> None:
     found = fleet.cohort().examine()
     (kept,) = (tmp_path / "cache").glob("fleet-slip/examined/*.json")

@@ -171,31 +171,6 @@ def test_a_query_of_gram_rows_needs_no_log_file(tmp_path: Path) -> None:
     assert run_selection(warehouse, SelectionRequest()).cohort.drive_count == 20
 
 
-def test_a_query_of_a_day_needs_the_files_of_that_day(tmp_path: Path) -> None:
-    warehouse = Warehouse(LocalFolder(tmp_path))
-    write_fleet(warehouse, 60)
-    first, *_, last = sorted({str(file.day) for file in warehouse.logs.snapshot().files})
-    for path in warehouse.logs.snapshot().paths:
-        if f"day={last}" in path:
-            Path(path).write_bytes(b"no Parquet file")
-    query = f"SELECT count(DISTINCT drive_id) FROM log WHERE day = DATE '{first}'"
-    with connect(tmp_path, query=query) as database:
-        assert database.execute(query).fetchone() == (20,)
-
-
-def test_files_with_other_columns_are_read_by_name(tmp_path: Path) -> None:
-    warehouse = Warehouse(LocalFolder(tmp_path))
-    counts = random_counts(np.random.default_rng(1), 10)
-    for number, dropped in enumerate(["gps_vx", "steer_fl", ""]):
-        rows = log_rows(f"drive-{number}", counts)
-        kept = rows.drop_columns([dropped]) if dropped else rows
-        land(warehouse, str(number), kept)
-        assert warehouse.logs.snapshot().has_same_columns is (number == 0)
-    query = "SELECT count(gps_vx), count(steer_fl), count(ax) FROM log_counts"
-    with connect(tmp_path, query=query) as database:
-        assert database.execute(query).fetchone() == (20, 20, 30)
-
-
 def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path))
     write_fleet(warehouse, 20)
@@ -215,15 +190,6 @@ def test_a_reader_opens_anew_only_what_changed(tmp_path: Path) -> None:
         assert tables(after) == tables(load_cohort(warehouse, folding=plan))
         assert after.grams_version == before.grams_version + 1
         assert after.rows > before.rows
-
-
-def test_a_reader_reads_again_what_came_after_the_table(tmp_path: Path) -> None:
-    warehouse = Warehouse(LocalFolder(tmp_path))
-    with GramReader(warehouse) as reader:
-        with pytest.raises(DataError, match="no Gram rows yet"):
-            load_cohort(reader, folding=Folding())
-        write_fleet(warehouse, 20)
-        assert load_cohort(reader, folding=Folding()).drive_count == 20
 
 
 def test_where_there_are_logs_the_next_command_is_gram_alone(warehouse: Warehouse) -> None:
