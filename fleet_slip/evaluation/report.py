@@ -77,8 +77,9 @@ def table_one(data: ReportData) -> ReportTable:
         rows.append([row.name, ", ".join(row.signals), number(paper, 4), ours, error, rmse])
     noise = data.version.manifest.cross_validation.label_noise_deg
     noise_text = "unknown" if noise is None else degrees(noise, 4)
+    folds = selection.compared.folds
     note = (
-        f"{selection.folds.count} folds by {selection.folds.by}, {count(selection.cohort.rows)} "
+        f"{folds.count} folds by {folds.by}, {count(selection.cohort.rows)} "
         f"rows. {selection.winner.reason} Every RMSE includes the label noise: {noise_text}."
     )
     caption = "Table I. Properties of the estimation models: cross-validated correlation"

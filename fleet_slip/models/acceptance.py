@@ -184,7 +184,7 @@ class ChallengerEvaluation:
             _require_same_columns(catalog, version, feature_set)
             models[version.reference] = version.manifest.counts_model(catalog, feature_set)
         winner, search = selection.winner.model, selection.searched_winner
-        label, intercept = catalog.signals.label, selection.intercept
+        label, intercept = catalog.signals.label, selection.compared.intercept
         inputs = winner.signals if search is None else search.inputs
         incumbent_signals = (name for model in models.values() for name in model.signals)
         signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))

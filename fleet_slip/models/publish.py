@@ -230,7 +230,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         ),
         intercept=winner.model.offset,
         intercept_exact=winner.model.intercept,
-        through_origin=not selection.intercept,
+        through_origin=not selection.compared.intercept,
         terms=tuple(
             _term(catalog, signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
@@ -374,7 +374,7 @@ def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossVali
     """Return the figures of a winner as a manifest stores them."""
     figures = winner.pooled
     return CrossValidated(
-        folds_by=selection.folds.by,
+        folds_by=selection.compared.folds.by,
         folds=len(winner.folds),
         correlation=figures.correlation,
         correlation_standard_error=winner.standard_error,

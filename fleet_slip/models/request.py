@@ -405,46 +405,51 @@ class SelectionPlan:
         The request as it was given.
     request
         The request with the name of its model list, and the label of the list.
-    model_list
-        The list, None for an order or a search of the request.
-    searches
-        Of the request, else of the list.
-    tolerance, intercept
-        Of the request, else of the list.
+    compared
+        All that is compared, with the options of the request; None for an order.
     """
 
     original: SelectionRequest
     request: SelectionRequest
-    model_list: ModelList | None
-    searches: tuple[Search, ...]
-    folds: Folding
+    compared: ModelList | None
     feature_set: str
-    tolerance: str | None
-    intercept: bool
+    folds: Folding
 
     @classmethod
     def from_request(cls, catalog: Catalog, original: SelectionRequest) -> "SelectionPlan":
         """Validate a request. Raises `UsageError`, `QuestionError` and `ConfigError`."""
         original.check()
-        request = replace(original, models=original.models or _default_list(original))
-        model_list = load_model_list(catalog, request.models) if request.models else None
-        if model_list and model_list.label and not request.label:
-            request = replace(request, label=model_list.label)
-            request.check()
-        if request.model is not None:
-            model_list = _list_of_one(catalog, request)
-        folds = model_list.folds if model_list else Folding()
-        feature_set = _feature_set(catalog, request, model_list)
-        return cls(
-            original=original,
-            request=request,
-            model_list=model_list,
-            searches=_searches(catalog, request, model_list, feature_set),
-            folds=make_folding(request.group_by or folds.by, request.folds, folds.count),
-            feature_set=feature_set,
-            tolerance=request.tolerance or (model_list.tolerance if model_list else None),
-            intercept=request.intercept and (model_list is None or model_list.intercept),
+        models = original.models or _default_list(original)
+        base = load_model_list(catalog, models) if models else None
+        label = original.label or (base.label if base else None)
+        request = replace(original, models=models, label=label)
+        request.check()
+        default = base.features if base else COURSE_FEATURES if label else PLAIN
+        feature_set = request.features or default
+        _require_columns(catalog, request, feature_set, base)
+        folds = base.folds if base else Folding()
+        folds = make_folding(request.group_by or folds.by, request.folds, folds.count)
+        if request.is_ordered:
+            return cls(original, request, None, feature_set, folds)
+        candidates, searches = (base.model, base.search) if base else ((), ())
+        if request.model:
+            signals = require_inputs(catalog, request.model.split(","), feature_set)
+            candidates = (CandidateModel(name=GIVEN, signals=signals),)
+        if request.search:
+            searches = (_search_of(catalog, request, feature_set),)
+        description = "One model" if request.model else "Models of a selection"
+        compared = ModelList(
+            description=base.description if base else description,
+            label=label,
+            features=base.features if base and base.line else feature_set,
+            line=base.line if base else None,
+            folds=folds,
+            tolerance=request.tolerance or (base.tolerance if base else None),
+            intercept=request.intercept and (base is None or base.intercept),
+            model=candidates,
+            search=searches,
         )
+        return cls(original, request, compared, feature_set, folds)
 
     @property
     def is_default(self) -> bool:
@@ -457,27 +462,6 @@ class SelectionPlan:
         request = self.request
         return bool(request.is_ordered or request.robust or request.half_life)
 
-    def with_logged_signals(self, catalog: Catalog) -> "SelectionPlan":
-        """Return the same plan with the list of logged signals."""
-        plan = SelectionPlan.from_request(catalog, replace(self.original, models=LOGGED_MODELS))
-        return replace(plan, original=self.original)
-
-    def compared_list(self, cohort: "Cohort") -> ModelList:
-        """Return all that is compared as a model list, which makes the same selection again."""
-        model_list = self.model_list
-        has_line = model_list is not None and model_list.line is not None
-        return ModelList(
-            description=model_list.description if model_list else "Models of a selection",
-            label=self.request.label,
-            features=model_list.features if model_list and has_line else cohort.feature_set,
-            line=model_list.line if model_list else None,
-            folds=self.folds,
-            tolerance=self.tolerance,
-            intercept=self.intercept,
-            model=model_list.model if model_list else (),
-            search=self.searches,
-        )
-
 
 def _default_list(request: SelectionRequest) -> str | None:
     """Return the name of the list that is compared unless the request names one."""
@@ -488,18 +472,10 @@ def _default_list(request: SelectionRequest) -> str | None:
     return LOGGED_MODELS if request.features or request.group_by == PARTS else DEFAULT_MODELS
 
 
-def _list_of_one(catalog: Catalog, request: SelectionRequest) -> ModelList:
-    """Return a list of the one model whose inputs a request names."""
-    feature_set = request.features or (COURSE_FEATURES if request.label else PLAIN)
-    signals = require_inputs(catalog, (request.model or "").split(","), feature_set)
-    model = CandidateModel(name=GIVEN, signals=signals)
-    return ModelList(description="One model", features=feature_set, model=(model,))
-
-
-def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelList | None) -> str:
-    """Return the feature set of a request. Raises `QuestionError` if it lacks columns."""
-    default = COURSE_FEATURES if request.label else PLAIN
-    name = request.features or (model_list.features if model_list else default)
+def _require_columns(
+    catalog: Catalog, request: SelectionRequest, name: str, model_list: ModelList | None
+) -> None:
+    """Raise `QuestionError` for a feature set without the columns of a request."""
     if request.label and not catalog.feature_set(name).change_ticks:
         names = ", ".join(name for name, entry in catalog.sets.items() if entry.change_s)
         raise QuestionError(
@@ -511,41 +487,32 @@ def _feature_set(catalog: Catalog, request: SelectionRequest, model_list: ModelL
             f"the feature set {name} lacks columns of {request.models}: "
             f"{name_inputs(catalog, absent)}. Choose another feature set or model list."
         )
-    return name
 
 
-def _searches(
-    catalog: Catalog, request: SelectionRequest, model_list: ModelList | None, feature_set: str
-) -> tuple[Search, ...]:
-    """Return the search of a request, else those of its list. Raises `QuestionError`."""
-    if not request.search:
-        return model_list.search if model_list else ()
+def _search_of(catalog: Catalog, request: SelectionRequest, feature_set: str) -> Search:
+    """Return the search of a request. Raises `QuestionError` for an unknown method."""
     if request.search not in METHODS:
         raise QuestionError(f"unknown search {request.search!r}. Known: {', '.join(METHODS)}.")
-    options: dict[str, Any] = {"method": request.search}
-    if request.max_features:
-        options["max_features"] = request.max_features
+    inputs = None
     if request.order and request.order != WHOLE_SET:
-        options["inputs"] = require_inputs(catalog, request.order.split(","), feature_set)
-    if request.label:
+        inputs = require_inputs(catalog, request.order.split(","), feature_set)
+    content = {
+        "method": request.search,
+        "max_features": request.max_features or DEFAULT_MAX_FEATURES,
+        "inputs": inputs,
         # The noise of the course exceeds the gain of a column: compare correlations.
-        options["rule"] = "best"
-    return (Search.model_validate(options),)
+        "rule": "best" if request.label else "tolerance",
+    }
+    return Search.model_validate(content)
 
 
 def checksum_of_list(model_list: ModelList, tolerance: str | None = None) -> str:
-    """Return the checksum of a compared list, and of options other than the default."""
+    """Return the checksum of a compared list, changed by options other than the default."""
     default = {"label": None, "line": None, "tolerance": None, "intercept": True}
     compared = model_list.model_copy(update=default).sha256
-    tolerance = tolerance or model_list.tolerance
-    return checksum_with_options(compared, tolerance, model_list.intercept)
-
-
-def checksum_with_options(compared: str, tolerance: str | None, intercept: bool) -> str:
-    """Return a checksum of what is compared, changed by options other than the default."""
     options: dict[str, Any] = {}
-    if tolerance is not None:
+    if (tolerance := tolerance or model_list.tolerance) is not None:
         options["worth"] = tolerance
-    if not intercept:
+    if not model_list.intercept:
         options["intercept"] = False
     return sha256_of(canonical_json({"compared": compared, **options})) if options else compared

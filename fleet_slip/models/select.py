@@ -5,7 +5,7 @@ The functions stand in the order in which they run.
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from functools import cache
 
@@ -43,7 +43,6 @@ from fleet_slip.models.request import (
     SelectionPlan,
     SelectionRequest,
     checksum_of_list,
-    checksum_with_options,
     inputs_of,
     parse_tolerance,
     require_odd,
@@ -99,7 +98,10 @@ def run_plan(
         if not plan.is_default:
             raise
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
-        plan = plan.with_logged_signals(warehouse.catalog)
+        logged = replace(plan.original, models=LOGGED_MODELS)
+        plan = replace(
+            SelectionPlan.from_request(warehouse.catalog, logged), original=plan.original
+        )
         cohort = load_training_set(warehouse, plan, predicate)
     selection = select_models(cohort, plan)
     rmse_deg = selection.winner.model.pooled.rmse_deg
@@ -180,7 +182,9 @@ def select_without(cohort: Cohort, plan: SelectionPlan, held_out: BoolArray) -> 
     """
     cohort = cohort.filter(~held_out)
     if len(cohort.drives[FOLD_KEYS[plan.folds.by]].unique()) < 2:
-        plan = replace(plan, folds=Folding(by="drive", count=plan.folds.count))
+        folds, compared = Folding(by="drive", count=plan.folds.count), plan.compared
+        compared = compared and compared.model_copy(update={"folds": folds})
+        plan = replace(plan, folds=folds, compared=compared)
     return select_models(cohort, plan)
 
 
@@ -195,8 +199,8 @@ def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors |
             return None
         cohort = load_cohort(cohort.source, cohort.predicate, cohort.feature_set)
     groups = np.array(deal_trips(cohort.drives["trip"].to_pylist()))
-    listed = plan.model_list.model if plan.model_list else ()
-    has_choice = plan.searches or plan.request.is_ordered or len(listed) > 1
+    compared = plan.compared
+    has_choice = compared is None or compared.search or len(compared.model) > 1
     if len(np.unique(groups)) < MIN_DRIVES or not has_choice:
         return None
     errors: list[ErrorSums] = []
@@ -233,12 +237,19 @@ def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
     if plan.request.robust:
         cohort, weighted = _downweight_outliers(cohort, plan)
         full *= FULL if weighted else 1
-    if prior := cohort.prior:
-        selection = _select_with_prior(cohort, prior, plan)
-    elif plan.request.is_ordered:
+    if plan.compared is None:
         selection = _select_order(cohort, plan)
+    elif cohort.prior:
+        selection = _select_with_prior(cohort, cohort.prior, plan.compared)
     else:
-        selection = _select_listed(cohort, plan)
+        selection = select(cohort, plan.compared)
+    if plan.compared is not None:
+        name = plan.request.models or (GIVEN if plan.request.model else None)
+        if name is None:
+            (search,) = plan.compared.search
+            name = f"search:{search.method} {search.max_features}"
+        checksum = checksum_of_list(plan.compared)
+        selection = replace(selection, model_list=name, config_sha256=checksum)
     return replace(selection, weighted=weighted, full=full, request=plan.original)
 
 
@@ -246,12 +257,12 @@ def _downweight_outliers(
     cohort: Cohort, plan: SelectionPlan
 ) -> tuple[Cohort, dict[str, DownweightedDrive]]:
     """Down-weight the drives that are outliers of a model of all compared inputs."""
-    request, model_list = plan.request, plan.model_list
-    inputs = inputs_of(cohort, request.order or WHOLE_SET)
-    if model_list and model_list.model and not (request.order or request.search):
-        signals = {name for candidate in model_list.model for name in candidate.signals}
-        inputs = tuple(name for name in cohort.inputs if name in signals)
-    outliers = outlier_drives(cohort.complete_cases(inputs), intercept=plan.intercept)
+    candidates = plan.compared.model if plan.compared and not plan.request.search else ()
+    signals = {name for candidate in candidates for name in candidate.signals}
+    inputs = tuple(name for name in cohort.inputs if name in signals)
+    inputs = inputs or inputs_of(cohort, plan.request.order or WHOLE_SET)
+    intercept = plan.compared.intercept if plan.compared else plan.request.intercept
+    outliers = outlier_drives(cohort.complete_cases(inputs), intercept=intercept)
     if not outliers:
         return cohort, {}
     parts_of = {name: round(outlier.weight * FULL) for name, outlier in outliers.items()}
@@ -268,17 +279,6 @@ def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, Downwe
     return {
         names[i]: weights.drive(i) for i in sorted(less, key=lambda i: -float(weights.times[i]))
     }
-
-
-def _select_listed(cohort: Cohort, plan: SelectionPlan) -> Selection:
-    """Compare the candidates and searches of a plan."""
-    compared = plan.compared_list(cohort)
-    title = plan.request.models or (GIVEN if plan.request.model else None)
-    if not title:
-        (search,) = compared.search
-        title = f"search:{search.method} {search.max_features}"
-    selection = select(cohort, compared)
-    return replace(selection, model_list=title, config_sha256=checksum_of_list(compared))
 
 
 MAX_LOST_SHARE = Fraction(1, 10)
@@ -328,16 +328,7 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
     winner = choose_by(compared, models)
     if winner.model.name in {candidate.name for candidate in rows.candidates}:
         winner = _refit(winner, folds, rows, catalog, intercept=intercept)
-    return Selection(
-        cohort,
-        compared.folds,
-        tuple(models),
-        winner,
-        skipped,
-        searched=tuple(searched),
-        intercept=intercept,
-        compared=compared,
-    )
+    return Selection(cohort, compared, tuple(models), winner, skipped, searched=tuple(searched))
 
 
 def _labelled_folds(cohort: Cohort, folding: Folding) -> CohortFolds:
@@ -556,16 +547,16 @@ def keeps_prior(with_prior: float, without: float, drives: int) -> bool:
     return with_prior <= without * (1 + min(MAX_PRIOR_COST, 1 / drives))
 
 
-def _select_with_prior(cohort: Cohort, prior: Cohort, plan: SelectionPlan) -> Selection:
+def _select_with_prior(cohort: Cohort, prior: Cohort, compared: ModelList) -> Selection:
     """Fit all inputs with the prior (no search: the prior regularises), or select without it."""
-    selection = _select_listed(replace(cohort, prior=None), plan)
+    selection = select(replace(cohort, prior=None), compared)
     alone = selection.winner.model
-    searched = next((search.inputs for search in plan.searches if search.inputs), ())
+    searched = next((search.inputs for search in compared.search if search.inputs), ())
     signals = tuple(name for name in searched if name in cohort.inputs) or alone.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
     weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighted.folds(plan.folds.by, plan.folds.count)
-    joined = _cross_validate("prior", signals, folds, cohort.catalog, plan.intercept)
+    folds = weighted.folds(compared.folds.by, compared.folds.count)
+    joined = _cross_validate("prior", signals, folds, cohort.catalog, compared.intercept)
     figures = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
         f"the weight {weighted.weight}, {alone.pooled.rmse_deg:.4f} deg without."
@@ -585,31 +576,30 @@ def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
     request, catalog = plan.request, cohort.catalog
     order = request.order or WHOLE_SET
     inputs, label = inputs_of(cohort, order), catalog.signals.label
-    rule = Rule(
-        request.ranking or "declared", request.criterion or "cv", parse_tolerance(plan.tolerance)
-    )
+    tolerance = parse_tolerance(request.tolerance)
+    rule = Rule(request.ranking or "declared", request.criterion or "cv", tolerance)
     folds = cohort.folds(plan.folds.by, plan.folds.count).complete_cases(inputs, label, sparse=True)
-    drives = clustered_moments(cohort.complete_cases(inputs), intercept=plan.intercept)
+    drives = clustered_moments(cohort.complete_cases(inputs), intercept=request.intercept)
     choice = choose_nested(
-        folds, drives, inputs, label, catalog.input_scales, rule, intercept=plan.intercept
+        folds, drives, inputs, label, catalog.input_scales, rule, intercept=request.intercept
     )
-    described = ModelList(
-        description="Inputs to choose from",
+    name, signals = choice.winner.model.name, choice.winner.model.signals
+    model_list = f"order:{order} {rule.ranking} {rule.criterion}"
+    compared = ModelList(
+        description=f"Chosen by select: {model_list}",
         features=cohort.feature_set,
         folds=plan.folds,
-        model=(CandidateModel(name="inputs", signals=inputs),),
+        intercept=request.intercept,
+        model=(CandidateModel(name=name, signals=signals),),
     )
-    content = {"inputs": described.sha256, "ranking": rule.ranking, "criterion": rule.criterion}
-    content |= {"evidence": choice.evidence.kind}
-    compared = sha256_of(canonical_json(content))
+    content = {"inputs": inputs, "rule": asdict(rule), "winner": compared.sha256}
     return Selection(
         cohort,
-        plan.folds,
+        compared,
         choice.models,
         choice.winner,
         {},
         choice=choice,
-        intercept=plan.intercept,
-        model_list=f"order:{order} {rule.ranking} {rule.criterion}",
-        config_sha256=checksum_with_options(compared, plan.tolerance, plan.intercept),
+        model_list=model_list,
+        config_sha256=sha256_of(canonical_json(content)),
     )

@@ -66,17 +66,18 @@ def _first_stage_model(
 ) -> FirstStageModel:
     """Return the stored first-stage model of a plan's list, or fit and store one."""
     catalog, name = warehouse.catalog, plan.feature_set
-    if plan.model_list is None or plan.model_list.line is None:
+    line = plan.compared.line if plan.compared else None
+    if line is None:
         raise QuestionError(
             f"the feature set {name} contains the estimate of a first-stage model: choose a model "
             "list that names it (line), such as models = learning."
         )
-    models = load_model_list(catalog, plan.model_list.line)
+    models = load_model_list(catalog, line)
     estimate = catalog.stacked_sets[name]
     about = {
         "estimate": estimate,
         "scale": catalog.estimates[estimate].scale,
-        "models": plan.model_list.line,
+        "models": line,
         "models_sha256": models.sha256,
         "feature_set": catalog.identity(models.features),
         "cohort": cohort,

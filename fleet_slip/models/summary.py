@@ -15,10 +15,9 @@ from fleet_slip.grams.cohort import (
     PARTS,
     Cohort,
     DownweightedDrive,
-    Folding,
     remark_left_out,
 )
-from fleet_slip.models.request import CandidateModel, ModelList, Search, SelectionRequest
+from fleet_slip.models.request import ModelList, Search, SelectionRequest
 from fleet_slip.regression.choice import NestedChoice, Winner
 from fleet_slip.regression.folds import CrossValidation, Figures
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
@@ -66,12 +65,11 @@ class Selection(Answer):
         Choice from an order; None for a list of models.
     searched
         The models of each search, which are among `models`.
-    intercept
-        False if models go through the origin.
     model_list, config_sha256
         Name of what was compared, such as `table1`, and its checksum.
     compared
-        What was compared, as a model list.
+        What was compared; of an order the winner. Its selection on the same data has the same
+        winner.
     weighted
         The drives that `robust` down-weights, the most unusual first.
     full
@@ -91,16 +89,14 @@ class Selection(Answer):
     """
 
     cohort: Cohort
-    folds: Folding
+    compared: ModelList
     models: tuple[CrossValidation, ...]
     winner: Winner
     skipped: dict[str, str]
     choice: NestedChoice | None = None
     searched: tuple[SearchedModels, ...] = ()
-    intercept: bool = True
     model_list: str = ""
     config_sha256: str = ""
-    compared: ModelList | None = None
     weighted: Mapping[str, DownweightedDrive] = field(default_factory=dict)
     full: int = 1
     without_label: CourseLabelQuality | None = None
@@ -130,19 +126,6 @@ class Selection(Answer):
         signals = self.winner.model.signals
         of_search = (s for s in self.searched if signals in [model.signals for model in s.models])
         return next(of_search, None)
-
-    def as_model_list(self) -> ModelList:
-        """Return a model list whose selection on the same data has the same winner."""
-        if self.choice is None and self.compared is not None:
-            return self.compared
-        winner = self.winner.model
-        return ModelList(
-            description=f"Chosen by select: {self.model_list}",
-            features=self.cohort.feature_set,
-            folds=self.folds,
-            intercept=self.intercept,
-            model=(CandidateModel(name=winner.name, signals=winner.signals),),
-        )
 
     @property
     def rows_without(self) -> int:
@@ -178,9 +161,9 @@ class Selection(Answer):
             "rows_without": self.rows_without,
             "drives_without_log": self.cohort.count_onboard_with(),
             "drives_left_out": self.cohort.left_out,
-            "intercept": self.intercept,
+            "intercept": self.compared.intercept,
             "folds": {
-                "by": self.folds.by,
+                "by": self.compared.folds.by,
                 "count": len(self.models[0].folds),
             },
             "skipped": self.skipped,
@@ -249,7 +232,7 @@ def summarize(selection: Selection, everything: bool = False, hint: str = "") ->
         yield from _choice(selection.choice)
     yield _models(selection, everything, hint)
     yield from _left_out(selection)
-    if selection.folds.by in (PARTS, BANDS):
+    if selection.compared.folds.by in (PARTS, BANDS):
         model = winner.model
         yield TextTable(
             f"\nmodel {model.name}, each fold left out in turn",
@@ -321,8 +304,8 @@ def _models(selection: Selection, everything: bool, hint: str) -> TextTable:
     shown = models if everything else [model for model in models if model.name in names]
     title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
     title += _shortened(where, everything, hint)
-    title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.folds.by}"
-    title += "" if selection.intercept else "; no intercept"
+    title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.compared.folds.by}"
+    title += "" if selection.compared.intercept else "; no intercept"
     title += "" if len(shown) == len(models) else f"; {len(shown)} of {len(models)} models"
     title += f" ({hint})" if hint and len(shown) < len(models) else ""
     header, row = "model", "{model.name}"
