@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -58,7 +58,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 BATCH_BYTES = 2**24
 """Files are read, written and committed together up to this size."""
 BATCH_FILES = 500
-FAILURES_SHOWN = 5
+TEXTS_SHOWN = 5
 
 
 class IngestTask(NamedTuple):
@@ -75,31 +75,25 @@ BuildRemoval: TypeAlias = Callable[[TableName, Snapshot, Collection[SourceRef]],
 
 
 @dataclass(frozen=True)
-class FileReport(Record):
+class IngestReport(Record):
     """The counts of a file and what looks implausible in it."""
+
+    DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
 
     file: str
     counts: IngestCounts
     suspicions: tuple[Fault, ...] = ()
     """Faults of the file; and of the longest drive, in the report of one file of a batch."""
-
-    @property
-    def alarms(self) -> tuple[Fault, ...]:
-        """The faults that harm a model."""
-        return tuple(fault for fault in self.suspicions if fault.does_harm)
-
-
-@dataclass(frozen=True)
-class IngestReport(FileReport):
-    """The result of ingesting one file."""
-
-    DOCUMENT = "file new *counts rows_quarantined drives_forgotten drives_replaced suspicions"
-
     new: bool = True
     drives_forgotten: int = 0
     """Drives that were skipped because they, or their cars, were erased."""
     drives_replaced: int = 0
     """Drives that this file replaces: the same recording, or the same path with other content."""
+
+    @property
+    def alarms(self) -> tuple[Fault, ...]:
+        """The faults that harm a model."""
+        return tuple(fault for fault in self.suspicions if fault.does_harm)
 
     @property
     def rows_quarantined(self) -> int:
@@ -120,7 +114,7 @@ class SignalRange:
 
 
 @dataclass(frozen=True)
-class Preview(FileReport, Answer):
+class Preview(IngestReport, Answer):
     """The result that ingesting a file would have."""
 
     DOCUMENT = "file *counts ranges suspicions"
@@ -133,7 +127,7 @@ class Preview(FileReport, Answer):
         rejected = ", ".join(f"{n:,} {reason}" for reason, n in counts.quarantined.items())
         yield TextTable(
             f"{self.file}: {pluralize(counts.rows_read, 'row')}; left out by conditions "
-            f"{counts.rows_left_out:,}; rejected {sum(counts.quarantined.values()):,}"
+            f"{counts.rows_left_out:,}; rejected {self.rows_quarantined:,}"
             f"{f' ({rejected})' if rejected else ''}; {pluralize(counts.drives, 'drive')} of "
             f"{pluralize(counts.ticks, 'tick')}",
             "signal|unit|least|most|missing",
@@ -272,17 +266,17 @@ def _joined(failures: Sequence[Failure], stored: int) -> InputError:
     for file, failure in failures:
         name = quote_name(file)
         reasons.setdefault(str(failure).removeprefix(f"{name}: "), []).append(name)
-    texts = []
-    for reason, files in reasons.items():
-        more = f" and {len(files) - FAILURES_SHOWN:,} more" if len(files) > FAILURES_SHOWN else ""
-        texts.append(f"{', '.join(files[:FAILURES_SHOWN])}{more}: {reason}")
-    unshown = len(texts) - FAILURES_SHOWN
+    texts = [f"{_shortened(files)}: {reason}" for reason, files in reasons.items()]
     are_repeated = all(isinstance(failure, RepeatedError) for _, failure in failures)
     return (RepeatedError if are_repeated else InputError)(
         f"{pluralize(len(failures), 'file')} cannot be used"
-        f"{'; all others are stored' if stored else ''}. {' '.join(texts[:FAILURES_SHOWN])}"
-        + (f" And {pluralize(unshown, 'other reason')}." if unshown > 0 else "")
+        f"{'; all others are stored' if stored else ''}. {_shortened(texts, ' ')}"
     )
+
+
+def _shortened(texts: Sequence[str], separator: str = ", ") -> str:
+    more = f" and {len(texts) - TEXTS_SHOWN:,} more" if len(texts) > TEXTS_SHOWN else ""
+    return separator.join(texts[:TEXTS_SHOWN]) + more
 
 
 # A batch of files becomes data files.
@@ -434,28 +428,22 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
 
     Raises `InputError`.
     """
-    previews: list[Preview] = []
-    for batch in _batches(map(IngestTask, logs)):
-        results = [preview_log(task.file, mapping) for task in batch]
-        faults = check_longest(mapping, [drive for _, drive in results])
-        previews += [
-            replace(preview, suspicions=(*preview.suspicions, *of_drive))
-            for (preview, _), of_drive in zip(results, faults, strict=True)
-        ]
-    return previews
+    return [_preview_log(log, mapping) for log in logs]
 
 
-def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
-    """Return the preview of a log and its longest drive. Raises `InputError`."""
+def _preview_log(log: Path, mapping: Mapping) -> Preview:
+    """Return the preview of a log. Raises `InputError`."""
     ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
     values: Counter[str] = Counter()
     with open_measured(log, mapping) as stream:
         for drive in stream.drives():
             for name, counts in drive.counts.items():
                 values[name] += len(counts) - counts.null_count
-                extremes = pc.min_max(counts).as_py()
-                ends[name] += [] if extremes["min"] is None else [extremes["min"], extremes["max"]]
+                ends[name] += [
+                    end for end in pc.min_max(counts).as_py().values() if end is not None
+                ]
         suspicions = stream.suspicions()  # may read the file again
+    (faults,) = check_longest(mapping, [stream.longest])
     ranges = []
     for name, bounds in ends.items():
         signal = mapping.signal_catalog[name]
@@ -463,7 +451,7 @@ def preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | N
         low, high = (scale * min(bounds), scale * max(bounds)) if bounds else (np.nan, np.nan)
         missing = 1 - values[name] / max(stream.counts.ticks, 1)
         ranges.append(SignalRange(name, signal.unit, low, high, missing))
-    return Preview(str(log), stream.counts, suspicions, tuple(ranges)), stream.longest
+    return Preview(str(log), stream.counts, (*suspicions, *faults), ranges=tuple(ranges))
 
 
 CHECKED_TICKS, MIN_CHECKED_TICKS = 60_000, 6_000
@@ -515,40 +503,40 @@ class DataFiles:
         """Take the table, and threads to write with."""
         self._table, self._threads = table, threads
         self._written: list[Future[list[AddAction]]] = []
-        self._of_this_log: list[Future[list[AddAction]]] = []
+        self._first_of_log, self._is_new = 0, False
         self._waiting: dict[str, pa.Table] = {}
+        """Rows that share a data file with those of other logs, by digest."""
         self.digests: list[str] = []
 
     def begin_log(self, digest: str, *, is_new: bool) -> None:
         """Begin a log. Its rows are ignored unless it is new."""
         self._digest, self._is_new = digest, is_new
-        self._remaining: pa.Table | None = None
+        self._first_of_log = len(self._written)
 
     def add(self, rows: pa.Table, *, full: bool) -> None:
-        """Write rows to a data file of their own if `full`, else keep them for `end_log`."""
+        """Write rows to a data file of their own if `full`, else keep them for other logs."""
         if self._is_new and rows.num_rows:
             if full:
-                name = f"measured-{self._digest[:24]}-{len(self._of_this_log) + 1}"
-                self._of_this_log.append(self._begin(name, [rows]))
+                number = len(self._written) - self._first_of_log + 1
+                self._begin(f"measured-{self._digest[:24]}-{number}", [rows])
             else:
-                self._remaining = rows
+                self._waiting[self._digest] = rows
 
     def end_log(self) -> None:
         """End the log: its remaining rows wait for those of other logs."""
-        if self._of_this_log or self._remaining is not None:
+        if len(self._written) > self._first_of_log or self._digest in self._waiting:
             self.digests.append(self._digest)
-        self._written += self._of_this_log
-        self._of_this_log = []
-        if self._remaining is not None:
-            self._waiting[self._digest] = self._remaining
         if sum(rows.num_rows for rows in self._waiting.values()) >= FILE_ROWS:
             self._write_waiting()
+        self._first_of_log, self._is_new = len(self._written), False
 
     def discard_log(self) -> None:
-        """Delete the files written of the current log."""
-        written = [writing for writing in self._of_this_log if writing.exception() is None]
+        """Delete the files written of the log that was begun and not ended."""
+        written = [w for w in self._written[self._first_of_log :] if w.exception() is None]
         self._table.discard(file for writing in written for file in writing.result())
-        self._of_this_log = []
+        del self._written[self._first_of_log :]
+        if self._is_new:
+            self._waiting.pop(self._digest, None)
 
     def finish(self) -> NewFiles:
         """Wait for all data files; return them and their transactions."""
@@ -558,18 +546,16 @@ class DataFiles:
 
     def _write_waiting(self) -> None:
         """Write waiting rows in the order of their logs' digests, which is that of drive names."""
-        digests = sorted(self._waiting)
-        if digests:
-            rows = [self._waiting[digest] for digest in digests]
-            self._written.append(self._begin(f"measured-{digest_of(digests)[:24]}", rows))
+        if self._waiting:
+            digests, rows = zip(*sorted(self._waiting.items()), strict=True)
+            self._begin(f"measured-{digest_of(digests)[:24]}", list(rows))
             self._waiting = {}
 
-    def _begin(self, name: str, rows: list[pa.Table]) -> Future[list[AddAction]]:
+    def _begin(self, name: str, rows: list[pa.Table]) -> None:
         """Start writing rows, after the oldest of `WRITERS` files under way has ended."""
-        begun = [*self._written, *self._of_this_log]
-        if len(begun) >= WRITERS:
-            begun[-WRITERS].result()
-        return self._threads.submit(self._write, name, rows)
+        if len(self._written) >= WRITERS:
+            self._written[-WRITERS].result()
+        self._written.append(self._threads.submit(self._write, name, rows))
 
     def _write(self, name: str, rows: list[pa.Table]) -> list[AddAction]:
         by_day = _by_day(pa.concat_tables(rows).unify_dictionaries())
@@ -590,44 +576,27 @@ def _by_day(rows: pa.Table) -> dict[Any, pa.Table]:
 
 def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     """Return the rows of `logs` for these drives; strings are dictionary-encoded."""
+    signals, measured = mapping.signal_catalog, set(mapping.signal_names)
     sizes = [drive.ticks.size for drive in drives]
-    repeat = cache(partial(_repeat, sizes=sizes))  # many columns are the same for all drives
-    columns, signals, measured = {}, mapping.signal_catalog, set(mapping.signal_names)
-    for column in signals.log_schema:
-        name, kind = column.name, column.type
-        if name == "tick":
-            columns[name] = pa.chunked_array([as_arrow(drive.ticks) for drive in drives], kind)
-        elif name in measured:
+    of_drive = pa.schema([signals.log_schema.field("day"), *signals.drive_schema])
+    metadata = [{name: drive.metadata.get(name) for name in of_drive.names} for drive in drives]
+    # Polars makes them, since Arrow imports pandas for Python's objects if that is installed.
+    schema = pl.DataFrame(of_drive.empty_table()).schema
+    named = pl.DataFrame(metadata, schema, strict=False).to_arrow().cast(of_drive)
+    columns: dict[str, pa.ChunkedArray] = {}
+    place_of_drive = as_arrow(np.repeat(np.arange(len(drives), dtype=np.int32), sizes))
+    for column in of_drive:
+        values = named[column.name].combine_chunks()
+        is_text = pa.types.is_string(column.type)
+        values = values.dictionary_encode() if is_text else values
+        columns[column.name] = values.take(place_of_drive)
+    columns["tick"] = pa.chunked_array([as_arrow(drive.ticks) for drive in drives], pa.int32())
+    for name in signals.signals:
+        if name in measured:
             columns[name] = pa.chunked_array([drive.counts[name] for drive in drives])
-        elif name in signals.extras:
-            continue
-        elif name in signals.signals:
-            columns[name] = pa.nulls(sum(sizes), kind)
-        else:
-            values = tuple(drive.metadata.get(name) for drive in drives)
-            if not pa.types.is_string(kind):
-                columns[name] = repeat(values, kind)
-                continue
-            texts = list(dict.fromkeys(text for text in values if text is not None))
-            codes = tuple(None if text is None else texts.index(text) for text in values)
-            named = pl.Series(texts, dtype=pl.String).to_arrow().cast(kind)
-            columns[name] = pa.DictionaryArray.from_arrays(
-                repeat(codes, pa.int32()), named, safe=False
-            )
+        elif name not in signals.extras:
+            columns[name] = pa.nulls(sum(sizes), pa.int16())
     return pa.table(columns)
-
-
-def _repeat(values: Sequence[Any], kind: pa.DataType, sizes: Sequence[int]) -> pa.Array:
-    """Repeat each value by its size. Not by `pa.array`, which imports pandas if installed."""
-    column = pl.Series(values, strict=False)
-    if column.null_count() == len(column):
-        return pa.nulls(sum(sizes), kind)
-    absent = None
-    if column.null_count():
-        absent = np.repeat(column.is_null().to_numpy(), sizes)
-        column = column.fill_null(column.drop_nulls()[0])
-    repeated = as_arrow(np.repeat(column.to_physical().to_numpy(), sizes), absent)
-    return repeated.view(column.to_arrow().type).cast(kind)
 
 
 # Commits: rejected rows first, then drives.
