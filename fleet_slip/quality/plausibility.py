@@ -5,10 +5,10 @@ The values are all well formed. Axes and signs are ISO 8855.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from itertools import islice
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -28,16 +28,17 @@ from fleet_slip.quality.drive_signals import (
     WHEELS,
     MeanMoments,
     Signals,
+    fit,
     is_moving,
     slope_of,
     speed_mps,
     to_regular_grid,
     wheel_speed_mps,
 )
-from fleet_slip.quality.label_motion import check_label, is_yaw_rate_reversed
 from fleet_slip.quality.turning import (
     MIN_MEAN_RATIO,
     WITNESSES,
+    estimate_delay,
     find_delays,
     find_reversed_or_swapped,
     find_swapped_axes,
@@ -45,6 +46,33 @@ from fleet_slip.quality.turning import (
 from fleet_slip.warehouse.predicate import Predicate, guarded_query
 from fleet_slip.warehouse.table_views import connect_tables
 from fleet_slip.warehouse.warehouse import Warehouse
+
+
+@dataclass(frozen=True)
+class DriveRows:
+    """Signals of a drive, the rows in which it moves, and its speed in m/s, if that is sound."""
+
+    signals: Signals
+    label: str
+    moving: BoolArray
+    speed: FloatArray | None = None
+
+    def has(self, *names: str) -> bool:
+        """Return True if the drive has these signals."""
+        return set(names) <= set(self.signals)
+
+    def without(self, faults: Sequence[Fault]) -> "DriveRows":
+        """Return the drive with the signals that no fault names."""
+        faulty = {name for fault in faults for name in fault.signals}
+        sound = {name: values for name, values in self.signals.items() if name not in faulty}
+        return replace(self, signals=sound)
+
+    @property
+    def curvature(self) -> FloatArray:
+        """The yaw rate over the speed; the yaw rate itself without a speed."""
+        yaw_rate = self.signals["yaw_rate"]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return yaw_rate if self.speed is None else np.asarray(yaw_rate / self.speed)
 
 
 def check_plausibility(
@@ -55,27 +83,26 @@ def check_plausibility(
     Each check passes over signals that an earlier one found faulty. The label of a drive may be
     computed from its velocities, where its remedies concern these.
     """
-    faults = list(_without_change(catalog, signals))
-    sound = _without(signals, faults)
-    moving = is_moving(sound)
-    one_sided = list(find_one_sided(sound, moving, catalog.label))
-    faults += (fault for fault in one_sided if catalog.label not in fault.signals)
-    faults += _turning(_without(sound, faults), moving, catalog.label)
-    faults += find_delays(_without(sound, faults), moving)
-    wrong_speeds = list(_speeds(sound, moving))
+    label, faults = catalog.label, list(_without_change(catalog, signals))
+    sound = DriveRows(signals, label, np.ones(1, dtype=np.bool_)).without(faults)
+    sound = replace(sound, moving=is_moving(sound.signals))
+    one_sided = list(find_one_sided(sound))
+    faults += (fault for fault in one_sided if label not in fault.signals)
+    faults += _turning(sound.without(faults))
+    faults += find_delays(sound.without(faults).signals, sound.moving)
+    wrong_speeds = list(_speeds(sound))
     faults += wrong_speeds
-    speed = speed_mps(_without(sound, wrong_speeds))
-    if speed is not None:
-        faults += _sizes(_without(sound, faults), speed, moving)
-        faults += _axles(_without(sound, faults), speed, moving)
-    remaining = _without(sound, faults)
-    label = check_label(catalog.label, remaining, speed, moving, from_velocities=from_velocities)
-    if one_sided and catalog.label in one_sided[-1].signals:
+    sound = replace(sound, speed=speed_mps(sound.without(wrong_speeds).signals))
+    if sound.speed is not None:
+        faults += _sizes(sound.without(faults), sound.speed)
+        faults += _axles(sound.without(faults), sound.speed)
+    of_label = check_label(sound.without(faults), from_velocities=from_velocities)
+    if one_sided and label in one_sided[-1].signals:
         # A biased label is on one side, too.
-        label = label if any(fault.kind == "biased" for fault in label) else one_sided[-1:]
-    faults += label
-    faults = _with_axes(faults, signals, catalog.label)
-    return [*faults, *islice(check_course(_without(sound, faults)), 1)]
+        is_biased = any(fault.kind == "biased" for fault in of_label)
+        of_label = of_label if is_biased else one_sided[-1:]
+    faults = _with_axes([*faults, *of_label], signals, label)
+    return [*faults, *islice(check_course(sound.without(faults).signals), 1)]
 
 
 _STEERING = ("steering_wheel", "steer", "steer_fl", "steer_fr")
@@ -106,12 +133,6 @@ def _with_axes(faults: list[Fault], signals: Signals, label: str) -> list[Fault]
     return [CHECKS["axes of the car"].fault(*ordered, witnesses=witnesses), *remaining]
 
 
-def _without(signals: Signals, faults: Sequence[Fault]) -> Signals:
-    """Return the signals that no fault names."""
-    faulty = {name for fault in faults for name in fault.signals}
-    return {name: values for name, values in signals.items() if name not in faulty}
-
-
 def _without_change(catalog: SignalCatalog, signals: Signals) -> Iterator[Fault]:
     for name, values in signals.items():
         present = values[np.isfinite(values)]
@@ -129,14 +150,15 @@ MIN_ONE_SIDED_S = 60.0
 """In a shorter drive a car may turn to one side."""
 
 
-def find_one_sided(signals: Signals, moving: BoolArray, label: str) -> Iterator[Fault]:
+def find_one_sided(drive: DriveRows) -> Iterator[Fault]:
     """Yield signals that never change their sign while the car drives; the label comes last.
 
     A car that does turn to one side, as on an oval, shows it by its rear wheels, or by the mean of
     the other signs of turning.
     """
+    signals, label, moving = drive.signals, drive.label, drive.moving
     rear = ("wheel_rl", "wheel_rr")
-    if set(rear) <= set(signals) and _side(signals[rear[1]] - signals[rear[0]], moving):
+    if drive.has(*rear) and _side(signals[rear[1]] - signals[rear[0]], moving):
         return
     means = {name: _mean_ratio(signals[name], moving) for name in SIGNED if name in signals}
     for name in (*SIGNED, label):
@@ -170,33 +192,33 @@ def _side(values: FloatArray, rows: BoolArray) -> int:
     return -1 if high <= -CHECKS["lost sign"].low * low else 0
 
 
-def _turning(signals: Signals, moving: BoolArray, label: str) -> list[Fault]:
+def _turning(drive: DriveRows) -> list[Fault]:
     """Compare the signs of turning, and both accelerations with the turns, while the car moves."""
     names = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
-    used = {name: values for name, values in signals.items() if name in names}
+    used = {name: values for name, values in drive.signals.items() if name in names}
     if not used:
         return []
-    rows = moving & np.isfinite(list(used.values())).all(axis=0)
+    rows = drive.moving & np.isfinite(list(used.values())).all(axis=0)
     if rows.sum() < MIN_TICKS:
         return []
     moments = MeanMoments.from_rows(used, rows)
     faults = find_reversed_or_swapped(moments).get(0, [])
     if faults and set(faults[0].signals) == {"ay", "yaw_rate"}:
-        faults = [_decide(faults[0], signals, moving, label)]
+        faults = [_decide(faults[0], drive)]
     return [*faults, *find_swapped_axes(moments).values()]
 
 
-def _decide(fault: Fault, signals: Signals, moving: BoolArray, label: str) -> Fault:
+def _decide(fault: Fault, drive: DriveRows) -> Fault:
     """Return which one of ay and yaw rate contradicts the label, too; the fault if none does."""
-    reversed_ = is_yaw_rate_reversed(label, signals, moving)
-    if reversed_ is None:
+    drive = replace(drive, speed=speed_mps(drive.signals))
+    if drive.speed is None or not drive.has(drive.label, "yaw_rate", "ay"):
         return fault
-    return Fault(
-        fault.kind,
-        ("yaw_rate",) if reversed_ else ("ay",),
-        f"it contradicts both {'ay' if reversed_ else 'yaw_rate'} and {label}",
-        "Write negate = true.",
-    )
+    lever_m, _, explained = _fit_lever(drive.signals[drive.label], drive, drive.speed)
+    if explained <= MIN_EXPLAINED or abs(lever_m) < -CHECKS["sign of the label"].low:
+        return fault
+    wrong, other = ("yaw_rate", "ay") if lever_m < 0 else ("ay", "yaw_rate")
+    figure = f"it contradicts both {other} and {drive.label}"
+    return Fault(fault.kind, (wrong,), figure, "Write negate = true.")
 
 
 # The size of signals by that of others.
@@ -214,8 +236,9 @@ def _ratio(values: FloatArray, expected: FloatArray, rows: BoolArray) -> float |
     return ratio if ratio > 0 else None
 
 
-def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
+def _speeds(drive: DriveRows) -> Iterator[Fault]:
     """Compare each wheel with all, and each speed with the wheels; ay and yaw rate decide."""
+    signals, moving = drive.signals, drive.moving
     wheels = wheel_speed_mps(signals)
     if wheels is None:
         return
@@ -229,8 +252,8 @@ def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
         ratio = _ratio(signals[name], wheels, moving)
         if ratio and not check.passes(ratio):
             named = [wheel for wheel in WHEELS if wheel in signals]
-            of_wheels = _turns_at(wheels, signals, moving)
-            of_speed = _turns_at(signals[name], signals, moving)
+            of_wheels = _turns_at(wheels, drive)
+            of_speed = _turns_at(signals[name], drive)
             if of_wheels and not of_speed:
                 named = [name]
             elif of_wheels == of_speed:
@@ -238,20 +261,22 @@ def _speeds(signals: Signals, moving: BoolArray) -> Iterator[Fault]:
             yield check.fault(*named, name=name, ratio=ratio)
 
 
-def _turns_at(speed: FloatArray, signals: Signals, moving: BoolArray) -> bool:
+def _turns_at(speed: FloatArray, drive: DriveRows) -> bool:
     """Return True if ay is the yaw rate times this speed."""
-    if not {"ay", "yaw_rate"} <= set(signals):
+    if not drive.has("ay", "yaw_rate"):
         return False
-    slope, correlation = slope_of(signals["ay"], signals["yaw_rate"] * speed, moving)
+    expected = drive.signals["yaw_rate"] * speed
+    slope, correlation = slope_of(drive.signals["ay"], expected, drive.moving)
     return abs(correlation) > MIN_CORRELATION and CHECKS["speeds of the car"].passes(abs(slope))
 
 
 def _compared(
-    signals: Signals, speed: FloatArray, moving: BoolArray
+    drive: DriveRows, speed: FloatArray
 ) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
     """Yield signals, the predictor of the first, its ratio to that, and their correlation."""
+    signals, moving = drive.signals, drive.moving
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
-    if yaw_rate is not None and {"wheel_rl", "wheel_rr"} <= set(signals):
+    if yaw_rate is not None and drive.has("wheel_rl", "wheel_rr"):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
         expected = "the yaw rate of the rear wheels"
         yield ("yaw_rate",), expected, *slope_of(yaw_rate, turn, moving)
@@ -270,9 +295,9 @@ def _compared(
         yield ("steering_wheel", angle), "15 times the other", *slope_of(wheel, column, moving)
 
 
-def _sizes(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Fault]:
+def _sizes(drive: DriveRows, speed: FloatArray) -> Iterator[Fault]:
     """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
-    for names, expected, slope, correlation in _compared(signals, speed, moving):
+    for names, expected, slope, correlation in _compared(drive, speed):
         ratio = slope if correlation > 0 else -slope
         if names == ("ax",) and not CHECKS["sign of ax"].passes(correlation):
             yield CHECKS["sign of ax"].fault(*names, correlation=correlation)
@@ -285,14 +310,15 @@ MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05
 """Bends of 20 m and less, at a speed and yaw rate times speed at which the tyres hardly slip."""
 
 
-def _axles(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[Fault]:
+def _axles(drive: DriveRows, speed: FloatArray) -> Iterator[Fault]:
     """Compare axles in tight bends: the front one drives the longer way."""
-    if not {"yaw_rate", *WHEELS} <= set(signals):
+    if not drive.has("yaw_rate", *WHEELS):
         return
+    signals, tightness = drive.signals, drive.curvature**2
     front, rear = (signals[f"wheel_{axle}l"] + signals[f"wheel_{axle}r"] for axle in "fr")
     with np.errstate(divide="ignore", invalid="ignore"):
-        tightness, longer = (signals["yaw_rate"] / speed) ** 2, front / rear - 1
-    rows = moving & (speed < MAX_BEND_MPS)
+        longer = front / rear - 1
+    rows = drive.moving & (speed < MAX_BEND_MPS)
     rows &= np.abs(signals["yaw_rate"] * speed) < MAX_BEND_MPS2
     tightest = np.nanmax(tightness, initial=0, where=rows & np.isfinite(tightness))
     if tightest < MIN_BEND_PER_M**2:
@@ -300,6 +326,142 @@ def _axles(signals: Signals, speed: FloatArray, moving: BoolArray) -> Iterator[F
     slope, correlation = slope_of(longer, tightness, rows)
     if correlation < CHECKS["front and rear wheels"].low and slope < -1:
         yield CHECKS["front and rear wheels"].fault(*WHEELS, correlation=correlation)
+
+
+# The label with the motion of the car, within one drive: size, delay, sign, scale and zero.
+#
+# No other drive is needed, so that a fault of all drives shows.
+
+FAST_MPS, SLOW_MPS = 8.0, 20.0
+"""Above the first a car hardly has a large angle; below the second it has its lever."""
+GENTLE_MPS2, MIN_GENTLE_TICKS = 5.0, 500
+"""Beyond, a tyre slips more than in proportion: a race car at its limit shows no lever."""
+MAX_COLLINEARITY = 0.995
+"""Correlation of curvature and curvature times squared speed. Below, speeds differ by 5 % and more.
+At one speed ay and curvature differ by phase alone, and relaxing tyres bias the lever."""
+SLIDING_M, SLIDING_RAD = 8.0, 0.15
+"""No car's rear axle is so far behind; a car that often slips so much slides."""
+MIN_EXPLAINED, MIN_SURE_EXPLAINED = 0.6, 0.85
+"""Share of the variance that shows a sign, and one that shows a scale and a zero."""
+WHEELBASE_M, MAX_WHEELBASE_SHARE = (2.0, 4.5), 0.75
+"""Wheelbases of cars, and the largest share of it between centre of gravity and rear axle."""
+MAX_COMPLIANCE = 0.012
+"""Side-slip of the rear axle in rad per m/s²: twice that of a usual car."""
+
+Contradiction: TypeAlias = tuple[str, Mapping[str, float]]
+"""Name of a check that the label fails, and its figures."""
+NONE: Contradiction = ("", {})
+
+
+def check_label(drive: DriveRows, *, from_velocities: bool) -> list[Fault]:
+    """Return the first fault of a label that the motion of its car shows."""
+    if not drive.has(drive.label, "yaw_rate"):
+        return []
+    name, figures = _contradiction(drive)
+    if not name:
+        return []
+    check = CHECKS[name]
+    if from_velocities:
+        check = replace(check, remedy=check.remedy_of_velocities or check.remedy)
+    return [check.fault(drive.label, **figures)]
+
+
+def _contradiction(drive: DriveRows) -> Contradiction:
+    signals, speed, moving = drive.signals, drive.speed, drive.moving
+    angle = np.where(moving, signals[drive.label], np.nan)
+    if speed is not None:
+        large = np.abs(angle[(speed > FAST_MPS) & np.isfinite(angle)])
+        median_deg = float(np.degrees(np.median(large))) if large.size >= MIN_TICKS else 0.0
+        if median_deg > CHECKS["size of the label"].high:
+            return "size of the label", {"median_deg": median_deg}
+    inputs = np.array([drive.curvature, *([signals["ay"]] if "ay" in signals else [])])
+    delay = estimate_delay(angle, inputs, moving & np.isfinite(inputs).all(axis=0))
+    if delay is not None and delay.exceeds(CHECKS["delay of the label"].high):
+        return "delay of the label", {"delay_s": delay.value_s, "error_s": delay.error_s}
+    if speed is not None and len(inputs) == 2:
+        sliding = large.size >= MIN_TICKS and float(np.quantile(large, 0.9)) > SLIDING_RAD
+        return _lever(drive, speed, sliding=sliding)
+    return NONE
+
+
+def _gentle(drive: DriveRows, speed: FloatArray) -> BoolArray:
+    """Return where the car turns gently and slowly, or not at all."""
+    signals = drive.signals
+    slow = (speed < SLOW_MPS) & (speed > 0) & (np.abs(signals["ay"]) < GENTLE_MPS2)
+    return drive.moving & slow & np.isfinite(signals["yaw_rate"])
+
+
+def _fit_lever(
+    angle: FloatArray, drive: DriveRows, speed: FloatArray
+) -> tuple[float, float, float]:
+    """Return the slope on the curvature in m, the constant and the explained share.
+
+    The curvature has no effect on ay of its own: both are inputs. All are 0 at one speed.
+    """
+    rows, inputs = _gentle(drive, speed), np.array([drive.curvature, drive.signals["ay"]])
+    if rows.sum() < MIN_GENTLE_TICKS or _is_one_speed(inputs[0, rows], speed[rows]):
+        return 0.0, 0.0, 0.0
+    (lever_m, _), zero, explained = fit(angle, inputs, rows)
+    return float(lever_m), zero, explained
+
+
+def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
+    """Return True if the speed differs too little to part curvature and ay."""
+    squared = curvature * speed**2
+    if not (curvature.std() > 0 and squared.std() > 0):
+        return True
+    return bool(abs(np.corrcoef(curvature, squared)[0, 1]) > MAX_COLLINEARITY)
+
+
+def _lever(drive: DriveRows, speed: FloatArray, *, sliding: bool) -> Contradiction:
+    """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
+    lever_m, zero, explained = _fit_lever(drive.signals[drive.label], drive, speed)
+    check, sign = CHECKS["scale of the label"], CHECKS["sign of the label"]
+    low, high = check.low, check.high
+    if explained:
+        high = min(high, MAX_WHEELBASE_SHARE * _wheelbase_m(drive, speed))
+        is_reversed = explained > MIN_EXPLAINED and lever_m < sign.low
+        is_large = explained > MIN_EXPLAINED and lever_m > SLIDING_M and sliding
+        is_scaled = explained > MIN_SURE_EXPLAINED and not low < lever_m < high
+    else:
+        lever_m, mean_square, explained = _fit_one_speed(drive, speed)
+        low -= MAX_COMPLIANCE * mean_square
+        is_sure = explained > MIN_SURE_EXPLAINED
+        is_reversed = is_sure and lever_m < min(low, 0) + sign.low
+        is_large = is_sure and lever_m > SLIDING_M
+        is_scaled = is_sure and 0 < lever_m < low
+    bounds = {"lever_m": lever_m, "low": low, "high": high}
+    if is_reversed:
+        return "sign of the label", bounds
+    if is_large or is_scaled:
+        return "scale of the label", bounds
+    zero_deg = math.degrees(zero)
+    if explained > MIN_SURE_EXPLAINED and not CHECKS["zero of the label"].passes(zero_deg):
+        return "zero of the label", {"zero_deg": zero_deg, "offset_rad": -zero}
+    return NONE
+
+
+def _wheelbase_m(drive: DriveRows, speed: FloatArray) -> float:
+    """Return the wheelbase that the road wheels show, infinity if they show none."""
+    angle = next((drive.signals[name] for name in ROAD_WHEELS if drive.has(name)), None)
+    if angle is None:
+        return math.inf
+    wheelbase_m, _, explained = _fit_lever(angle, drive, speed)
+    shortest, longest = WHEELBASE_M
+    is_sure = explained > MIN_SURE_EXPLAINED and shortest < wheelbase_m < longest
+    return wheelbase_m if is_sure else math.inf
+
+
+def _fit_one_speed(drive: DriveRows, speed: FloatArray) -> tuple[float, float, float]:
+    """Return the slope on the curvature in m, the mean squared speed and the explained share.
+
+    At one speed the slope is the lever less the compliance times the squared speed.
+    """
+    rows = _gentle(drive, speed)
+    if rows.sum() < MIN_GENTLE_TICKS:
+        return 0.0, 0.0, 0.0
+    (slope,), _, explained = fit(drive.signals[drive.label], drive.curvature[None], rows)
+    return float(slope), float(np.mean(speed[rows] ** 2)), explained
 
 
 # The checks of rows on some long drives of a cohort, read from the logs.
