@@ -20,7 +20,7 @@ from fleet_slip.base import date_of, normalize_name, pluralize
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.storage.runs import step
+from fleet_slip.storage.runs import recorded_step, step
 
 if TYPE_CHECKING:
     from fleet_slip.calibration.car_calibration import Calibration
@@ -44,19 +44,14 @@ class Compacted(Answer):
 
     def parts(self) -> Iterator[Part]:
         """Render what was compacted and removed."""
-        report = self.compacted
-        if report is None:
-            if self.vacuumed.files:
-                yield TextTable("", "would be removed", zip(self.vacuumed.files))
-        elif report.changed:
+        if self.compacted is None and self.vacuumed.files:
+            yield TextTable("", "would be removed", zip(self.vacuumed.files))
+        if report := self.compacted:
             yield Remark(
                 f"{pluralize(report.files_before, 'file')} became {report.files_after}; "
                 f"{report.rows_rewritten:,} rows were written again, "
                 f"{report.size_bytes_before:,} bytes became {report.size_bytes_after:,}"
             )
-        else:
-            files = pluralize(report.files_after, "file")
-            yield Remark(f"nothing to compact: {files}, large or alone in the day")
         yield self.vacuumed.remark
 
 
@@ -188,7 +183,8 @@ class FleetMaintenance:
         repair
             Rebuild damaged Gram rows from the logs.
         accept_loss
-            Lost documents to give up, as in `accept_losses`.
+            Lost documents without a backup to give up: files or folders below the root, such as
+            `models/golf/3.json` or `models/golf`.
         workers
             A number of threads, the address of a Dask scheduler, or an executor.
         progress
@@ -209,9 +205,14 @@ class FleetMaintenance:
             If the cluster cannot be used.
         """
         from fleet_slip.operations.verify import check_grams, verify
+        from fleet_slip.operations.verify import repair as repair_damage
+        from fleet_slip.storage.documents import accept_losses
 
-        accepted = self.accept_losses(accept_loss) if accept_loss else ()
-        steps = progress_of_steps(progress)
+        steps, root = progress_of_steps(progress), self.warehouse.root
+        accepted: Sequence[str] = ()
+        if accept_loss:
+            with recorded_step(root, "accept_losses", accept_loss):
+                accepted = accept_losses(root, accept_loss)
         with open_workers(self.warehouse.root, workers) as executor:
 
             def verify_all() -> "Verification":
@@ -224,7 +225,8 @@ class FleetMaintenance:
 
             result = verify_all()
             if repair:
-                rebuilt = self.repair(result)
+                with recorded_step(root, "repair", ()):
+                    rebuilt = repair_damage(self.warehouse, result)
                 result = verify_all()
                 result.rebuilt, result.repaired = rebuilt, True
         result.accepted = accepted
@@ -258,31 +260,6 @@ class FleetMaintenance:
         from fleet_slip.operations.verify import check_grams
 
         return check_grams(self.warehouse, files, total_progress(progress), begin)
-
-    @record_call
-    def accept_losses(self, paths: Sequence[str]) -> list[str]:
-        """Give up lost documents of which there is no backup; return their files.
-
-        Parameters
-        ----------
-        paths
-            Files or folders below the root, such as `models/golf/3.json` or `models/golf`.
-
-        Raises
-        ------
-        QuestionError
-            If nothing is lost there.
-        """
-        from fleet_slip.storage.documents import accept_losses
-
-        return accept_losses(self.warehouse.root, paths)
-
-    @record_call
-    def repair(self, verification: "Verification") -> list[str]:
-        """Rebuild what a verification found damaged; return the paths below the root."""
-        from fleet_slip.operations.verify import repair
-
-        return repair(self.warehouse, verification)
 
     @record_call
     def compact(

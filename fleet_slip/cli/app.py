@@ -8,11 +8,10 @@ import sys
 from collections.abc import Mapping
 from functools import cache, partial
 from importlib import import_module
-from importlib.abc import InspectLoader, MetaPathFinder
-from importlib.machinery import ModuleSpec
+from importlib.abc import InspectLoader
 from importlib.util import find_spec
-from types import CodeType, FunctionType, ModuleType
-from typing import TYPE_CHECKING, Annotated, Any
+from types import CodeType, FunctionType
+from typing import Annotated, Any
 
 import typer
 from typer import Context, Option
@@ -31,10 +30,6 @@ from fleet_slip.errors import (
 )
 from fleet_slip.limits import memory_bytes
 
-if TYPE_CHECKING:
-    from fleet_slip.api.fleet import Fleet
-
-
 # A module is imported when one of its commands runs: --help and shell completion import none. The
 # list of commands takes their docstrings from the module's compiled code. Help is plain text: boxes
 # and colours took longer than everything else.
@@ -52,9 +47,8 @@ MODULES = {
     "pipeline_commands": "demo run learn nightly",
     "data_commands": "mapping ingest simulate gram features",
     "sql_command": "sql",
-    "model_commands": "show export models promote rollback pin unpin diff",
+    "model_commands": "select publish diagnose show export models promote rollback pin unpin diff",
     "accuracy_commands": "evaluate score predict identify report watch explore",
-    "selection_commands": "select publish diagnose",
     "operation_commands": "status contract quality calibrate monitor verify compact forget migrate",
 }
 """The modules of `fleet_slip.cli` that define the commands, each as a function."""
@@ -116,82 +110,15 @@ def docstrings(module: str) -> Mapping[str, str]:
     }
 
 
-EXIT_CODES = {
-    0: "done",
-    1: "a bug",
-    2: "wrong usage",
-    3: "a config file",
-    4: "input data",
-    5: "the data cannot answer",
-    6: "storage",
-    7: "refused",
-    8: "a conflict with another process",
-    9: "damage",
-    10: "something needs attention",
-    11: "a cluster",
-    12: "not finished yet",
-    13: "a package of an extra is missing",
-    15: "a recording is in the logs already",
-    16: "sensors are not checked",
-    INTERRUPTED: "interrupted",
-}
-"""The exit codes of the classes of `errors.py`, as `--help` lists them."""
-
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog=f"Exit codes: {', '.join(f'{code} {text}' for code, text in EXIT_CODES.items())}.",
+    epilog="Exit codes: 0 done, 2 wrong usage, 10 something needs attention; docs/commands.md "
+    "lists the others.",
 )
-
-
-def _open(root: str | None, config: str | None) -> "Fleet":
-    """Return the fleet of a command when it runs: its help needs no tables."""
-    if "pyarrow" in sys.modules:
-        _hide_pandas(sys.modules["pyarrow"])
-    else:
-        sys.meta_path.insert(0, _ArrowWithoutPandas())
-    return fleet_slip.open(root, config)
-
-
-class _ArrowWithoutPandas(MetaPathFinder):
-    """Hides pandas from pyarrow when that is imported."""
-
-    def find_spec(self, name: str, _path: Any = None, _target: Any = None) -> ModuleSpec | None:
-        if name != "pyarrow":
-            return None
-        sys.meta_path.remove(self)
-        spec = find_spec(name)
-        if spec and spec.loader:
-            execute = spec.loader.exec_module
-
-            def execute_without_pandas(module: ModuleType) -> None:
-                execute(module)
-                _hide_pandas(module)
-
-            spec.loader.exec_module = execute_without_pandas  # type: ignore[method-assign]
-        return spec
-
-
-class _WithoutPandas(MetaPathFinder):
-    """Fails to find pandas."""
-
-    def find_spec(self, name: str, _path: Any = None, _target: Any = None) -> None:
-        if name == "pandas":
-            raise ModuleNotFoundError(name, name=name)
-
-
-def _hide_pandas(pyarrow: Any) -> None:
-    """Prevent pyarrow from importing pandas with its first array of Python values.
-
-    The import takes a quarter of a short command. Data frames still work.
-    """
-    finder = _WithoutPandas()
-    sys.meta_path.insert(0, finder)
-    pyarrow.array([])
-    sys.meta_path.remove(finder)
 
 
 def _print_version(requested: bool) -> None:
@@ -241,7 +168,7 @@ def options(
     With logs of your own: fleet-slip mapping suggest LOG, then fleet-slip learn
     """
     configure_remarks()
-    context.obj = cache(partial(_open, root, config))
+    context.obj = cache(partial(fleet_slip.open, root, config))
 
 
 def run_app() -> int:

@@ -28,7 +28,6 @@ from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 
 if TYPE_CHECKING:
-    from fleet_slip.catalog.catalog import Catalog
     from fleet_slip.catalog.features import FeatureSet
     from fleet_slip.catalog.signals import SignalCatalog
     from fleet_slip.grams.update import GramReport
@@ -420,7 +419,7 @@ def features(
         header, row = "column|unit|scale|description", "{0}|{1.unit}|{1.scale}|{1.description}"
         print_parts([TextTable("", header, columns.items(), row, text_columns=4)])
         if not everything:
-            print_parts([_families(catalog)])
+            say(f"and {pluralize(len(catalog.time_columns), 'column')} over time: --all")
 
 
 def _content_of(feature_set: "FeatureSet") -> dict[str, Any]:
@@ -430,21 +429,6 @@ def _content_of(feature_set: "FeatureSet") -> dict[str, Any]:
     content = asdict(feature_set)
     ticks = content.pop("block_ticks")
     return {**content, "block_s": None if ticks is None else float(ticks * SAMPLE_TIME_S)}
-
-
-def _families(catalog: "Catalog") -> TextTable:
-    """Render the hundreds of columns over time by family."""
-    file = catalog.file
-    families = [
-        [name, " ".join(map(str, window.ticks or (0,))), window.description]
-        for name, window in file.windows.items()
-    ]
-    single = (*file.products, *file.estimates, *file.slopes, *file.factors, *file.calibrated)
-    families += [[name, "", file.time_columns[name].description] for name in single]
-    families += [[f"COLUMN_{name}_…", "", gate.description] for name, gate in file.gates.items()]
-    count = pluralize(len(file.time_columns), "column")
-    title = f"\n{count} over time; one by one: --all"
-    return TextTable(title, "column|over ticks|description", families, text_columns=3)
 
 
 def _print_files(configs: "Configs", json: bool) -> None:

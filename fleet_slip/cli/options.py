@@ -3,18 +3,15 @@
 import functools
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, cast
 
 from typer import Argument, Context, Option
 
-import fleet_slip
-from fleet_slip.errors import FleetSlipError
 from fleet_slip.storage.runs import Run, recording
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.models.registry import Registry
     from fleet_slip.warehouse.warehouse import Warehouse
 
 P = ParamSpec("P")
@@ -56,33 +53,6 @@ def _lineage(
     return emit_lineage(target, warehouse, current_run, options)
 
 
-def complete_name(context: Context, incomplete: str) -> list[str]:
-    """Return the names of models for the completion of a shell."""
-    with suppress(FleetSlipError):
-        names = _registry(context).names()
-        return [name for name in names if name.startswith(incomplete)]
-    return []
-
-
-def complete_reference(context: Context, incomplete: str) -> list[str]:
-    """Return names of models, or versions and aliases once a name is complete."""
-    name, at, _ = incomplete.partition("@")
-    if not at:
-        return complete_name(context, incomplete)
-    with suppress(FleetSlipError):
-        registry = _registry(context)
-        versions = [*map(str, registry.versions(name)), *registry.history(name).aliases()]
-        references = [f"{name}@{version}" for version in versions]
-        return [reference for reference in references if reference.startswith(incomplete)]
-    return []
-
-
-def _registry(context: Context) -> "Registry":
-    """Return the registry of a command line that is not complete yet."""
-    options = context.parent.params if context.parent else {}
-    return fleet_slip.open(options.get("root"), options.get("config")).models.registry
-
-
 Json = Annotated[bool, Option("--json", help="Print machine-readable JSON on stdout.")]
 All = Annotated[bool, Option("--all", help="Print all rows and columns.")]
 
@@ -103,18 +73,13 @@ Model = Annotated[
     str | None,
     Argument(
         metavar="MODEL",
-        autocompletion=complete_reference,
         help="NAME, NAME@VERSION or NAME@ALIAS. Default: the only published model.",
     ),
 ]
-ModelName = Annotated[str, Argument(help="Name of the model.", autocompletion=complete_name)]
+ModelName = Annotated[str, Argument(help="Name of the model.")]
 Alias = Annotated[str, Option(help="Alias.")]
 Version = Annotated[
-    str,
-    Argument(
-        help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.",
-        autocompletion=complete_reference,
-    ),
+    str, Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.")
 ]
 
 Cohort = Annotated[str, Option(help="SQL predicate on the view drives.")]

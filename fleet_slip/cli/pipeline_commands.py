@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Context, Option
 
-from fleet_slip.base import date_of, last_day, pluralize
+from fleet_slip.base import date_of, last_day
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.data_commands import warn_of_passed_over
 from fleet_slip.cli.options import fleet_of, recorded
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
-from fleet_slip.errors import FleetSlipError, UsageError
-from fleet_slip.storage.local import data_root
+from fleet_slip.errors import UsageError
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
@@ -53,7 +52,6 @@ def demo(
         drives, rows = fleet.sql("SELECT count(*), sum(rows) FROM drives").fetchall()[0]
         validation = model.manifest.cross_validation
     c_file = next(file for file in sources if file.suffix == ".c")
-    begin = f"{program()} --root {shlex.quote(str(output / 'data'))}"
     print_parts(
         [
             f"logs    {drives} simulated drives, {rows:,} rows at 100 Hz",
@@ -65,10 +63,14 @@ def demo(
     )
     if not report.changed:
         say("nothing to do: the demo was run before.")
-    say(f"done in {time.monotonic() - start:.0f} s; next:")
-    say(f"  {begin} show demo")
-    say(f'  {begin} sql "SELECT drive_id, rows, speed_factor FROM drives"')
-    say(f"  {begin} evaluate demo && {begin} report demo")
+    say(f"done in {time.monotonic() - start:.0f} s")
+    _say_next(
+        fleet,
+        "show demo",
+        'sql "SELECT drive_id, rows, speed_factor FROM drives"',
+        "evaluate demo",
+        "report demo",
+    )
     if open_page:
         typer.launch(str(page))
 
@@ -113,11 +115,15 @@ def run(
     if json or not (report.publication and report.publication.new):
         return
     version = report.publication.version
-    _report_lost_control(fleet, report.campaign, version.manifest.name)
     if version.version == 1:
-        say("next:")
-        for line in next_steps(fleet, report.campaign, version.manifest.name):
-            say(f"  {line}")
+        _say_next(
+            fleet,
+            'sql "SELECT drive_id, rows, speed_factor FROM drives"',
+            f"show {version.manifest.name}",
+            'select --cohort "adhesion > 0.8"',
+            f"evaluate {version.manifest.name}",
+            f"report {version.manifest.name}",
+        )
 
 
 @recorded
@@ -150,12 +156,10 @@ def learn(
     else:
         print_parts(report.parts(everything))
         if report.changed and report.publication:
-            begin = f"{program()}{_root_option(fleet)}"
-            say("next:")
-            say(f"  {begin} show {name}")
-            say(f"  {begin} export {name} --to c --output {name}")
+            steps = [f"show {name}", f"export {name} --to c --output {name}"]
             if not report.publication.version.manifest.learned_from:
-                say(f"  {begin} evaluate {name} --cohort \"campaign = '{report.mapping}'\"")
+                steps.append(f"evaluate {name} --cohort \"campaign = '{report.mapping}'\"")
+            _say_next(fleet, *steps)
     if report.problem:
         raise report.problem
 
@@ -219,47 +223,12 @@ def nightly(
     print_answer(report, json)
 
 
-def next_steps(fleet: "Fleet", campaign: str, model: str) -> list[str]:
-    """Return command lines to continue with: a query, the model, a cohort, the test drives."""
-    begin = f"{program()}{_root_option(fleet)}"
-    query = "SELECT drive_id, max(abs(degrees(sideslip_rad))) AS beta_deg FROM log GROUP BY ALL"
-    lines = [f'{begin} sql "{query}"', f"{begin} show {model}"]
-    medians = fleet.sql("SELECT campaign, median(speed_factor) FROM drives GROUP BY ALL").fetchall()
-    speed = dict(medians).get(campaign)
-    if speed is not None:
-        lines.append(f'{begin} select --cohort "speed_factor > {speed:.2f}"')
-    lines.append(f"{begin} evaluate {model} && {begin} report {model}")
-    return lines
-
-
-def _report_lost_control(fleet: "Fleet", campaign: str, model: str) -> None:
-    """Report how many training drives ended in a loss of control."""
-    query = "SELECT campaign, count(lost_control_s), count(*) FROM drives GROUP BY ALL"
-    counts = {name: (lost, drives) for name, lost, drives in fleet.sql(query).fetchall()}
-    lost, drives = counts.get(campaign, (0, 0))
-    if lost:
-        cohort = f"campaign = '{campaign}' AND lost_control_s IS NULL"
-        say(
-            f"in {lost:,} of {pluralize(drives, 'drive')} the car lost control; the model was "
-            "trained on these, too. Without them:"
-        )
-        say(f'  {program()}{_root_option(fleet)} publish {model} --cohort "{cohort}"')
-
-
-def program() -> str:
-    """Return the command that starts this program: its name if it is on the path, else a path."""
+def _say_next(fleet: "Fleet", *steps: str) -> None:
+    """Print commands to continue with, as they can be typed."""
     started = Path(sys.argv[0])
     on_path = shutil.which(started.name)
-    if on_path and os.path.realpath(on_path) == os.path.realpath(started):
-        return started.name
-    folder, path = Path.cwd(), started.absolute()
-    return shlex.quote(str(path.relative_to(folder) if path.is_relative_to(folder) else path))
-
-
-def _root_option(fleet: "Fleet") -> str:
-    """Return the option that names the data root, empty for the default root."""
-    try:
-        default = str(data_root())
-    except FleetSlipError:
-        default = ""
-    return "" if str(fleet.root) == default else f" --root {shlex.quote(str(fleet.root))}"
+    is_on_path = on_path and os.path.realpath(on_path) == os.path.realpath(started)
+    program = started.name if is_on_path else shlex.quote(str(started.absolute()))
+    say("next:")
+    for line in steps:
+        say(f"  {program} --root {shlex.quote(str(fleet.root))} {line}")

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from fleet_slip.views import Session
 
 SCREEN_ROWS = 40
-SAMPLE_ROWS = 1000
-"""Rows whose texts set the width of columns."""
 UNLIMITED = 2**31 - 1
 MIN_TEXT = 24
 """Minimum width of a column of texts in characters: columns are left out rather than narrower."""
@@ -141,24 +139,14 @@ def _show(session: "Session", text: str, everything: bool) -> None:
         say("output truncated. Select fewer columns, or: --all")
 
 
-def _readable(result: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
-    """Round numbers to 15 digits: 52.66, where binary has 52.660000000000004."""
-    if len(set(result.columns)) < len(result.columns):
-        return result
-    quoted = {name: '"' + name.replace('"', '""') + '"' for name in result.columns}
-    return result.project(
-        ", ".join(
-            f"CAST(printf('%.15g', {quoted[name]}) AS DOUBLE) AS {quoted[name]}"
-            if kind == "DOUBLE"
-            else quoted[name]
-            for name, kind in zip(result.columns, result.types, strict=True)
-        )
-    )
-
-
 def _draw(result: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
-    """Return a result as DuckDB's table of at most this width."""
-    result = _readable(result)
+    """Return a result as DuckDB's table of at most this width, numbers of 15 digits."""
+    names = result.columns
+    if len(set(names)) == len(names):
+        doubles = [name for name, kind in zip(names, result.types, strict=True) if kind == "DOUBLE"]
+        quoted = ['"' + name.replace('"', '""') + '"' for name in doubles]
+        rounded = [f"CAST(printf('%.15g', {name}) AS DOUBLE) AS {name}" for name in quoted]
+        result = result.project(f"* REPLACE ({', '.join(rounded)})" if rounded else "*")
 
     def draw(max_text: int) -> str:
         with contextlib.redirect_stdout(io.StringIO()) as output:
@@ -167,20 +155,8 @@ def _draw(result: duckdb.DuckDBPyRelation, width: int, rows: int) -> str:
 
     table = draw(width)
     if width < UNLIMITED and "│ … │" in table:  # a wide text leaves no room for other columns
-        table = draw(_text_width(result, width))
+        table = draw(max(width // len(names) - 3, MIN_TEXT))
     return table
-
-
-def _text_width(result: duckdb.DuckDBPyRelation, width: int) -> int:
-    """Return the largest column width with which all columns fit, otherwise a narrow width."""
-    records = [result.columns, result.types, *result.limit(SAMPLE_ROWS).fetchall()]
-    widths = [max(len(str(value)) for value in column) for column in zip(*records, strict=True)]
-    fits = (
-        text
-        for text in range(width - 4, MIN_TEXT, -1)
-        if sum(min(text, wide) + 3 for wide in widths) < width
-    )
-    return next(fits, MIN_TEXT)
 
 
 def _mark_formulas(table: pa.Table) -> pa.Table:

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.base import pluralize, require_extra
+from fleet_slip.base import Record, pluralize, require_extra
 from fleet_slip.errors import AlarmError, DataError, InputError, MissingColumnError, UsageError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.drive_sums import counts_of
@@ -34,12 +34,19 @@ ESTIMATE, REFERENCE = "sideslip_estimate_deg", "sideslip_reference_deg"
 
 
 @dataclass(frozen=True)
-class PredictedDrive:
-    """Predictions of a drive: `table` has `drive_id`, `time_s`, estimate and reference in deg."""
+class PredictedDrive(Record):
+    """Predictions of a drive: `table` has `drive_id`, `time_s`, estimate and reference in deg.
+
+    `errors_deg` are those of the rows that have both.
+    """
+
+    DOCUMENT = "drive_id vehicle_id rows rows_estimated rmse_deg"
 
     drive_id: str
     vehicle_id: str
     table: pa.Table
+    rows_estimated: int
+    errors_deg: FloatArray
 
     @property
     def rows(self) -> int:
@@ -47,23 +54,9 @@ class PredictedDrive:
         return len(self.table)
 
     @property
-    def rows_estimated(self) -> int:
-        """Number of rows with an estimate."""
-        return self.rows - int(self.table[ESTIMATE].null_count)
-
-    @property
-    def errors_deg(self) -> FloatArray:
-        """Estimate minus reference on the rows that have both."""
-        errors = self._values(ESTIMATE) - self._values(REFERENCE)
-        return errors[np.isfinite(errors)]
-
-    @property
     def rmse_deg(self) -> float | None:
         """Root mean square error; None without a reference."""
         return _root_mean_square(self.errors_deg)
-
-    def _values(self, name: str) -> FloatArray:
-        return np.asarray(self.table[name].to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def _root_mean_square(values: FloatArray) -> float | None:
@@ -74,7 +67,9 @@ def _root_mean_square(values: FloatArray) -> float | None:
 class Predictions(Answer):
     """The predictions of log files, and the faults of the files."""
 
-    DOCUMENT = "model output drives rows rows_estimated rmse_deg rows_quarantined suspicions"
+    DOCUMENT = (
+        "model output drives=predicted rows rows_estimated rmse_deg rows_quarantined suspicions"
+    )
 
     model: str
     output: str
@@ -82,12 +77,6 @@ class Predictions(Answer):
     rows_quarantined: int
     suspicions: tuple[str, ...]
     alarms: tuple[str, ...]
-
-    @property
-    def drives(self) -> list[dict[str, object]]:
-        """The figures of each drive."""
-        names = ("drive_id", "vehicle_id", "rows", "rows_estimated", "rmse_deg")
-        return [{name: getattr(drive, name) for name in names} for drive in self.predicted]
 
     @property
     def rows(self) -> int:
@@ -158,8 +147,7 @@ def predict_logs(
             "LIST"
         )
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
-    drives: list[PredictedDrive] = []
-    log_of_drive: dict[str, Path] = {}
+    drives: dict[str, PredictedDrive] = {}
     rejected, suspicions, alarms = 0, list[str](), list[str]()
     predict_drive = partial(_predict_drive, predictor=predictor, cars=cars)
     for log in logs:
@@ -171,18 +159,22 @@ def predict_logs(
             predicted, faults, unusable = _predict_log(log, without_label, predict_drive)
             suspicions.append(f"no reference: {error}")
         for prediction in predicted:
-            if prediction.drive_id in log_of_drive:
+            if prediction.drive_id in drives:
                 raise InputError(
-                    f"{log}: the drive {prediction.drive_id} is also in "
-                    f"{log_of_drive[prediction.drive_id]}. Leave out one of them."
+                    f"{log}: the drive {prediction.drive_id} is also in another log. Leave out one "
+                    "of them."
                 )
-            log_of_drive[prediction.drive_id] = log
-        drives += predicted
+            drives[prediction.drive_id] = prediction
         rejected += unusable
         suspicions += [f"{log}: {fault}" for fault in faults]
         alarms += [f"{log}: {fault}" for fault in faults if fault.does_harm]
     predictions = Predictions(
-        version.reference, str(output), tuple(drives), rejected, tuple(suspicions), tuple(alarms)
+        version.reference,
+        str(output),
+        tuple(drives.values()),
+        rejected,
+        tuple(suspicions),
+        tuple(alarms),
     )
     if not predictions.rows_estimated:
         raise DataError(
@@ -191,7 +183,7 @@ def predict_logs(
             f"{mapping.name} --dry-run"
         )
     about = {"model": version.reference, "model_sha256": version.sha256, "mapping": mapping.name}
-    content = _encode(output.suffix.lower(), [drive.table for drive in drives], about)
+    content = _encode(output.suffix.lower(), [drive.table for drive in drives.values()], about)
     LocalFolder(output.parent).put(output.name, content)
     return predictions
 
@@ -227,15 +219,18 @@ def _predict_drive(
     """Predict the rows of one drive."""
     drive_id, vehicle_id = (rows[name][0].as_py() for name in ("drive_id", "vehicle_id"))
     counts = counts_of(rows, predictor.plan, None, cars.get(vehicle_id))
-    columns = {ESTIMATE: predictor(counts), REFERENCE: reference_rad}
+    estimate = np.degrees(predictor(counts))
+    columns = {ESTIMATE: estimate, REFERENCE: np.degrees(reference_rad)}
     table = pa.table(
         {
             "drive_id": pa.array([drive_id] * len(rows)).dictionary_encode(),
             "time_s": rows["tick"].to_numpy() / TICKS_PER_S,
-            **{n: pa.array(np.degrees(v), from_pandas=True) for n, v in columns.items()},
+            **{name: pa.array(angle, from_pandas=True) for name, angle in columns.items()},
         }
     )
-    return PredictedDrive(drive_id, vehicle_id, table)
+    errors = estimate - columns[REFERENCE]
+    estimated = int(np.isfinite(estimate).sum())
+    return PredictedDrive(drive_id, vehicle_id, table, estimated, errors[np.isfinite(errors)])
 
 
 def _encode(suffix: str, tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 MAX_DIGITS = 4000
 """Maximum number of decimal digits of a number in decimal: Python refuses longer texts."""
 
-_FRACTION = re.compile(r"-?[0-9]{1,4000}/[0-9]{1,4000}")
-_LONG_FRACTION = re.compile(r"-?0x[0-9a-f]{1,30000}/0x[0-9a-f]{1,30000}")
+_FRACTION = re.compile(r"(-?[0-9]{1,4000})/([0-9]{1,4000})")
+_LONG_FRACTION = re.compile(r"(-?0x[0-9a-f]{1,30000})/(0x[0-9a-f]{1,30000})")
 """In hexadecimal: models of hundreds of inputs need it."""
 
 
@@ -57,16 +57,13 @@ def _exact_fraction(value: Any) -> Fraction:
     """Return a fraction, also from its text "3/4". Raises `ValueError` for anything else."""
     if isinstance(value, Fraction):
         return value
-    if isinstance(value, str) and _FRACTION.fullmatch(value):
-        base = 10
-    elif isinstance(value, str) and _LONG_FRACTION.fullmatch(value):
-        base = 16
-    else:
-        raise ValueError("is not a fraction such as 3/4")
-    numerator, denominator = (int(part, base) for part in value.split("/"))
-    if not denominator:
-        raise ValueError("is divided by zero")
-    return Fraction(numerator, denominator)
+    for pattern, base in ((_FRACTION, 10), (_LONG_FRACTION, 16)):
+        if isinstance(value, str) and (match := pattern.fullmatch(value)):
+            numerator, denominator = (int(number, base) for number in match.groups())
+            if not denominator:
+                raise ValueError("is divided by zero")
+            return Fraction(numerator, denominator)
+    raise ValueError("is not a fraction such as 3/4")
 
 
 def _fraction_text(value: Fraction) -> str:
@@ -190,12 +187,6 @@ class CrossValidated(Config):
         rmse_deg = self.beyond_label_noise_deg
         return f"{self.label_noise_deg:.4f} deg, without which the RMSE is {rmse_deg:.4f} deg"
 
-    @model_validator(mode="after")
-    def _can_be(self) -> Self:
-        if abs(self.error_mean_deg) > self.rmse_deg * (1 + 1e-9) + 1e-12:
-            raise ValueError("says that the mean of the error is larger than its RMSE")
-        return self
-
 
 class TrainedOn(Config):
     """Training data of a model; `drives_without_log` are drives whose cars sent Gram rows."""
@@ -209,12 +200,6 @@ class TrainedOn(Config):
     logs_version: Count
     grams_version: Count
     drives_sha256: Sha256
-
-    @model_validator(mode="after")
-    def _can_be(self) -> Self:
-        if not max(self.vehicles, self.drives_without_log or 0) <= self.drives <= self.rows:
-            raise ValueError("says that there are more cars than drives, or more drives than rows")
-        return self
 
 
 Seconds = Annotated[FiniteFloat, Field(gt=0)]
@@ -240,10 +225,10 @@ class LearnedFrom(Config):
         if not self.cars:
             return f"{text}. No intercept: it goes through the origin"
         error = self.intercept_uncertainty_deg
-        uncertainty = "uncertainty unknown" if error is None else f"uncertain by {error:.2g} deg"
+        uncertainty = "unknown" if error is None else f"{error:.2g} deg"
         return (
-            f"{text}. Intercept where {pluralize(self.cars, 'car')} "
-            f"{'goes' if self.cars == 1 else 'go'} straight, {uncertainty}"
+            f"{text}. Intercept from straight driving of {pluralize(self.cars, 'car')}, "
+            f"uncertainty {uncertainty}"
         )
 
 
@@ -320,55 +305,31 @@ class CombinedWithFilter(Config):
     def _agrees(self) -> Self:
         if (self.term is None) != (self.method == "line"):
             raise ValueError("every method but the line has a column of filter and line")
-        if self.term and not isinstance(self._content, Blend):
+        definition = self.term and self.term.definition
+        if self.term and not isinstance(definition and definition.made, Blend):
             raise ValueError("its column does not contain a filter")
         return self
 
-    @property
-    def _content(self) -> Made | None:
-        return self.term.definition.made if self.term and self.term.definition else None
-
     def __str__(self) -> str:
-        """Return which estimate is used where, as a sentence."""
+        """Return which estimate is used, as a sentence."""
         if self.reason:
             return f"The linear model alone: {self.reason}"
         figures = ", ".join(
             f"{name.replace('_', ' ')} {deg:.3f}" for name, deg in self.rmse_deg.items()
         )
-        compared = f" RMSE in {self.groups} inner groups: {figures} deg."
-        blend = self._content
-        if not isinstance(blend, Blend):
-            return f"The linear model alone: the filter does not improve it.{compared}"
-        if blend.line is None:
-            return (
-                "The filter in the identified car alone: the linear model does not improve "
-                f"it.{compared}"
-            )
-        shares = " to ".join(
-            dict.fromkeys(
-                f"{share / 2**16:.0%}" for share in (min(blend.shares), max(blend.shares))
-            )
-        )
-        limits = " to ".join(
-            dict.fromkeys(
-                f"{math.degrees(limit / 2**16):.2g}"
-                for limit in (min(blend.limits), max(blend.limits))
-            )
-        )
-        where = "" if blend.lateral is None else ", by lateral acceleration"
-        start = (
-            f"The filter in the identified car, plus {shares} of the difference to the linear model"
-            if blend.anchor == "filter"
-            else f"The linear model, keeping {shares} of its difference to the filter"
-        )
-        return f"{start}, clipped at {limits} deg{where}.{compared}"
+        return f"{_METHODS[self.method]}. RMSE in {self.groups} inner groups: {figures} deg."
 
 
-class ImportedFrom(Config):
-    """Version of another data root that a version was imported from."""
-
-    reference: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}@[1-9][0-9]{0,8}$")]
-    sha256: Sha256
+_METHODS = {
+    "line": "The linear model alone: the filter does not improve it",
+    "filter": "The filter in the identified car alone: the linear model does not improve it",
+    "constant": "The filter in the identified car, plus a share of the difference to the linear "
+    "model",
+    "by_lateral": "The filter in the identified car, plus a share of the difference to the linear "
+    "model, by lateral acceleration",
+    "line_by_lateral": "The linear model, keeping a share of its difference to the filter, by "
+    "lateral acceleration",
+}
 
 
 _MADE: TypeAdapter[Made] = TypeAdapter(Made)
@@ -378,7 +339,7 @@ _WITH_COLUMNS = ("terms", "combination")
 
 
 class Manifest(Config):
-    """One model version; `trained_on` of an imported one describes another data root.
+    """One model version.
 
     A document of unknown origin is validated with the `SignalCatalog` as context.
     """
@@ -400,7 +361,6 @@ class Manifest(Config):
     prior: Annotated[Prior | None, _OPTIONAL] = None
     combination: Annotated[CombinedWithFilter | None, _OPTIONAL] = None
     """None if no filter was compared: the terms are the estimate."""
-    imported_from: Annotated[ImportedFrom | None, _OPTIONAL] = None
     assumed: Annotated[
         tuple[Annotated[str, Field(max_length=200)], ...],
         Field(max_length=100, exclude_if=lambda assumed: not assumed),
@@ -553,11 +513,13 @@ class Manifest(Config):
         from fleet_slip.warehouse.predicate import describe_cohort  # noqa: PLC0415 - SQL
 
         figures, trained = self.cross_validation, self.trained_on
-        correlation = f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})"
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
         alone = ", of the linear model alone" * bool(self.line_remark)
+        prior, line = self.prior, self.line
         properties = {
-            "correlation": correlation,
+            "correlation": (
+                f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})"
+            ),
             "RMSE": f"{figures.rmse_deg:.4f} deg{alone}",
             "label noise": figures.label_noise_text,
             "error std": f"{figures.error_std_deg:.4f} deg",
@@ -571,23 +533,13 @@ class Manifest(Config):
             "selected": f"model {self.selected_by.model} of {self.selected_by.model_list}",
             "why": self.selected_by.reason,
             "assumed": "; ".join(self.assumed),
+            "with filter": str(self.combination or ""),
+            "first-stage model": line and f"{line}, of the feature set {trained.feature_set}",
+            "prior": prior
+            and f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
+            f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}",
+            "learned from": str(self.learned_from or ""),
         }
-        if self.combination:
-            properties["with filter"] = str(self.combination)
-        if line := self.line:
-            stacked = f"{line}, fitted first; feature set {trained.feature_set}"
-            properties["first-stage model"] = stacked
-        if prior := self.prior:
-            properties["prior"] = (
-                f"{prior.campaign}: {pluralize(prior.drives, 'simulated drive')} of "
-                f"{', '.join(prior.vehicles)}, each row with the weight {prior.weight}"
-            )
-        if self.learned_from:
-            properties["learned from"] = str(self.learned_from)
-        if source := self.imported_from:
-            properties["imported"] = (
-                f"from {source.reference} of another data root, sha256 {source.sha256}"
-            )
         return {name: text for name, text in properties.items() if text}
 
     def same_estimator(self, other: "Manifest") -> bool:

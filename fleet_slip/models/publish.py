@@ -176,7 +176,7 @@ def is_current(
         chosen.config_sha256,
         manifest.package_version,
     )
-    return manifest.imported_from is None and stored == (
+    return stored == (
         cohort,
         warehouse.catalog.identity(model_list.features),
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar, overload
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, overload
 
 from pydantic import Field
 
@@ -167,21 +167,6 @@ def _after(trail: list[int], move: AliasMove) -> list[int]:
 # One published version of a model, which estimates angles from data frames.
 
 
-class ArrowStream(Protocol):
-    """An Arrow table, or a table that exports Arrow streams."""
-
-    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
-        """Return the table's batches."""
-
-
-class PandasFrame(Protocol):
-    """A pandas data frame; pandas need not be installed."""
-
-    @property
-    def iloc(self) -> Any:
-        """Rows by position."""
-
-
 @dataclass(frozen=True)
 class ModelVersion(Answer):
     """A manifest with its number, its verified checksum, and the catalog of its data root."""
@@ -213,31 +198,20 @@ class ModelVersion(Answer):
             f"sum of coefficient * signal{', through the origin' if origin else ''}"
         )
         properties = manifest.properties(on_board)
-        yield TextTable(
-            "",
-            "|",
-            [*properties.items(), *([("sha256", self.sha256)] if everything else [])],
-            text_columns=2,
-        )
+        if everything:
+            properties["sha256"] = self.sha256
+        yield TextTable("", "|", properties.items(), text_columns=2)
         form = repr if everything else "{:.6g}".format
-        terms = [] if origin else [["intercept", label.unit, form(manifest.intercept), ""]]
+        rows = [] if origin else [("intercept", label.unit, form(manifest.intercept), "")]
         for term in manifest.terms:
             per_count = f"{float(term.coefficient_exact * term.scale_exact):.9g}"
-            terms.append([term.column, term.unit, form(term.coefficient), per_count])
-        header = "signal|unit|coefficient"
+            rows.append((term.column, term.unit, form(term.coefficient), per_count))
         if not everything:
-            yield TextTable("", header, [row[:3] for row in terms], text_columns=2)
+            short = [row[:3] for row in rows]
+            yield TextTable("", "signal|unit|coefficient", short, text_columns=2)
             return
-        yield TextTable("", f"{header}|per count", terms, text_columns=2)
+        yield TextTable("", "signal|unit|coefficient|per count", rows, text_columns=2)
         yield "per count: coefficient times scale, for an ECU that works on raw counts"
-        if manifest.features:
-            yield TextTable(
-                "\nfeatures: SQL over log_counts, clipped to +-32767 counts, times the scale",
-                "feature|scale|SQL",
-                (term for term in manifest.terms if term.sql),
-                "{signal}|{scale} {unit}|{sql}",
-                text_columns=3,
-            )
 
     @property
     def reference(self) -> str:
@@ -256,7 +230,7 @@ class ModelVersion(Answer):
         self, frame: "Mapping[str, ArrayLike | Sequence[float | None]]"
     ) -> "NDArray[float64]": ...
     @overload
-    def predict(self, frame: ArrowStream | PandasFrame) -> Any: ...
+    def predict(self, frame: Any) -> Any: ...
     def predict(self, frame: Any) -> Any:
         """Estimate the side-slip angle in rad for each row of a frame.
 
@@ -436,39 +410,48 @@ class Registry:
         self.load(name, version)
         history = self.history(name)
 
-        def move(newest: int) -> int | None:
+        def target() -> int | None:
             is_best = history.pointed_at(alias) == history.best_of(alias) == version
-            unchanged = is_best and not history.held_by(alias)
-            moved = unchanged or history.move(alias, version, "promote", after=newest)
-            return version if moved else None
+            return None if is_best and not history.held_by(alias) else version
 
-        history.decide(move)
+        self._move(name, alias, "promote", target)
 
     def hold(self, name: str, alias: str, command: Literal["pin", "unpin"]) -> int:
         """Pin or unpin an alias; return its version. Raises `QuestionError` if there is none."""
         version = self.resolve(f"{name}@{alias}").version
         history = self.history(name)
 
-        def move(newest: int) -> int | None:
-            unchanged = bool(history.held_by(alias)) == (command == "pin")
-            moved = unchanged or history.move(alias, version, command, after=newest)
-            return version if moved else None
+        def target() -> int | None:
+            return None if bool(history.held_by(alias)) == (command == "pin") else version
 
-        return history.decide(move)
+        self._move(name, alias, command, target)
+        return version
 
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back; return its version. Raises `RefusedError`, and as `load`."""
-        history = self.history(name)
 
-        def move(newest: int) -> int | None:
-            version = history.before(alias)
+        def target() -> int:
+            version = self.history(name).before(alias)
             if version is None:
                 raise RefusedError(
                     f"{name}@{alias} never pointed at another version, so there is nothing to go "
                     f"back to. See: fleet-slip models {name}"
                 )
-            self.load(name, version)
-            return version if history.move(alias, version, "rollback", after=newest) else None
+            return self.load(name, version).version
+
+        return self._move(name, alias, "rollback", target)
+
+    def _move(
+        self, name: str, alias: str, command: Command, target: Callable[[], int | None]
+    ) -> int:
+        """Point an alias at the target, unless that is None; return its version."""
+        history = self.history(name)
+
+        def move(newest: int) -> int | None:
+            version = target()
+            if version is None:
+                return history.pointed_at(alias)
+            return version if history.move(alias, version, command, after=newest) else None
 
         return history.decide(move)
 

@@ -601,8 +601,6 @@ def _is_trained_before(
         manifest = registry.load(name, number).manifest
     except FleetSlipError:
         return True
-    if manifest.imported_from is not None:  # from Gram rows of another data root
-        return True
     return any(end is None or manifest.trained_on.grams_version < end for end in ends)
 
 

@@ -218,11 +218,6 @@ _SINCE = "fleet-slip monitor {name} --since DAY"
 
 def _last_training_day(warehouse: Warehouse, version: ModelVersion) -> date | None:
     """Return the newest day of the logs as they were when the model was trained."""
-    if version.manifest.imported_from is not None:
-        raise DataError(
-            f"{version.reference} was trained in another data root. Give the first day of new "
-            f"drives: {_SINCE.format(name=version.manifest.name)}"
-        )
     logs = warehouse.logs
     number = version.manifest.trained_on.logs_version
     try:

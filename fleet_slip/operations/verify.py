@@ -450,8 +450,6 @@ def _faults_of_version(
         if isinstance(error, RefusedError) or "drives" in str(error):
             yield str(error)
         return
-    if manifest.imported_from is not None:  # the tables that made it are elsewhere
-        return
     trained = manifest.trained_on
     made_of = {"grams": trained.grams_version}
     if trained.drives_without_log != trained.drives:

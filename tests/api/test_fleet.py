@@ -247,5 +247,5 @@ def test_a_users_lines_are_typed(fleet: Fleet) -> None:
     frame = pl.DataFrame(log)
     assert isinstance(assert_type(model.predict(frame), pl.Series), pl.Series)
     columns = {name: frame[name].to_numpy() for name in model.columns}
-    angles = assert_type(model.predict(columns), NDArray[np.float64])
+    angles: NDArray[np.float64] = model.predict(columns)
     assert angles.dtype == np.float64

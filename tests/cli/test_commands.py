@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import os
 import shlex
 import shutil
 from hashlib import sha256
@@ -292,29 +291,6 @@ def test_the_version_is_told(run_command: RunCommand) -> None:
     assert run_command().exit_code == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
-        ("show s", "smoke"),
-        ("pin ", "smoke"),
-        ("promote smoke@", "smoke@1 smoke@champion"),
-        ("diff smoke@1 smoke@c", "smoke@champion"),
-        ("publish x", ""),
-    ],
-)
-def test_a_shell_completes_models_and_versions(
-    smoke_root: Path, words: str, completed: str
-) -> None:
-    line = f"fleet-slip --root {smoke_root} {words}"
-    env = {
-        "_FLEET_SLIP_COMPLETE": "complete_bash",
-        "COMP_WORDS": line,
-        "COMP_CWORD": str(line.count(" ")),
-    }
-    done = run_here([COMMAND], env={**os.environ, **env})
-    assert done.stdout.split() == completed.split(), done
-
-
 @pytest.fixture
 def publish_worse(tmp_path: Path) -> tuple[str, ...]:
     """The command that publishes a model of one signal."""
@@ -414,19 +390,13 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
 
 def test_each_command_can_be_typed(told: tuple[Path, list[str]]) -> None:
     folder, lines = told
-    assert [shlex.split(line)[1] for line in lines] == ["sql", "show", "select", "evaluate"]
-    for line in lines[:-1]:
+    commands = [shlex.split(line)[3] for line in lines]
+    assert commands == ["sql", "show", "select", "evaluate", "report"]
+    for line in lines[:3]:
         program, *arguments = shlex.split(line)
         done = run_here([str(folder / program), *arguments], folder)
         assert done.exit_code == 0, (line, done.stderr)
         assert done.stdout
-
-
-def test_the_last_draws_the_report_of_the_model(told: tuple[Path, list[str]]) -> None:
-    _, lines = told
-    evaluate, report = lines[-1].split(" && ")
-    assert evaluate.endswith("evaluate smoke")
-    assert report.endswith("report smoke")
 
 
 def test_another_root_stands_in_them(
@@ -443,22 +413,3 @@ def test_they_are_said_once(told: tuple[Path, list[str]]) -> None:
     folder, _ = told
     again = run_here([COMMAND, "run", "--campaign", "smoke", "--models", "table1"], folder)
     assert "next:" not in again.stderr
-
-
-def test_it_says_in_how_many_drives_the_car_was_lost(
-    run_command: RunCommand, tmp_path: Path
-) -> None:
-    """A model of drives in control is one command away."""
-    campaign = tmp_path / "ice.toml"
-    campaign.write_text(
-        'name = "ice"\ndescription = "Drives on ice"\nbase = "proving_ground"\nseed = 5\n'
-        "number_of_days = 1\ndrives_per_day = 12\n"
-        '[plan]\ntracks = ["switchback_1", "hill_2", "motorway_3"]\n'
-        "[plan.adhesion]\nusual = 0.15\nshare = 1.0\nmin = 0.12\nmax = 0.2\n",
-        encoding="utf-8",
-    )
-    done = run_command("run", "--campaign", str(campaign), root=tmp_path / "data")
-    assert done.exit_code == 0, done.stderr
-    assert " of 12 drives the car lost control" in done.stderr
-    line = next(one for one in done.stderr.splitlines() if "lost_control_s IS NULL" in one)
-    assert "publish ice --cohort \"campaign = 'ice' AND lost_control_s IS NULL\"" in line

@@ -13,13 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-import fleet_slip
-from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
-from fleet_slip.models.manifest import MAX_DIGITS, ExactFraction, ImportedFrom, TrainedDrives
-from fleet_slip.models.publish import is_current
+from fleet_slip.errors import QuestionError, RefusedError, StorageError
+from fleet_slip.models.manifest import MAX_DIGITS, ExactFraction, TrainedDrives
 from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
-from fleet_slip.operations.monitor import monitor
-from fleet_slip.operations.verify import Verification, verify_models
 from fleet_slip.storage.documents import Document, DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.catalog import CATALOG
@@ -253,22 +249,3 @@ def test_hashes_of_drives_are_those_of_versions_of_before() -> None:
     assert TrainedDrives.unpacked("year", made.content).among(drives).all()
     assert not len(TrainedDrives.from_hashes("year", drives[:0]).salted)
     assert TrainedDrives.from_hashes("other", drives).salted.tolist() != known
-
-
-def test_the_tables_here_are_not_those_that_made_it(smoke_root: Path, tmp_path: Path) -> None:
-    """Their numbers would be taken for those of tables here, by chance the same."""
-    home, away = fleet_slip.open(smoke_root), fleet_slip.open(tmp_path / "away")
-    made = home.models.get("smoke")
-    origin = ImportedFrom(reference=made.reference, sha256=made.sha256)
-    drives = home.models.registry.trained_drives(made.manifest)
-    assert drives is not None
-    manifest = made.manifest.model_copy(update={"imported_from": origin})
-    brought = away.models.registry.add(manifest, drives.content)
-    arguments = (home.warehouse, made.manifest.trained_on.cohort, "estimator", None)
-    assert is_current(made.manifest, *arguments)
-    assert not is_current(brought.manifest, *arguments)
-    with pytest.raises(DataError, match="monitor smoke --since DAY"):
-        monitor(home.warehouse, brought)
-    report = Verification()
-    verify_models(away.warehouse, {}, report)
-    assert report.findings == []
