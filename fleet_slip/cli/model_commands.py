@@ -202,11 +202,8 @@ def models(
     form += "{correlation:.4f}|{rmse_deg:.4f}|{drives:,}"
     print_parts([TextTable("", header, records, form, text_columns=4)])
     for row in rows:
-        reference = f"{row['name']}@{row['version']}"
         if row["trained_on_forgotten"]:
-            say(f"{reference} was trained on drives that were forgotten since")
-        if remark := fleet.models.get(reference).manifest.line_remark:
-            say(f"{reference}: {remark}")
+            say(f"{row['name']}@{row['version']} was trained on drives that were forgotten since")
     if name:
         moves = fleet.models.registry.history(name).moves()
         header = "at|command|alias|version"

@@ -49,15 +49,14 @@ def demo(
             model = fleet.models.get("demo")
             sources = fleet.models.export(model, "c", output / "c")
             page = fleet.evaluation.watch("nominal", model, output / "report.html", until_s=60.0)
-        drives, rows = fleet.sql("SELECT count(*), sum(rows) FROM drives").fetchall()[0]
         validation = model.manifest.cross_validation
     c_file = next(file for file in sources if file.suffix == ".c")
     print_parts(
         [
-            f"logs    {drives} simulated drives, {rows:,} rows at 100 Hz",
+            f"logs    12 simulated drives in {output / 'data'}",
             f"model   {model.reference}: {len(model.manifest.terms)} inputs, held-out RMSE "
             f"{validation.rmse_deg:.3f} deg",
-            f"in C    {c_file}, integer arithmetic, {c_file.stat().st_size:,} bytes",
+            f"in C    {c_file}, integer arithmetic",
             f"report  {page}: a drive outside the training set, with its true and estimated angle",
         ]
     )

@@ -140,13 +140,20 @@ def _is_number(kind: pa.DataType) -> bool:
 
 def open_frame(frame: Any) -> Frame:
     """Return a frame of Polars, pandas, Arrow (any stream) or a mapping. Raises `InputError`."""
-    if _is_of("polars", "DataFrame", frame):
-        return Frame(frame.columns, lambda name: frame[name].to_arrow(), _polars)
-    if _is_of("pandas", "DataFrame", frame):
+    polars, pandas = sys.modules.get("polars"), sys.modules.get("pandas")
+    if polars and isinstance(frame, polars.DataFrame):
+        return Frame(
+            frame.columns,
+            lambda name: frame[name].to_arrow(),
+            lambda values, name: polars.Series(name, values),
+        )
+    if pandas and isinstance(frame, pandas.DataFrame):
         return Frame(
             list(frame.columns),
             lambda name: pa.array(frame[name], from_pandas=True),
-            lambda values, name: _pandas(values, name, frame.index),
+            lambda values, name: pandas.Series(
+                values.to_numpy(zero_copy_only=False), frame.index, "float64", name
+            ),
         )
     if isinstance(frame, pa.RecordBatch):
         return Frame(frame.schema.names, frame.column, lambda values, _: values)
@@ -166,21 +173,6 @@ def open_frame(frame: Any) -> Frame:
         f"{type(frame).__name__} is no data frame. Give one of Polars (collected), pandas or "
         "Arrow, or a mapping of names to arrays."
     )
-
-
-def _is_of(library: str, kind: str, frame: Any) -> bool:
-    """Return True if a value is of a class of a library, without importing the library."""
-    module = sys.modules.get(library)
-    return module is not None and isinstance(frame, getattr(module, kind))
-
-
-def _polars(values: pa.Array, name: str) -> Any:
-    return sys.modules["polars"].Series(name, values)
-
-
-def _pandas(values: pa.Array, name: str, index: Any) -> Any:
-    numbers = values.to_numpy(zero_copy_only=False)
-    return sys.modules["pandas"].Series(numbers, index=index, name=name, dtype="float64")
 
 
 def predict(

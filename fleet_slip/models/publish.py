@@ -56,8 +56,6 @@ _MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "c
 _MODEL_OPTIONS |= {"search", "max_features"}
 """Options that define which models are compared: with one of these, none is taken from before."""
 
-_REQUEST_FIELDS = fields(SelectionRequest)
-
 _STORED_NAMES = {
     "order": "nested",
     "ranking": "rank",
@@ -93,21 +91,21 @@ def recipe_for(
 ) -> Recipe:
     """Return how to train a model as before, but for given options. Raises `QuestionError`."""
     version = _newest(registry, name)
-    options = _options(request)
     if version is None:
         return Recipe(request, cohort or TRAINING_DRIVES)
-    model_list = version.manifest.selected_by.model_list
+    options = _options(request)
     if options.keys() & _MODEL_OPTIONS:
-        old_cohort = with_all_drives(version.manifest.trained_on.cohort)
-        explanation = f"not as {version.reference}, chosen from {model_list}"
+        old_cohort, verb = with_all_drives(version.manifest.trained_on.cohort), "not as"
     else:
         old_request, old_cohort = recipe_of(version)
-        request = replace(old_request, **options)
-        explanation = f"trained as {version.reference}, chosen from {model_list}"
-    if cohort is None or cohort == old_cohort:
-        return Recipe(request, old_cohort, f"{explanation}, on drives where {old_cohort}")
-    explanation += f", but on drives where {cohort} instead of {old_cohort}"
-    return Recipe(request, cohort, explanation)
+        request, verb = replace(old_request, **options), "trained as"
+    explanation = (
+        f"{verb} {version.reference}, chosen from {version.manifest.selected_by.model_list}, on "
+        f"drives where {cohort or old_cohort}"
+    )
+    if cohort not in (None, old_cohort):
+        explanation += f" instead of {old_cohort}"
+    return Recipe(request, cohort or old_cohort, explanation)
 
 
 def _options(request: SelectionRequest) -> dict[str, Any]:
@@ -131,7 +129,9 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
     stored = manifest.selected_by.options
     if stored is None:
         return _request_of_list(version), cohort
-    names = {field.name: _STORED_NAMES.get(field.name, field.name) for field in _REQUEST_FIELDS}
+    names = {
+        field.name: _STORED_NAMES.get(field.name, field.name) for field in fields(SelectionRequest)
+    }
     options: dict[str, Any] = {name: stored[key] for name, key in names.items() if key in stored}
     if unknown := stored.keys() - {*names.values(), COHORT}:
         raise QuestionError(

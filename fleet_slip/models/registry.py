@@ -544,10 +544,9 @@ class Difference(Answer):
 
         For a term of a single version it shows the coefficient alone.
         """
-        versions = (self.first, self.second)
-        one_name, other_name = (version.reference for version in versions)
-        signals = [{term.signal for term in version.manifest.terms} for version in versions]
-        once = tuple(f"terms.{signal}." for signal in signals[0] ^ signals[1])
+        one_name, other_name = self.first.reference, self.second.reference
+        first, second = self.first.manifest.signals, self.second.manifest.signals
+        once = tuple(f"terms.{signal}." for signal in {*first} ^ {*second})
         rows = [
             [name, _shown(a), _shown(b)]
             for name, (a, b) in self.facts.items()
