@@ -110,14 +110,34 @@ def docstrings(module: str) -> Mapping[str, str]:
     }
 
 
+EXIT_CODES = {
+    0: "done",
+    1: "a bug",
+    2: "wrong usage",
+    3: "a config file",
+    4: "input data",
+    5: "the data cannot answer",
+    6: "storage",
+    7: "refused",
+    8: "a conflict with another process",
+    9: "damage",
+    10: "something needs attention",
+    11: "a cluster",
+    12: "not finished yet",
+    13: "a package of an extra is missing",
+    15: "a recording is in the logs already",
+    16: "sensors are not checked",
+    INTERRUPTED: "interrupted",
+}
+"""The exit codes of the classes of `errors.py`, as `--help` lists them."""
+
 app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Exit codes: 0 done, 2 wrong usage, 10 something needs attention; docs/commands.md "
-    "lists the others.",
+    epilog=f"Exit codes: {', '.join(f'{code} {text}' for code, text in EXIT_CODES.items())}.",
 )
 
 

@@ -19,7 +19,7 @@ from fleet_slip.api.fleet_cohort import FleetCohort
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.summary import Selection
-from tests.support.commands import finish, run, run_on, start
+from tests.support.commands import run, run_on
 
 
 def test_opening_touches_nothing_and_the_root_follows_the_rule(
@@ -43,14 +43,6 @@ def test_importing_the_package_imports_no_engine() -> None:
     assert not {"numpy", "pyarrow", "duckdb", "polars", "pydantic"} & {*done.stdout.split()}
 
 
-def test_help_shows_every_exported_name() -> None:
-    for name in fleet_slip.__all__:
-        assert name in dir(fleet_slip)
-        assert getattr(fleet_slip, name).__doc__
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = fleet_slip.nothing
-
-
 def test_the_lines_that_help_shows_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = [line[4:] for line in fleet_slip.__doc__.splitlines() if line.startswith("    ")]
@@ -70,13 +62,6 @@ def test_a_relation_keeps_its_connection(fleet: Fleet) -> None:
     assert n > 10_000
     again = fleet.sql("SELECT count(*) FROM log WHERE ax_mps2 > 0").fetchall()
     assert again == [(n,)]
-
-
-def test_answers_come_as_frames_of_any_library(fleet: Fleet) -> None:
-    relation = fleet.sql("SELECT drive_id, tick FROM log ORDER BY ALL LIMIT 5")
-    tables = relation.pl().to_arrow(), relation.to_arrow_table(), relation.arrow().read_all()
-    assert {table.num_rows for table in tables} == {5}
-    assert relation.df().shape == (5, 2)
 
 
 def test_a_long_query_of_an_interactive_python_prints_nothing(fleet: Fleet) -> None:
@@ -148,20 +133,6 @@ def test_all_queries_of_a_session_see_the_same_commits(smoke_copy: Path) -> None
     assert fleet.sql(COUNT).fetchall() != before
 
 
-def test_an_answer_is_computed_as_a_table_or_by_a_function(fleet: Fleet) -> None:
-    with fleet.session() as session:
-        table = session.table("SELECT drive_id FROM drives ORDER BY ALL")
-        assert table.num_rows > 1
-        assert session.compute("FROM drives", len) == table.num_rows
-
-
-def test_a_closed_session_answers_no_more(fleet: Fleet) -> None:
-    with fleet.session() as session:
-        pass
-    with pytest.raises(duckdb.ConnectionException):
-        session.database.execute("SELECT 1")
-
-
 def test_an_unlocked_session_does_what_it_is_told(fleet: Fleet, tmp_path: Path) -> None:
     with fleet.session(unlocked=True) as session:
         session.sql(COUNT).write_csv(str(tmp_path / "out.csv"))
@@ -210,20 +181,6 @@ def test_a_notebook_shows_what_commands_print(smoke_root: Path) -> None:
     assert html.unescape(page) == f"<pre>{shown}</pre>"
     assert "&lt;script&gt;" in selection._repr_html_()
     assert "<script>" not in selection._repr_html_() + page
-
-
-KERNEL = """
-import sys, types
-sys.modules["IPython"] = types.ModuleType("IPython")  # what DuckDB takes for a notebook
-sys.modules["IPython"].get_ipython = lambda: types.SimpleNamespace(config={"IPKernelApp": {}})
-sys.modules["ipywidgets"] = None
-from fleet_slip.warehouse.database import open_database
-print(open_database().sql("SELECT 42").fetchall())
-"""
-
-
-def test_a_notebook_needs_no_widgets() -> None:
-    assert finish(start([sys.executable, "-c", KERNEL]))[0].stdout == "[(42,)]\n"
 
 
 def test_an_answer_is_the_text_that_its_command_prints(smoke_root: Path) -> None:

@@ -23,7 +23,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.predicate import hash_drive, parse_predicate, without_drives
 from tests.support.cars import counts, drive
 from tests.support.catalog import SIGNALS
-from tests.support.commands import Finished, run_on, start_on, until
+from tests.support.commands import Finished, run_on
 from tests.support.counted_rows import START_S, row_of, write_counted
 from tests.support.landing import Landing
 from tests.support.logs import state
@@ -190,23 +190,6 @@ def test_a_night_that_is_killed_and_given_again_ends_at_the_same_place(
     assert not fleet_slip.open(place / "data").maintenance.verify().damage
 
 
-@pytest.mark.long
-def test_a_process_that_is_killed_leaves_a_night_that_can_be_given_again(
-    place: Path, landing: Landing
-) -> None:
-    land(landing, 2)
-    commits = place / "data/grams/_delta_log"
-    before = len(list(commits.glob("*.json")))
-    process = start_on(place / "data", *command(place, 2))
-    until(lambda: len(list(commits.glob("*.json"))) > before)
-    process.kill()
-    process.communicate()
-    assert process.returncode < 0
-    again = give(place, 2)
-    assert (again.exit_code, again.drives, again.champion) == (0, 8, "smoke@3")
-    assert again.drives - again.before.drives == 2
-
-
 def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
     place: Path, landing: Landing
 ) -> None:
@@ -343,12 +326,6 @@ def test_a_night_that_is_given_again_has_the_beginning_it_had(nights: NightlyLog
     assert nights.begin(MONDAY, later) == NOW
     nights.end(past(MONDAY, "ab"))  # as it ended at last
     assert nights.begin(TUESDAY, later) == replace(later, known_faults=frozenset({"ab"}))
-
-
-def test_models_have_nights_of_their_own(nights: NightlyLog) -> None:
-    nights.end(past(MONDAY, "ab"))
-    other = NightlyLog(nights.root, "other")
-    assert other.begin(TUESDAY, NOW).known_faults == frozenset()
 
 
 def test_a_changed_record_is_refused(nights: NightlyLog, tmp_path: Path) -> None:

@@ -180,10 +180,6 @@ def test_publish_show_score_promote_and_roll_back(
     assert "ax_mps2" in run_command("show", "slip@2").stdout
 
 
-def test_the_statement_of_the_gram_rows_is_shown(run_command: RunCommand) -> None:
-    assert "sum(ax::INTEGER * ax::INTEGER)" in run_command("gram", "--sql").stdout
-
-
 FORGED = (
     "false) UNION ALL SELECT 'd' || i, 'v', 'm', 'simulated', 'c', 't', 1, 1, 1, 0, "
     "DATE '2024-05-01', NULL, 'ay,sideslip', 9, 0, [i, i], [1, 2, 9] "
@@ -407,9 +403,3 @@ def test_another_root_stands_in_them(
         "run", "--campaign", "smoke", "--models", "table1", root=tmp_path / "my data"
     )
     assert f"--root '{tmp_path / 'my data'}' sql" in done.stderr
-
-
-def test_they_are_said_once(told: tuple[Path, list[str]]) -> None:
-    folder, _ = told
-    again = run_here([COMMAND, "run", "--campaign", "smoke", "--models", "table1"], folder)
-    assert "next:" not in again.stderr

@@ -1,7 +1,7 @@
 """How a table names the columns of a large model."""
 
-from fleet_slip.models.request import load_model_list, require_inputs
-from fleet_slip.models.summary import MANY_SIGNALS, in_families
+from fleet_slip.models.request import load_model_list
+from fleet_slip.models.summary import in_families
 from tests.support.catalog import CATALOG
 
 
@@ -20,21 +20,3 @@ def test_a_part_of_a_family_is_named_column_by_column() -> None:
     shown = in_families(CATALOG, [name for name in models["no gate"] if name != "ax_mean_16"])
     assert "ax_mean_8 ax_mean_32 " in shown
     assert " ax_mean(" not in shown
-
-
-def test_a_small_model_is_named_in_full() -> None:
-    names = [f"x{number}" for number in range(MANY_SIGNALS)]
-    assert in_families(CATALOG, names) == " ".join(names)
-
-
-def test_families_of_a_question_stand_for_their_columns() -> None:
-    asked = require_inputs(CATALOG, ["ay", " ax_mean", "excess"], "gated")
-    known = CATALOG
-    assert asked == ("ay", *known.members("ax_mean"), *known.members("excess"))
-
-
-def test_the_small_gated_list_is_made_of_the_gated_set_without_its_long_ring() -> None:
-    (sixty,) = load_model_list(CATALOG, "gated_small").model
-    assert len(sixty.signals) == 60
-    assert set(sixty.signals) <= set(CATALOG.feature_set("gated").inputs)
-    assert not set(sixty.signals) & set(CATALOG.members("road"))

@@ -44,14 +44,6 @@ def test_a_table_can_be_asked_for_whole(run_command: RunCommand, smoke_root: Pat
     assert whole.count("x" * 300) == 100
 
 
-def test_what_fits_is_shown_whole_and_nothing_is_said(
-    run_command: RunCommand, smoke_root: Path
-) -> None:
-    told = run_command("sql", "SELECT drive_id, lost_control_s FROM drives", root=smoke_root)
-    assert "NULL" in told.stdout
-    assert told.stderr == ""
-
-
 @pytest.mark.parametrize("suffix", ["parquet", "csv", "json"])
 def test_an_answer_becomes_a_file(
     run_command: RunCommand, smoke_root: Path, tmp_path: Path, suffix: str
@@ -114,13 +106,6 @@ def test_a_text_that_is_a_formula_is_marked_in_csv(
     assert f"{len(texts)} texts that begin like a formula" in done.stderr
     exact = run_command("sql", query, "--csv", "--exact", root=smoke_root)
     assert (cells(exact.stdout), exact.stderr) == ([[*texts, "-1.5"]], "")
-
-
-def test_other_texts_are_printed_as_they_are(run_command: RunCommand, smoke_root: Path) -> None:
-    query = "SELECT unnest(['a=b', '', NULL, '2024-05-01', ' =x'::VARCHAR]) AS a, -2 AS b"
-    done = run_command("sql", query, "--csv", root=smoke_root)
-    assert [row[0] for row in cells(done.stdout)] == ["a=b", "", "", "2024-05-01", " =x"]
-    assert done.stderr == ""
 
 
 Shown = Callable[..., list[str]]
@@ -242,11 +227,6 @@ def test_a_pipe_is_sent_texts_as_they_are(
     assert b'"\x1b[2J"' in capsysbinary.readouterr().out
 
 
-def test_prose_breaks_between_words_and_commands_do_not(shown: Shown) -> None:
-    lines = shown(lambda: print_parts(["a model of the fleet " * 20]))
-    assert " ".join(lines).split() == ("a model of the fleet " * 20).split()
-
-
 def test_an_evaluation_is_a_screen(shown: Shown) -> None:
     standing = {"scenario": "nominal", "winner": "ekf", "winner_rmse_deg": 0.1, "rmse_deg": 0.2}
     ranking = {
@@ -296,12 +276,6 @@ def test_the_winner_stands_first(smoke_root: Path, shown: Shown) -> None:
     at = next(i for i, line in enumerate(lines) if "(--all)" in line)
     names = [line.split("  ")[0] for line in lines[at + 2 :] if not line.startswith(" ")]
     assert names == [*"12345", lines[0].removeprefix("winner: ").partition(".")[0]]
-
-
-def test_publish_suggests_no_option_of_select(smoke_root: Path) -> None:
-    done = run_on(smoke_root, "publish", "smoke", "--dry-run")
-    assert " of 43 models\n" in done.stdout
-    assert "--all" not in done.stdout
 
 
 def test_a_typo_in_a_condition_names_the_nearest_column_that_may_be_used(smoke_root: Path) -> None:

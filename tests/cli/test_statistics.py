@@ -17,7 +17,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.cars import TICKS, counts, drive
 from tests.support.catalog import CATALOG
 from tests.support.commands import RunCommand, done_on
-from tests.support.logs import ask, land, log_rows
+from tests.support.logs import land, log_rows
 from tests.support.model_lists import write_list
 from tests.support.once import made_once
 
@@ -74,19 +74,6 @@ def test_a_criterion_chooses_from_a_ranking_and_says_how_sure(
     assert "with the choice repeated" in run_command(*arguments, root=more_sets).stderr
 
 
-def test_a_model_names_the_rows_that_it_was_made_of(
-    run_command: RunCommand, more_sets: Path
-) -> None:
-    report = run_command("select", "--models", "table1", "--json", root=more_sets).json
-    model = report["models"][1]
-    assert model["drives"] == report["drives"] == 8
-    counted = (
-        f"SELECT count(DISTINCT drive_id), sum(row_count) FROM grams WHERE {model['gram_rows']}"
-    )
-    (row,) = ask(more_sets, counted)
-    assert row == (model["drives"], model["rows"])
-
-
 def test_a_published_model_with_features_explains_and_evaluates_them(
     run_command: RunCommand, own_set: Path
 ) -> None:
@@ -127,13 +114,6 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, more_sets:
         assert naive["value"] == robust["value"]
         assert robust["standard_error"] > naive["standard_error"]
     assert report["effective_rows"] < report["rows"]
-
-
-def test_features_are_listed(run_command: RunCommand) -> None:
-    assert "curvature" in run_command("features").stdout
-    assert "motion" in run_command("features", "--sets").stdout
-    listed = run_command("features", "--json").json
-    assert listed["sets"]["motion"]["identity"] == CATALOG.identity("motion")
 
 
 @pytest.mark.parametrize(
