@@ -342,13 +342,6 @@ def gram(
             with progress(f"gram {name}") as show:
                 reports.append(fleet.gram(name, cohort=cohort, workers=executor, progress=show))
     print_answer(reports if features == ALL_SETS else reports[0], json)
-    if not (
-        json or any(report.gram_rows for report in reports) or fleet.warehouse.logs.snapshot().files
-    ):
-        say(
-            f"{fleet.root}: no logs yet. Load some with fleet-slip ingest, or simulate with "
-            "fleet-slip run"
-        )
 
 
 # Features, feature sets and config files.

@@ -12,7 +12,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -117,34 +117,29 @@ def progress_of_steps() -> Iterator[Callable[[str, int, int | None], None]]:
 
     Yields the callback. Its arguments are the task, the units done and, if known, their total.
     """
+    if not sys.stderr.isatty() or os.environ.get("CI"):
+        yield lambda *_: None
+        return
     from rich.progress import (
         BarColumn,
         Progress,
-        TaskID,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
-    console = stderr()
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal or bool(os.environ.get("CI")),
-    )
-    tasks: dict[str, TaskID] = {}
+    percentage = TextColumn("{task.percentage:>3.0f}%")
+    columns = ("{task.description}", BarColumn(), percentage)
+    tasks: dict[str, Any] = {}
+    with Progress(
+        *columns, TimeElapsedColumn(), TimeRemainingColumn(), console=stderr(), transient=True
+    ) as bar:
 
-    def show(task: str, done: int, total: int | None) -> None:
-        if task not in tasks:
-            tasks[task] = bar.add_task(task, total=None)
-        bar.update(tasks[task], completed=done, total=total)
+        def show(task: str, done: int, total: int | None) -> None:
+            if task not in tasks:
+                tasks[task] = bar.add_task(task, total=None)
+            bar.update(tasks[task], completed=done, total=total)
 
-    with drawing_on(console), bar:
         yield show
 
 
@@ -209,26 +204,12 @@ def _as_text(raw: io.FileIO, like: TextIO | None, errors: str = "surrogateescape
     )
 
 
-_drawn_on: "list[Console]" = []
-
-
+@cache
 def stderr() -> "Console":
-    """Return the console for progress and remarks: the one with a progress bar, if any."""
-    if _drawn_on:
-        return _drawn_on[-1]
+    """Return the console for progress and remarks, which it prints above the bars."""
     from rich.console import Console
 
     return Console(stderr=True, highlight=False, emoji=False, soft_wrap=True)
-
-
-@contextmanager
-def drawing_on(console: "Console") -> Iterator[None]:
-    """Print remarks above the progress bar of a console."""
-    _drawn_on.append(console)
-    try:
-        yield
-    finally:
-        _drawn_on.remove(console)
 
 
 class _RemarkHandler(logging.Handler):
@@ -237,12 +218,11 @@ class _RemarkHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Print a remark."""
         text = printable(hide_passwords(record.getMessage()))
-        if not (_drawn_on or sys.stderr.isatty()):
+        if not sys.stderr.isatty():
             print(text, file=sys.stderr, flush=True)  # noqa: T201 - a remark
             return
         console = stderr()
-        shown = wrap_lines(text, console.width) if console.is_terminal else text
-        console.print(shown, markup=False)
+        console.print(wrap_lines(text, console.width), markup=False)
 
 
 def configure_remarks() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
+from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, overload
 
 from pydantic import Field
@@ -600,7 +601,7 @@ def _flat(content: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
 
 def _shown(value: Any) -> str:
     text = "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[: _LONGEST_SHOWN - 1]}…"
+    return shorten(text, _LONGEST_SHOWN, placeholder="…")
 
 
 def _count_drives(
