@@ -155,11 +155,13 @@ def drawn_for(files: int) -> Iterator[Drives]:
         yield Drives.drawn(first, min(LOGS_AT_ONCE, files - first), 1)
 
 
-def write_grams(warehouse: Warehouse, paths: Sequence[str], rows: int, weight: int = 1) -> None:
+def write_grams(
+    warehouse: Warehouse, paths: Sequence[str], rows: int, weight: int = 1, chunk: int = CHUNK
+) -> None:
     """Commit Gram rows, evenly of the log files, through the writer of the warehouse."""
     actions = []
-    for first in range(0, rows, CHUNK):
-        drives = Drives.drawn(first, min(CHUNK, rows - first), weight)
+    for first in range(0, rows, chunk):
+        drives = Drives.drawn(first, min(chunk, rows - first), weight)
         files = (drives.numbers * len(paths) // rows).tolist()
         table = drives.grams(warehouse, [paths[f] for f in files], [day_of(f) for f in files])
         actions.append(warehouse.grams.write_file(f"growth-{first:09d}", table))
@@ -172,19 +174,7 @@ def write_fleet(warehouse: Warehouse, files: int, grams: int | None = None) -> N
     """Write log files, and a Gram row of each, or as many Gram rows as given."""
     paths = write_logs(warehouse, files)
     if grams is None:  # the very rows of the log files, so that they agree
-        parts = [
-            drives.grams(
-                warehouse,
-                [paths[i] for i in drives.numbers],
-                [day_of(i) for i in drives.numbers.tolist()],
-            )
-            for drives in drawn_for(files)
-        ]
-        action = warehouse.grams.write_file("growth", pa.concat_tables(parts))
-        transaction = AppTransaction(
-            transaction_name(CATALOG.identity(PLAIN)), warehouse.logs.snapshot().version or 0
-        )
-        warehouse.grams.snapshot().commit(Change(add=[action], transactions=[transaction]))
+        write_grams(warehouse, paths, files, chunk=LOGS_AT_ONCE)
     else:
         write_grams(warehouse, paths, grams, WEIGHT)
 
