@@ -3,7 +3,6 @@
 import logging
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -28,7 +27,6 @@ from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
 
 if TYPE_CHECKING:
-    from fleet_slip.catalog.features import FeatureSet
     from fleet_slip.catalog.signals import SignalCatalog
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.draft import Draft
@@ -395,7 +393,11 @@ def features(
                     for name, feature in catalog.features.items()
                 },
                 "sets": {
-                    name: {"identity": catalog.identity(name), **_content_of(feature_set)}
+                    name: {
+                        "identity": catalog.identity(name),
+                        **feature_set.model_dump(),
+                        "block_s": feature_set.block_s and float(feature_set.block_s),
+                    }
                     for name, feature_set in feature_sets.items()
                 },
             }
@@ -413,15 +415,6 @@ def features(
         print_parts([TextTable("", header, columns.items(), row, text_columns=4)])
         if not everything:
             say(f"and {pluralize(len(catalog.time_columns), 'column')} over time: --all")
-
-
-def _content_of(feature_set: "FeatureSet") -> dict[str, Any]:
-    """Return the document of a feature set, with times in s."""
-    from fleet_slip.catalog.signals import SAMPLE_TIME_S
-
-    content = asdict(feature_set)
-    ticks = content.pop("block_ticks")
-    return {**content, "block_s": None if ticks is None else float(ticks * SAMPLE_TIME_S)}
 
 
 def _print_files(configs: "Configs", json: bool) -> None:

@@ -116,6 +116,13 @@ def test_diagnose_shows_both_kinds_of_errors(run_command: RunCommand, more_sets:
     assert report["effective_rows"] < report["rows"]
 
 
+def test_features_are_listed(run_command: RunCommand) -> None:
+    assert "curvature" in run_command("features").stdout
+    assert "motion" in run_command("features", "--sets").stdout
+    listed = run_command("features", "--json").json
+    assert listed["sets"]["motion"]["identity"] == CATALOG.identity("motion")
+
+
 @pytest.mark.parametrize(
     "words", [*(f"select --folds {folds}" for folds in ("1001", "1", "-3", "few"))]
 )
