@@ -227,7 +227,7 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
     asked = ("select", "--features", "windows", "--order", "ax,ay", "--cohort")
     refused = run_command(*asked, "campaign = 'smoke'", root=root)
     assert refused.exit_code == 5
-    assert "log files have no Gram rows yet. Run: fleet-slip gram &&" in refused.stderr
+    assert "features are missing for 4 log files. Run: fleet-slip gram &&" in refused.stderr
     assert "no drive matches" not in refused.stderr
 
 
