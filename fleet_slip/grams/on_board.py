@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import pyarrow as pa
@@ -46,7 +46,6 @@ from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S,
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
 from fleet_slip.grams.drive_sums import DriveBlocks
-from fleet_slip.grams.parquet_pages import RowGroup, read_page_headers, read_row_groups
 from fleet_slip.grams.update import (
     files_to_rewrite,
     gram_digests,
@@ -353,7 +352,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
     """Return the rows of a file in the order of `COLUMNS`. Raises `InputError`."""
     stream = pa.BufferReader(content)
     try:
-        _require_decodable(file, content, read_row_groups(content))
+        _require_decodable(file, content)
         schema = pq.ParquetFile(stream).schema_arrow
         columns = [name for name in COLUMNS.names if name in schema.names]
         if missing := set(COLUMNS.names).difference(columns, OPTIONAL):
@@ -371,17 +370,17 @@ def _read(file: Path, content: bytes) -> pa.Table:
     return pa.concat_tables(batches).combine_chunks()
 
 
-def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -> None:
+def _require_decodable(file: Path, content: bytes) -> None:
     """Raise `InputError` for pages that decode to too many bytes, or that have no checksum.
 
     Reads the headers of all pages, since the footer can state other sizes. Without a checksum a
     flipped bit of a product remains undetected.
     """
-    if sum(group.rows for group in groups) > MAX_ROWS:
+    rows, pages = read_pages(content)
+    if rows > MAX_ROWS:
         raise _too_large(file)
-    chunks = (chunk for group in groups for chunk in group.chunks if chunk.column in COLUMNS.names)
     decoded = 0
-    for page in (page for chunk in chunks for page in read_page_headers(content, chunk)):
+    for page in (page for page in pages if page.column in COLUMNS.names):
         if not page.has_checksum:
             raise InputError(
                 f"{file}: its pages have no checksums. Write it with them, as by "
@@ -390,6 +389,118 @@ def _require_decodable(file: Path, content: bytes, groups: Sequence[RowGroup]) -
         decoded += max(page.size_bytes, page.values * VALUE_BYTES)
         if decoded > MAX_DECODED_BYTES:
             raise _too_large(file)
+
+
+# Footer and page headers of a Parquet file, which bound what it decodes to.
+#
+# They are structs in the compact protocol of Thrift (`parquet.thrift`). pyarrow does not expose
+# page headers, and aborts the process for some damaged footers if asked for a column.
+
+_DATA, _DICTIONARY, _DATA_V2 = 5, 7, 8
+_MAX_FOOTER_BYTES, _MAX_HEADER_BYTES, _DEEPEST, _MAX_SHIFT = 2**24, 2**16, 12, 63
+
+
+class Page(NamedTuple):
+    """A page of a column: the size and the number of the values that it decodes to."""
+
+    column: str
+    size_bytes: int
+    values: int
+    has_checksum: bool
+
+
+def read_pages(content: bytes) -> tuple[int, Iterator[Page]]:
+    """Return the rows and the pages of a file. Raises `ValueError` or `IndexError` for damage."""
+    size, end = int.from_bytes(content[-8:-4], "little"), len(content) - 8
+    if content[-4:] != b"PAR1" or size > min(_MAX_FOOTER_BYTES, end):
+        raise ValueError("a file without a footer, or with a large one")
+    footer = _ThriftReader(memoryview(content)[end - size : end]).struct()
+    groups = _field(footer, 4, list) if footer.get(3) else []
+    chunks = [_field(chunk, 3, dict) for group in groups for chunk in _field(group, 1, list)]
+    rows = sum(_field(group, 3, int) for group in groups)
+    return rows, (page for chunk in chunks for page in _pages_of(content, chunk))
+
+
+def _pages_of(content: bytes, chunk: dict[int, Any]) -> Iterator[Page]:
+    """Yield the pages of a column in a row group."""
+    column = bytes(_field(chunk, 3, list)[0]).decode()
+    at = min(offset for offset in (chunk.get(11), _field(chunk, 9, int)) if offset)
+    end = at + _field(chunk, 7, int)
+    while at < end:
+        reader = _ThriftReader(memoryview(content)[at : at + _MAX_HEADER_BYTES])
+        header = reader.struct()
+        kind = next((kind for kind in (_DATA, _DICTIONARY, _DATA_V2) if kind in header), 0)
+        values = _field(_field(header, kind, dict), 1, int)
+        yield Page(column, _field(header, 2, int), values, has_checksum=4 in header)
+        at += reader.at + _field(header, 3, int)
+
+
+def _field(fields: Any, number: int, kind: type) -> Any:
+    """Return a field of a struct. Raises `ValueError` if it is missing, negative or no `kind`."""
+    value = fields.get(number) if isinstance(fields, dict) else None
+    if not isinstance(value, kind) or (isinstance(value, int) and value < 0):
+        raise ValueError(f"the field {number} of a struct is not as it must be")
+    return value
+
+
+class _ThriftReader:
+    """Reads values in their order; `at` is the position behind the last one."""
+
+    def __init__(self, content: memoryview) -> None:
+        self.content, self.at, self._depth = content, 0, 0
+
+    def struct(self) -> dict[int, Any]:
+        """Return the fields of a struct by their numbers."""
+        fields: dict[int, Any] = {}
+        number = 0
+        while byte := self._byte():
+            number = number + (byte >> 4) if byte >> 4 else self._value(4)
+            fields[number] = self._value(byte & 15)
+        return fields
+
+    def _byte(self) -> int:
+        self.at += 1
+        return self.content[self.at - 1]
+
+    def _varint(self) -> int:
+        value = 0
+        for shift in range(0, _MAX_SHIFT + 1, 7):
+            byte = self._byte()
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                return value
+        raise ValueError("a number is too long")
+
+    def _value(self, kind: int) -> Any:
+        """Return a value of a type; that of a Boolean is its type."""
+        match kind:
+            case 1 | 2:
+                return kind == 1
+            case 3:
+                return self._byte()
+            case 4 | 5 | 6:
+                zigzag = self._varint()
+                return (zigzag >> 1) ^ -(zigzag & 1)
+            case 7:
+                self.at += 8
+                return None
+            case 8:
+                size = self._varint()
+                self.at += size
+                return bytes(self.content[self.at - size : self.at])
+            case 9 | 10 | 12 if self._depth < _DEEPEST:
+                self._depth += 1
+                value = self.struct() if kind == 12 else self._list()
+                self._depth -= 1
+                return value
+        raise ValueError("a type that Parquet does not use, or structs that are nested too deeply")
+
+    def _list(self) -> list[Any]:
+        head = self._byte()
+        size = self._varint() if head >> 4 == 15 else head >> 4
+        if size > len(self.content):
+            raise ValueError("a list is too long")
+        return [self._value(head & 15) for _ in range(size)]
 
 
 def _too_large(file: Path) -> InputError:
