@@ -7,7 +7,7 @@ for a pattern, or be anything but a name.
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import date, datetime
+from datetime import date
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -20,20 +20,18 @@ from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.batches import DISORDER, HELD, LATER, ROW, read_batches, read_columns
 from fleet_slip.ingest.columns import (
-    NO_NUMBER,
     DateColumn,
     SignalColumn,
-    as_clock_s,
-    as_moments,
-    conversion_factor,
+    as_number,
     count_range,
     describe,
-    parse_numbers,
+    unfit_column,
+    without_missing,
 )
 from fleet_slip.ingest.formats.csv import CUT, EXTRA_FIELDS, FEWER
 from fleet_slip.ingest.formats.source import BASE, OWN_TIME
 from fleet_slip.ingest.log_files import size_of
-from fleet_slip.ingest.mapping import FromColumn, Mapping, is_number
+from fleet_slip.ingest.mapping import FromColumn, Mapping
 
 RAW = "raw "
 Faults: TypeAlias = dict[str, pl.Expr]
@@ -60,17 +58,10 @@ def find_held(column: str, schema: pl.Schema) -> str:
     return HELD + column if RAW + HELD + column in schema else column
 
 
-def _number_faults(name: str, is_present: pl.Expr, reason: str, is_faulty: pl.Expr) -> Faults:
-    """Return the faults of a field's number; `is_present` is true where there is a text."""
+def _number_faults(name: str, reason: str, is_faulty: pl.Expr) -> Faults:
+    """Return the faults of a field's number."""
     value = pl.col(name)
-    unread = value.is_null() & is_present
-    return {"not_a_number": unread, "not_finite": ~value.is_finite(), reason: is_faulty}
-
-
-def _time_faults(name: str, text: pl.Expr, is_outside: pl.Expr | None = None) -> Faults:
-    """Return the faults of a field's day or time."""
-    faults = {"missing": text.is_null(), "not_a_time": pl.col(name).is_null()}
-    return faults if is_outside is None else faults | {"out_of_range": is_outside}
+    return {"not_a_number": value.is_nan(), "not_finite": value.is_infinite(), reason: is_faulty}
 
 
 MAX_WHOLE = 2.0**53
@@ -84,51 +75,25 @@ def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
     if schema[RAW + column] == pl.Float64:
         integer = raw.cast(pl.Int64, strict=False)
         text = pl.when(integer == raw).then(integer.cast(pl.String)).otherwise(text)
-    return without_missing(text, mapping)
+    return without_missing(text, mapping.missing)
 
 
-def as_number(column: str, schema: pl.Schema, mapping: Mapping) -> tuple[pl.Expr, pl.Expr]:
-    """Return a column as float64 with null for missing, and whether there is a text."""
-    raw = pl.col(RAW + column)
-    absent = [float(text) for text in mapping.missing if is_number(text)]
-    match schema[RAW + column]:
-        case pl.String:
-            text = without_missing(raw, mapping)
-            number = parse_numbers(text, decimal_comma=mapping.csv.decimal_comma)
-            is_absent = number.is_nan() | text.str.contains(NO_NUMBER)
-            if absent:
-                is_absent |= number.is_in(absent)
-            is_present = text.is_not_null() & ~is_absent.fill_null(value=False)
-            return pl.when(is_present).then(number), is_present
-        case pl.Float64 | pl.Int64 | pl.UInt64:
-            number = raw.cast(pl.Float64)
-            number = pl.when(~number.is_in(absent)).then(number) if absent else number
-            return number, pl.lit(value=False)
-        case other:
-            raise unfit_column(column, other, "numbers")
-
-
-def without_missing(text: pl.Expr, mapping: Mapping) -> pl.Expr:
-    """Return a text without spaces around it, null where it means that there is no value."""
-    text = text.str.strip_chars()
-    return pl.when(~text.is_in(["", *mapping.missing])).then(text)
-
-
-def unfit_column(column: str, kind: pl.DataType, needed: str) -> InputError:
-    """Return the error of a column whose type does not fit the mapping."""
-    return InputError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
+def _number(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return a column as float64, null for missing, NaN for other texts."""
+    kind, comma = schema[RAW + column], mapping.csv.decimal_comma
+    return as_number(column, pl.col(RAW + column), kind, mapping.missing, decimal_comma=comma)
 
 
 _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 
 def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    """Return the field of a day. Raises `InputError` for a column that is none."""
+    """Return the field of a day. Raises `ValueError` for a column that is none."""
     raw, value = pl.col(RAW + column), pl.col(name)
     text = raw
     match schema[RAW + column]:
         case pl.String:
-            text = without_missing(raw, mapping)
+            text = without_missing(raw, mapping.missing)
             days = [text.str.to_date(f, strict=False) for f in ("%Y-%m-%d", "%d.%m.%Y")]
             day = pl.coalesce(days)
         case pl.Date | pl.Datetime:
@@ -136,46 +101,32 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
         case other:
             raise unfit_column(column, other, "a date such as 2024-05-31")
     outside = (value < pl.lit(_FIRST_DAY)) | (value >= pl.lit(_END_DAY))
-    return RowField(name, "key", raw, day, _time_faults(name, text, outside))
+    faults = {"missing": text.is_null(), "not_a_time": value.is_null(), "out_of_range": outside}
+    return RowField(name, "key", raw, day, faults)
 
 
 def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    """Return the field of the time in s, since 1970 for timestamps. Raises `InputError`."""
-    unit = "s" if column == OWN_TIME else mapping.time.unit
-    if unit is None:
-        return _timestamp(column, schema, mapping)
-    number, present = as_number(column, schema, mapping)
-    faults = _number_faults("time", present, "missing", pl.col("time").is_null())
-    time_s = number * conversion_factor(unit, "s")
-    return RowField("time", "time", pl.col(RAW + column), time_s, faults)
-
-
-def _later(schema: pl.Schema) -> pl.Expr | None:
-    """Return the rows of the second of two equal hours."""
-    return pl.col(RAW + LATER) if RAW + LATER in schema else None
-
-
-def _timestamp(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    raw, value = pl.col(RAW + column), pl.col("time")
-    kind = schema[RAW + column]
-    if kind == pl.String and mapping.time.format is not None:
-        text = without_missing(raw, mapping)
-        if mapping.time.date is not None:
-            text = _dates(mapping.time.date, schema, mapping) + " " + text
-        if not mapping.time.is_dated:  # the time of day
-            clock_s = as_clock_s(text, mapping.time.format)
-            return RowField("time", "time", raw, clock_s, _time_faults("time", text))
-        moment = as_moments(text, str(mapping.time.moment_format))
-    elif isinstance(kind, pl.Datetime):
-        text = moment = raw
+    """Return the field of the time in s, since 1970 for timestamps. Raises `ValueError`."""
+    raw, value, time = pl.col(RAW + column), pl.col("time"), mapping.time
+    faults = {"missing": value.is_null()}
+    if column == OWN_TIME or time.unit is not None:
+        faults |= {"not_a_number": value.is_nan(), "not_finite": value.is_infinite()}
     else:
-        needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
-        raise unfit_column(column, kind, needed)
-    moment = mapping.time.in_utc(moment, kind, _later(schema))
-    first, end = (datetime.combine(day, datetime.min.time()) for day in (_FIRST_DAY, _END_DAY))
-    outside = (value < 0) | (value >= (end - first).total_seconds())
-    faults = _time_faults("time", text, outside)
-    return RowField("time", "time", raw, moment.dt.epoch("us") / 1e6, faults)
+        faults["not_a_time"] = value.is_nan()
+        if time.is_dated:
+            days = (_END_DAY - _FIRST_DAY).days
+            faults["out_of_range"] = (value < 0) | (value >= days * 86_400)
+    if column == OWN_TIME:
+        return RowField("time", "time", raw, raw, faults)
+    time_s = time.in_s(
+        raw,
+        schema[RAW + column],
+        missing=mapping.missing,
+        decimal_comma=mapping.csv.decimal_comma,
+        dates=_dates(time.date, schema, mapping) if time.date else None,
+        later=pl.col(RAW + LATER) if RAW + LATER in schema else None,
+    )
+    return RowField("time", "time", raw, time_s, faults)
 
 
 def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
@@ -194,7 +145,7 @@ MAX_VALUE_CHARACTERS = 200
 def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
     """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
 
-    Raises `InputError` if a column's type does not fit the mapping.
+    Raises `ValueError` if a column's type does not fit the mapping.
     """
     fields = [
         _METADATA[name](name, find_held(column, schema), schema, mapping)
@@ -228,7 +179,7 @@ def _key_columns(mapping: Mapping) -> dict[str, str]:
 
 
 def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
-    """Return whether a row meets all of the mapping's conditions. Raises `InputError`."""
+    """Return whether a row meets all of the mapping's conditions. Raises `ValueError`."""
     predicates = []
     for condition in mapping.where:
         signal = condition.signal
@@ -237,11 +188,11 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
         )
         if signal is not None:
             source = mapping.signals[signal]
-            value = _si_value(mapping, signal, source, _signed(source, name, schema, mapping)[0])
+            value = _si_value(mapping, signal, source, _signed(source, name, schema, mapping))
         elif condition.one_of:
             value = as_text(name, schema, mapping)
         else:
-            value = as_number(name, schema, mapping)[0]
+            value = _number(name, schema, mapping)
         predicates.append(condition.is_met(value))
     return pl.all_horizontal(predicates)
 
@@ -254,9 +205,9 @@ def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
     """Return a signal in SI units; its range is checked on the count that it becomes."""
     source = mapping.signals[name]
     raw = pl.col(RAW + source.column)
-    number, present = _signed(source, source.column, schema, mapping)
+    number = _signed(source, source.column, schema, mapping)
     least, largest = _value_range(*count_range(mapping.signal_catalog, name, source))
-    faults = _number_faults(name, present, "out_of_range", ~pl.col(name).is_between(least, largest))
+    faults = _number_faults(name, "out_of_range", ~pl.col(name).is_between(least, largest))
     return RowField(name, "signal", raw, _si_value(mapping, name, source, number), faults)
 
 
@@ -271,17 +222,14 @@ def _value_range(signal: Signal, low: int, high: int) -> tuple[float, float]:
     return float(least), float(largest)
 
 
-def _signed(
-    source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping
-) -> tuple[pl.Expr, pl.Expr]:
-    """Return a column as `as_number` does, with the sign of another column."""
-    number, present = as_number(column, schema, mapping)
+def _signed(source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
+    """Return a column as a number, with the sign of another column."""
+    number = _number(column, schema, mapping)
     if source.sign is None:
-        return number, present
+        return number
     sign = as_text(find_held(source.sign.column, schema), schema, mapping)
-    negative = sign == str(source.sign.negative)
-    signed = pl.when(negative).then(-number).when(sign.is_not_null()).then(number)
-    return signed, present & sign.is_not_null()
+    is_negative = sign == str(source.sign.negative)
+    return pl.when(is_negative).then(-number).when(sign.is_not_null()).then(number)
 
 
 def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
@@ -291,8 +239,8 @@ def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr
 
 
 def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    number, present = as_number(column, schema, mapping)
-    faults = _number_faults(name, present, "out_of_range", pl.col(name) <= 0)
+    number = _number(column, schema, mapping)
+    faults = _number_faults(name, "out_of_range", pl.col(name) <= 0)
     return RowField(name, "key", pl.col(RAW + column), number, faults)
 
 
@@ -377,7 +325,7 @@ class RowChecker:
         raw = _without_nan(batch.rename({name: RAW + name for name in batch.columns}))
         try:
             fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
-        except InputError as error:
+        except ValueError as error:
             raise InputError(f"{quote_name(self._file)}: {error}") from None
         if RAW + ROW in raw.columns:
             raw = raw.rename({RAW + ROW: "row", RAW + BASE: "base"})
@@ -478,7 +426,7 @@ def is_grouped(file: Path, mapping: Mapping) -> bool:
     if several_bases or size_of(file) < LARGE_FILE_BYTES:
         return False
     keys, latest = DriveKeys(), -1
-    with suppress(InputError):
+    with suppress(InputError, ValueError):
         for batch in read_columns(file, mapping, [*dict.fromkeys(columns.values())]):
             raw = batch.rename({name: RAW + name for name in batch.columns})
             fields = [
@@ -504,8 +452,8 @@ def _split(
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Split a batch into good rows, in SI units, and bad ones with the first fault of each.
 
-    Most batches are good: then each fault is only looked for. A value that is not finite is out of
-    its range, too.
+    Most batches are good: then each fault is only looked for. A signal that is no finite number is
+    out of its range, too.
     """
     measured = [field for field in fields if field.kind in {"time", "signal"}]
     columns = ["row", "group", *({"base"} & set(raw.columns)), *(f.name for f in measured)]
@@ -514,7 +462,7 @@ def _split(
     possible = [
         fault
         for field, reason, fault in faults
-        if field.kind != "key" and not (field.kind == "signal" and reason == "not_finite")
+        if field.kind != "key" and (field.kind != "signal" or reason == "out_of_range")
     ]
     seen = valued.select(
         fault.any().alias(str(i)) for i, fault in enumerate([pl.col("group").is_null(), *possible])

@@ -106,6 +106,46 @@ def parse_numbers(text: pl.Expr, *, decimal_comma: bool) -> pl.Expr:
     return text.cast(pl.Float64, strict=False)
 
 
+def is_number(text: str) -> bool:
+    """Return True if a text is a number, such as one that means "no value"."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def without_missing(text: pl.Expr, missing: Sequence[str]) -> pl.Expr:
+    """Return a text without spaces around it, null where it means that there is no value."""
+    text = text.str.strip_chars()
+    return pl.when(~text.is_in(["", *missing])).then(text)
+
+
+def as_number(
+    column: str, raw: pl.Expr, kind: pl.DataType, missing: Sequence[str], *, decimal_comma: bool
+) -> pl.Expr:
+    """Return a column as float64: null for a missing value, NaN for a text that is no number.
+
+    Raises `ValueError` for a column of another type.
+    """
+    if kind == pl.String:
+        text = without_missing(raw, missing)
+        number = parse_numbers(text, decimal_comma=decimal_comma)
+        is_missing = text.is_null() | number.is_nan() | text.str.contains(NO_NUMBER)
+        number = pl.when(~is_missing.fill_null(value=False)).then(number.fill_null(float("nan")))
+    elif kind.is_numeric():
+        number = raw.cast(pl.Float64)
+    else:
+        raise unfit_column(column, kind, "numbers")
+    absent = [float(text) for text in missing if is_number(text)]
+    return pl.when(~number.is_in(absent)).then(number) if absent else number
+
+
+def unfit_column(column: str | None, kind: pl.DataType, needed: str) -> ValueError:
+    """Return the error of a column whose type does not fit the mapping."""
+    return ValueError(f"column {column!r} has the type {kind}; the mapping needs {needed}.")
+
+
 FiniteFloat = Annotated[float, Field(allow_inf_nan=False)]
 OffsetM = Annotated[FiniteFloat, Field(ge=-15, le=15)]
 WHEEL_PREFIX = "wheel_"
@@ -347,31 +387,37 @@ class TimeBase(Config):
         """The format of a text, preceded by the date if that is a separate column."""
         return self.format if self.date is None else f"{self.date.format} {self.format}"
 
-    def in_s(self, raw: pl.Expr, kind: pl.DataType, *, decimal_comma: bool = False) -> pl.Expr:
-        """Return times in s, since 1970 if they have a date; null for empty, NaN for invalid texts.
+    def in_s(
+        self,
+        raw: pl.Expr,
+        kind: pl.DataType,
+        *,
+        missing: Sequence[str] = (),
+        decimal_comma: bool = False,
+        dates: pl.Expr | None = None,
+        later: pl.Expr | None = None,
+    ) -> pl.Expr:
+        """Return times in s, since 1970 if they have a date.
 
-        Raises `ValueError` for a column of another type.
+        Null for a missing time, NaN for a text that is none. `dates` are those of a column of their
+        own; for `later` see `in_utc`. Raises `ValueError` for a column of another type.
         """
-        if isinstance(kind, pl.Datetime):
-            return self.in_utc(raw, kind).dt.epoch("us") / 1e6
         if self.unit is not None:
-            number = raw.cast(pl.Float64) if kind.is_numeric() else raw
-            if kind == pl.String:
-                text = raw.str.strip_chars()
-                number = parse_numbers(text, decimal_comma=decimal_comma)
-                number = number.fill_null(pl.when(text != "").then(float("nan")))
+            number = as_number(str(self.column), raw, kind, missing, decimal_comma=decimal_comma)
             return number * conversion_factor(self.unit, "s")
-        if kind != pl.String or self.format is None:
-            raise ValueError(
-                f"column {self.column!r} has the type {kind}; the mapping needs a time: add 'unit' "
-                "for numbers, 'format' for timestamps as text"
-            )
-        text = raw.str.strip_chars()
-        if self.is_dated:
-            time_s = self.in_utc(as_moments(text, self.format), kind).dt.epoch("us") / 1e6
-        else:
-            time_s = as_clock_s(text, self.format)
-        return time_s.fill_null(pl.when(text != "").then(float("nan")))
+        text = moment = raw
+        if kind == pl.String and self.format is not None:
+            text = without_missing(raw, missing)
+            if not self.is_dated:
+                clock_s = as_clock_s(text, self.format)
+                return clock_s.fill_null(pl.when(text.is_not_null()).then(float("nan")))
+            dated = text if dates is None else dates + " " + text
+            moment = as_moments(dated, str(self.moment_format))
+        elif not isinstance(kind, pl.Datetime):
+            needed = "a time: add 'unit' for numbers, 'format' for timestamps as text"
+            raise unfit_column(self.column, kind, needed)
+        time_s = self.in_utc(moment, kind, later).dt.epoch("us") / 1e6
+        return time_s.fill_null(pl.when(text.is_not_null()).then(float("nan")))
 
     def in_utc(self, moment: pl.Expr, kind: pl.DataType, later: pl.Expr | None = None) -> pl.Expr:
         """Return timestamps without a zone as those of `zone`.

@@ -39,6 +39,7 @@ from fleet_slip.ingest.columns import (
     RowCondition,
     SignalColumn,
     TimeBase,
+    is_number,
     require_satellites,
     split_components,
 )
@@ -436,15 +437,6 @@ def _missing_keys(content: Any) -> Iterator[str]:
     for name, signal in signals.items() if isinstance(signals, dict) else ():
         if isinstance(signal, dict) and signal.get("unit") == CHOOSE:
             yield f"the unit of signals.{name} ({signal.get('column')})"
-
-
-def is_number(text: str) -> bool:
-    """Return True if a text that means "no value" is also a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:

@@ -29,6 +29,8 @@ GAP_S = 1.0
 class FakeSource(Source):
     """A file with clocks that is in memory, read in batches of some rows."""
 
+    has_clock = True
+
     def __init__(self, frames: Sequence[pl.DataFrame], batch: int) -> None:
         self._frames, self._batch = frames, batch
 
