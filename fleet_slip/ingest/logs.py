@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import polars as pl
@@ -136,6 +136,9 @@ class Preview(IngestReport, Answer):
             text_columns=2,
         )
         yield from (f"looks wrong: {fault}" for fault in self.suspicions)
+
+
+Report = TypeVar("Report", bound=IngestReport)
 
 
 @dataclass(frozen=True)
@@ -307,13 +310,16 @@ def write_batch(
                 failures.append((task.file, error))
         faults = check_longest(mapping, [file.longest for file in written])
         new = {name: data.finish() for name, data in batch.data.items()}
-    checked = tuple(_with_faults(*pair) for pair in zip(written, faults, strict=True))
+    checked = tuple(map(_checked_file, written, faults))
     return WrittenBatch(checked, tuple(failures), batch.forgotten, new)
 
 
-def _with_faults(file: WrittenFile, faults: Sequence[Fault]) -> WrittenFile:
-    suspicions = (*file.report.suspicions, *faults)
-    return replace(file, report=replace(file.report, suspicions=suspicions), longest=None)
+def _checked_file(file: WrittenFile, faults: Sequence[Fault]) -> WrittenFile:
+    return replace(file, report=_with_faults(file.report, faults), longest=None)
+
+
+def _with_faults(report: Report, faults: Sequence[Fault]) -> Report:
+    return replace(report, suspicions=(*report.suspicions, *faults))
 
 
 class _BatchWriter:
@@ -428,11 +434,16 @@ def preview_logs(logs: Iterable[Path], mapping: Mapping) -> list[Preview]:
 
     Raises `InputError`.
     """
-    return [_preview_log(log, mapping) for log in logs]
+    previews: list[Preview] = []
+    for batch in _batches(map(IngestTask, logs)):
+        results, longest = zip(*(_preview_log(task.file, mapping) for task in batch), strict=True)
+        faults = check_longest(mapping, longest)
+        previews += map(_with_faults, results, faults)
+    return previews
 
 
-def _preview_log(log: Path, mapping: Mapping) -> Preview:
-    """Return the preview of a log. Raises `InputError`."""
+def _preview_log(log: Path, mapping: Mapping) -> tuple[Preview, MeasuredDrive | None]:
+    """Return the preview of a log and its longest drive. Raises `InputError`."""
     ends: dict[str, list[int]] = {name: [] for name in mapping.signal_names}
     values: Counter[str] = Counter()
     with open_measured(log, mapping) as stream:
@@ -443,7 +454,6 @@ def _preview_log(log: Path, mapping: Mapping) -> Preview:
                     end for end in pc.min_max(counts).as_py().values() if end is not None
                 ]
         suspicions = stream.suspicions()  # may read the file again
-    (faults,) = check_longest(mapping, [stream.longest])
     ranges = []
     for name, bounds in ends.items():
         signal = mapping.signal_catalog[name]
@@ -451,7 +461,8 @@ def _preview_log(log: Path, mapping: Mapping) -> Preview:
         low, high = (scale * min(bounds), scale * max(bounds)) if bounds else (np.nan, np.nan)
         missing = 1 - values[name] / max(stream.counts.ticks, 1)
         ranges.append(SignalRange(name, signal.unit, low, high, missing))
-    return Preview(str(log), stream.counts, (*suspicions, *faults), ranges=tuple(ranges))
+    preview = Preview(str(log), stream.counts, suspicions, ranges=tuple(ranges))
+    return preview, stream.longest
 
 
 CHECKED_TICKS, MIN_CHECKED_TICKS = 60_000, 6_000
