@@ -35,8 +35,8 @@ from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
     FilterEstimate,
-    PublishedEstimate,
     TuningDrives,
+    published_estimate,
 )
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.grams.cohort import load_cohort
@@ -104,7 +104,7 @@ def train(
     yield (
         manifest.name,
         Rival(
-            PublishedEstimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest)),
+            partial(published_estimate, SIGNALS, Predictor.from_manifest(SIGNALS, manifest)),
             8 * (len(manifest.terms) + 1),
         ),
     )

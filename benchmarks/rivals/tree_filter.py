@@ -23,16 +23,8 @@ from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
 from fleet_slip.evaluation.kalman import independent_state
-from fleet_slip.evaluation.single_track import (
-    STEP_S,
-    Axles,
-    DriveSignals,
-    LabelledDrive,
-    follow,
-    hold_last,
-    measured_speed_mps,
-    sideslip_angle,
-)
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive, hold_last
+from fleet_slip.evaluation.single_track import Axles, follow, measured_speed_mps, sideslip_angle
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.evaluation.tuning import tune
 from fleet_slip.vehicle.parameters import VehicleParameters
@@ -64,16 +56,19 @@ class LeafNoise(Config):
 @kernel
 def _filter(given: ekf.Inputs, factors: FloatArray) -> FloatArray:
     """Return vx and vy as `ekf` does, the model's variances of each row times a factor."""
-    ax, ay, yaw_rate, vx, steer, loaded, mean, first_variances, c, v = given
-    found = np.empty((2, len(ax)))
-    x = independent_state(mean, first_variances)
-    for k in range(len(ax)):
-        axles = Axles(loaded[0, k], loaded[1, k], loaded[2, k], loaded[3, k])
+    found = np.empty((2, len(given.ax_mps2)))
+    x, (q_vx, q_vy, q_r, q_bias) = (
+        independent_state(given.first_mean, given.first_variances),
+        given.q,
+    )
+    for k in range(len(given.ax_mps2)):
+        loaded, steer, factor = given.axles[:, k], given.steer_rad[k], factors[k]
+        axles = Axles(loaded[0], loaded[1], loaded[2], loaded[3])
         if k > 0:
-            q_vy, q_r = factors[k] * v.q_vy, factors[k] * v.q_r
-            w = ekf.Variances(v.q_vx, q_vy, q_r, v.r_vx, v.r_r, v.r_ay)
-            ekf.predict(x, ax[k], steer[k], STEP_S, axles, c, w)
-        ekf.update(x, vx[k], yaw_rate[k], ay[k], steer[k], axles, c, v)
+            q = q_vx, factor * q_vy, factor * q_r, q_bias
+            ekf.predict(x, given.ax_mps2[k], steer, STEP_S, axles, given.constants, q)
+        measured = given.vx_mps[k], given.yaw_rate_rad_s[k], given.ay_mps2[k]
+        ekf.update(x, *measured, steer, axles, given.constants, given.variances)
         found[:, k] = x.mean[:2]
     return found
 

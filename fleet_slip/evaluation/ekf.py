@@ -35,19 +35,16 @@ from fleet_slip.evaluation.kalman import (
     measurement_update,
     predict_covariance,
 )
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
 from fleet_slip.evaluation.single_track import (
-    STEP_S,
     Axles,
-    Chassis,
-    DriveSignals,
-    hold_last,
     loaded_axles,
     measured_speed_mps,
     measured_steer_rad,
     rates,
     sideslip_angle,
 )
-from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants
 
 INITIAL_STD = (1.0, 1.0, 0.1)
 """Standard deviations of vx, vy (m/s) and r (rad/s) at the first row."""
@@ -108,25 +105,22 @@ TUNABLE = (
     "stiffness_rear_factor",
     *YAW_RATE_TUNABLE,
 )
-"""The parameters that `identify.tune` should search."""
+"""The parameters to search."""
 
 
-class Variances(NamedTuple):
-    """Variances of a step of the state, and of the measurements."""
-
-    q_vx: float
-    q_vy: float
-    q_r: float
-    r_vx: float
-    r_r: float
-    r_ay: float
+STARTS = (
+    EkfNoise(),
+    EkfNoise(lateral_model_std_mps2=2.0, yaw_model_std_rad_s2=2.0, ay_bias_std_mps2=0.01),
+)
+"""Parameters with which a search begins: the default, and no bias and large errors of the model, as
+suits cars that differ from their class."""
 
 
 @kernel
 def predict(
-    x: GaussianState, ax: float, steer: float, dt: float, axles: Axles, c: Chassis, v: Variances
+    x: GaussianState, ax: float, steer: float, dt: float, axles: Axles, c: Constants, q: Row
 ) -> None:
-    """Time update: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x."""
+    """Time update: x ← x + Δt f(x), P ← F P Fᵀ + Q, F = I + Δt ∂f/∂x; `q` is Q's diagonal."""
     vx, vy, r, _ = x.mean
     d = rates(vx, vy, r, steer, axles, c)
     x.mean[0] = vx + dt * (ax + r * vy)
@@ -138,7 +132,7 @@ def predict(
         (dt * d.yaw_vx, dt * d.yaw_vy, 1.0 + dt * d.yaw_r, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
-    predict_covariance(x, f, (v.q_vx, v.q_vy, v.q_r, 0.0))
+    predict_covariance(x, f, q)
 
 
 @kernel
@@ -149,14 +143,14 @@ def update(
     ay: float,
     steer: float,
     axles: Axles,
-    c: Chassis,
-    v: Variances,
+    c: Constants,
+    variances: Row,
 ) -> None:
     """Measurement update by wheel speed, yaw rate and lateral acceleration."""
-    measurement_update(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], v.r_vx)
-    measurement_update(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], v.r_r)
+    measurement_update(x, (1.0, 0.0, 0.0, 0.0), vx - x.mean[0], variances[0])
+    measurement_update(x, (0.0, 0.0, 1.0, 0.0), yaw_rate - x.mean[2], variances[1])
     d = rates(x.mean[0], x.mean[1], x.mean[2], steer, axles, c)
-    measurement_update(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], v.r_ay)
+    measurement_update(x, (d.ay_vx, d.ay_vy, d.ay_r, 1.0), ay - d.ay - x.mean[3], variances[2])
 
 
 class Inputs(NamedTuple):
@@ -170,40 +164,33 @@ class Inputs(NamedTuple):
     axles: FloatArray
     first_mean: Row
     first_variances: Row
-    chassis: Chassis
-    variances: Variances
+    q: Row
+    """Diagonal of Q."""
+    variances: Row
+    """Variances of wheel speed, yaw rate and lateral acceleration."""
+    constants: Constants
 
 
 @kernel
 def _filter(u: Inputs) -> FloatArray:
     velocities = np.empty((2, len(u.ax_mps2)))
-    x, c, v = independent_state(u.first_mean, u.first_variances), u.chassis, u.variances
+    x = independent_state(u.first_mean, u.first_variances)
     for k in range(len(u.ax_mps2)):
         loaded, steer = u.axles[:, k], u.steer_rad[k]
         axles = Axles(loaded[0], loaded[1], loaded[2], loaded[3])
         if k > 0:
-            predict(x, u.ax_mps2[k], steer, STEP_S, axles, c, v)
-        update(x, u.vx_mps[k], u.yaw_rate_rad_s[k], u.ay_mps2[k], steer, axles, c, v)
+            predict(x, u.ax_mps2[k], steer, STEP_S, axles, u.constants, u.q)
+        measured = u.vx_mps[k], u.yaw_rate_rad_s[k], u.ay_mps2[k]
+        update(x, *measured, steer, axles, u.constants, u.variances)
         velocities[:, k] = x.mean[:2]
     return velocities
 
 
-def variances(noise: EkfNoise) -> Variances:
-    """Return the variances per step."""
-    return Variances(
-        q_vx=(noise.ax_std_mps2 * STEP_S) ** 2,
-        q_vy=(noise.lateral_model_std_mps2 * STEP_S) ** 2,
-        q_r=(noise.yaw_model_std_rad_s2 * STEP_S) ** 2,
-        r_vx=noise.wheel_speed_std_mps**2,
-        r_r=noise.yaw_rate_std_rad_s**2,
-        r_ay=noise.ay_std_mps2**2,
-    )
-
-
-def chassis(car: VehicleParameters) -> Chassis:
-    """Return the chassis of a car."""
-    body = car.body
-    return Chassis(body.mass_kg, body.yaw_inertia_kgm2, body.front_axle_m, body.rear_axle_m)
+def variances(noise: EkfNoise) -> tuple[Row, Row]:
+    """Return the diagonal of Q, and the variances of wheel speed, yaw rate and ay."""
+    model = noise.ax_std_mps2, noise.lateral_model_std_mps2, noise.yaw_model_std_rad_s2
+    measured = noise.wheel_speed_std_mps, noise.yaw_rate_std_rad_s, noise.ay_std_mps2
+    return (*((std * STEP_S) ** 2 for std in model), 0.0), (*(std**2 for std in measured),)
 
 
 def axles_of(
@@ -238,6 +225,6 @@ def inputs_of(drive: DriveSignals, car: VehicleParameters, noise: EkfNoise) -> I
         # vy: the rear wheels roll without slip
         (vx_mps[0], car.body.rear_axle_m * yaw_rate_rad_s[0], yaw_rate_rad_s[0], 0.0),
         (*(std**2 for std in INITIAL_STD), noise.ay_bias_std_mps2**2),
-        chassis(car),
-        variances(noise),
+        *variances(noise),
+        constants(car, noise.adhesion),
     )

@@ -19,10 +19,16 @@ from fleet_slip.catalog.definitions import (
 )
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.combined import LATERAL_ROWS, CombinedEstimate, combine
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.held_out import HeldOutDrive, Learner, read_measured_drives
+from fleet_slip.evaluation.held_out import (
+    LATERAL_ROWS,
+    CombinedModel,
+    Learner,
+    combine,
+    read_measured_drives,
+)
 from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
+from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
@@ -138,7 +144,6 @@ def with_filter(
         is_calibrated = warehouse.catalog.feature_set(learner.plan.feature_set).calibrated
         combined = combine(
             learner,
-            drives,
             measures,
             frozenset(),
             executor,
@@ -167,7 +172,7 @@ def with_filter(
 
 
 def observer_of_drives(
-    vehicle: IdentifiedVehicle, signals: SignalCatalog, drives: Sequence[HeldOutDrive]
+    vehicle: IdentifiedVehicle, signals: SignalCatalog, drives: Sequence[LabelledDrive]
 ) -> Observer:
     """Return the observer of a car for the signals that all drives have."""
     logged = [
@@ -186,7 +191,7 @@ def observer_of_drives(
 
 
 def combined_term(
-    catalog: Catalog, manifest: Manifest, combined: CombinedEstimate, observer: Observer
+    catalog: Catalog, manifest: Manifest, combined: CombinedModel, observer: Observer
 ) -> ModelTerm:
     """Return the column of a combination as the only term of an estimate."""
     combination, is_alone = combined.choice.combination, combined.choice.method == "filter"

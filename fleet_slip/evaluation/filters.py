@@ -5,12 +5,12 @@ dry road and the usual load. `ekf_informed` uses the true vehicle and road. Tune
 parameters with the smallest error on drives that the regression was trained on.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -23,12 +23,8 @@ from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.evaluator import Estimator
 from fleet_slip.evaluation.identify import IdentifiedVehicle, identify
-from fleet_slip.evaluation.single_track import (
-    DriveSignals,
-    LabelledDrive,
-    measured_speed_mps,
-    read_drive,
-)
+from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, read_drives
+from fleet_slip.evaluation.single_track import measured_speed_mps
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.evaluation.tuning import TuningResult, tune
 from fleet_slip.grams.cohort import Cohort, load_cohort
@@ -42,7 +38,6 @@ from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
-from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
 TABLE_ONE = "table1"
@@ -52,33 +47,21 @@ EstimatorBank = dict[str, tuple[Estimator[TestDrive], dict[str, Any]]]
 """Estimators by name, each with its description in a document."""
 
 
-@dataclass(frozen=True)
-class LinearEstimate:
-    """An intercept in rad and a coefficient for each SI column; a null leaves no estimate."""
-
-    intercept: float
-    coefficients: Mapping[str, float]
-
-    def __call__(self, drive: TestDrive) -> FloatArray:
-        """Return intercept + sum of coefficient times signal."""
-        terms = [weight * drive.signals[column] for column, weight in self.coefficients.items()]
-        total: FloatArray = np.sum(terms, axis=0) + self.intercept
-        return total
+def linear_estimate(
+    intercept: float, coefficients: Mapping[str, float], drive: TestDrive
+) -> FloatArray:
+    """Return intercept in rad + sum of coefficient times SI column; NaN where one is null."""
+    terms = [weight * drive.signals[column] for column, weight in coefficients.items()]
+    total: FloatArray = np.sum(terms, axis=0) + intercept
+    return total
 
 
-@dataclass(frozen=True)
-class PublishedEstimate:
-    """A published model on counts, as on an ECU: the integers that its Gram rows are made of."""
-
-    signal_catalog: SignalCatalog
-    predictor: Predictor
-
-    def __call__(self, drive: TestDrive) -> FloatArray:
-        """Return the estimate at each tick."""
-        names = self.predictor.plan.signals
-        return self.predictor(
-            as_counts(self.signal_catalog, drive.signals, names, drive.vehicle_attributes)
-        )
+def published_estimate(
+    signals: SignalCatalog, predictor: Predictor, drive: TestDrive
+) -> FloatArray:
+    """Return the estimate of a model on counts: the integers that its Gram rows are made of."""
+    names = predictor.plan.signals
+    return predictor(as_counts(signals, drive.signals, names, drive.vehicle_attributes))
 
 
 @dataclass(frozen=True)
@@ -109,36 +92,33 @@ class TrainedModels:
             weights = {
                 signals[signal].column: weight for signal, weight in model.model.weights.items()
             }
-            bank[name] = (
-                LinearEstimate(model.model.offset, weights),
-                {
-                    **common,
-                    "table_one": model.name,
-                    "signals": list(model.signals),
-                    "cross_validated": model.pooled.as_dict(),
-                    "intercept": model.model.offset,
-                    "coefficients": weights,
-                },
-            )
-        bank[version.reference] = (
-            PublishedEstimate(signals, Predictor.from_manifest(signals, manifest)),
-            {
+            about = {
                 **common,
-                "published": version.reference,
-                "sha256": version.sha256,
-                "signals": list(manifest.signals),
-                "cross_validated": manifest.cross_validation.model_dump(mode="json"),
-                "intercept": manifest.intercept,
-                "coefficients": {term.column: term.coefficient for term in manifest.terms},
-                "columns": {
-                    term.signal: term.definition.model_dump(mode="json")
-                    if term.definition
-                    else term.sql
-                    for term in manifest.terms
-                    if not term.logged
-                },
+                "table_one": model.name,
+                "signals": list(model.signals),
+                "cross_validated": model.pooled.as_dict(),
+                "intercept": model.model.offset,
+                "coefficients": weights,
+            }
+            bank[name] = partial(linear_estimate, model.model.offset, weights), about
+        about = {
+            **common,
+            "published": version.reference,
+            "sha256": version.sha256,
+            "signals": list(manifest.signals),
+            "cross_validated": manifest.cross_validation.model_dump(mode="json"),
+            "intercept": manifest.intercept,
+            "coefficients": {term.column: term.coefficient for term in manifest.terms},
+            "columns": {
+                term.signal: term.definition.model_dump(mode="json")
+                if term.definition
+                else term.sql
+                for term in manifest.terms
+                if not term.logged
             },
-        )
+        }
+        predictor = Predictor.from_manifest(signals, manifest)
+        bank[version.reference] = partial(published_estimate, signals, predictor), about
         return bank
 
 
@@ -152,61 +132,51 @@ def train_models(warehouse: Warehouse, version: ModelVersion) -> TrainedModels:
 GROUP = "filters and observers"
 
 
-@dataclass(frozen=True)
-class Filter:
-    """A filter with its default parameters, and those to tune.
+class Filter(NamedTuple):
+    """A filter: its name among the estimators, and its module.
 
-    Attributes
-    ----------
-    name
-        Name among the estimators.
-    module
-        Module of the filter; filters of one module share tuned parameters.
-    gps
-        True if it needs satellite navigation.
-    informed
-        True if it uses the scenario's own load, tyres and road.
-    other_starts
-        Further starts of the search for parameters.
+    Filters of one module share tuned parameters. A module has the function `estimate`, parameters
+    to begin a search with, `STARTS`, of which the first are the default, and those to search,
+    `TUNABLE`.
     """
 
     name: str
-    module: str
-    estimate: Callable[[DriveSignals, VehicleParameters, Any], FloatArray]
-    parameters: Config
-    tunable: tuple[str, ...]
+    module: Any
     gps: bool = False
+    """True if it needs satellite navigation."""
     informed: bool = False
-    other_starts: tuple[Config, ...] = ()
+    """True if it uses the scenario's own load, tyres and road."""
+
+    @property
+    def module_name(self) -> str:
+        """Name of its module."""
+        return str(self.module.__name__).rpartition(".")[2]
+
+    @property
+    def default(self) -> Config:
+        """Default parameters."""
+        default: Config = self.module.STARTS[0]
+        return default
 
     def tune(
         self, drives: Sequence[LabelledDrive], car: VehicleParameters, executor: Executor
     ) -> TuningResult[Config]:
         """Return the best parameters over all starts."""
+        module = self.module
         return min(
             (
-                tune(self.estimate, start, self.tunable, drives, car, executor)
-                for start in (self.parameters, *self.other_starts)
+                tune(module.estimate, start, module.TUNABLE, drives, car, executor)
+                for start in module.STARTS
             ),
             key=lambda tuned: tuned.rmse_rad,
         )
 
 
-LOOSE_EKF = ekf.EkfNoise(
-    lateral_model_std_mps2=2.0, yaw_model_std_rad_s2=2.0, ay_bias_std_mps2=0.01
-)
-"""No bias and large errors of the model, as suits cars that differ from their class."""
-
 FILTERS = (
-    Filter("kalman", "kalman", kalman.estimate, kalman.FilterNoise(), kalman.TUNABLE, gps=True),
-    Filter(
-        "ekf_class", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, other_starts=(LOOSE_EKF,)
-    ),
-    Filter(
-        "ekf_informed", "ekf", ekf.estimate, ekf.EkfNoise(), ekf.TUNABLE, informed=True,
-        other_starts=(LOOSE_EKF,),
-    ),
-)  # fmt: skip
+    Filter("kalman", kalman, gps=True),
+    Filter("ekf_class", ekf),
+    Filter("ekf_informed", ekf, informed=True),
+)
 
 
 @dataclass(frozen=True)
@@ -232,11 +202,17 @@ class FilterEstimate:
         signals, car, parameters = drive_signals(drive), self.car(drive), self.parameters
         if self.filter.informed:
             parameters = parameters.model_copy(update={"adhesion": drive.scenario.adhesion})
-        angle_rad = self.filter.estimate(signals, car, parameters)
+        angle_rad: FloatArray = self.filter.module.estimate(signals, car, parameters)
         if not (reference_m := car.body.reference_m):
             return angle_rad
         speed_mps = np.maximum(measured_speed_mps(signals, car), 1.0)
         return angle_rad + reference_m * signals.yaw_rate_rad_s / speed_mps
+
+    def on_labelled(self, default_car: VehicleParameters, drive: LabelledDrive) -> FloatArray:
+        """Return the estimate of a drive of the logs, at each row."""
+        car = drive.car or default_car
+        angle_rad: FloatArray = self.filter.module.estimate(drive.signals, car, self.parameters)
+        return angle_rad
 
     def description(self) -> dict[str, Any]:
         """Return its description in a document."""
@@ -259,7 +235,7 @@ def drive_signals(drive: TestDrive) -> DriveSignals:
 def restore_filter(name: str, about: Mapping[str, Any]) -> FilterEstimate:
     """Restore a filter from its name among the estimators and its description in a document."""
     (kind,) = (kind for kind in FILTERS if kind.name == name.removesuffix("_tuned"))
-    parameters = type(kind.parameters).model_validate(about["parameters"])
+    parameters = type(kind.default).model_validate(about["parameters"])
     return FilterEstimate(kind, parameters, about.get("weighed", False))
 
 
@@ -273,15 +249,16 @@ def filter_bank(
     stored = drives.load_or_tune(car, executor)
     for failure in stored["failing"]:
         LOGGER.warning("%s", failure)
-    cars = {model: IdentifiedVehicle.load(content) for model, content in stored["cars"].items()}
     bank: EstimatorBank = {}
-    if cars:
-        identified = IdentifiedEstimate(cars)
-        bank[IDENTIFIED_NAME] = identified, identified.description()
+    if stored["cars"]:
+        cars = {name: IdentifiedVehicle.load(content) for name, content in stored["cars"].items()}
+        about = {"kind": "filter", "group": GROUP, "gps": False, "told": "labelled drives"}
+        about |= {"parameters": {name: car.dump() for name, car in cars.items()}}
+        bank[IDENTIFIED_NAME] = partial(identified_estimate, cars), about
     for kind in FILTERS:
-        default = FilterEstimate(kind, kind.parameters, drives.with_mass)
-        best = stored["parameters"].get(kind.module)
-        parameters = type(kind.parameters).model_validate(best) if best else kind.parameters
+        default = FilterEstimate(kind, kind.default, drives.with_mass)
+        best = stored["parameters"].get(kind.module_name)
+        parameters = type(kind.default).model_validate(best) if best else kind.default
         tuned = replace(default, parameters=parameters)
         tuned_on = {"tuned_on": drives.names if best else []}
         bank[kind.name] = default, default.description()
@@ -298,27 +275,10 @@ DRIVES_OF_A_CLASS = 12
 """Drives of each class of cars; a dozen give as good a car in half the time."""
 
 
-@dataclass(frozen=True)
-class IdentifiedEstimate:
-    """The filter in the identified car of a drive's class, or in the first identified car."""
-
-    cars: Mapping[str, IdentifiedVehicle]
-
-    def __call__(self, drive: TestDrive) -> FloatArray:
-        """Return the estimate at each tick."""
-        default = next(iter(self.cars.values()))
-        car = self.cars.get(drive.scenario.vehicle.name, default)
-        return car.estimate(drive_signals(drive))
-
-    def description(self) -> dict[str, Any]:
-        """Return its description in a document."""
-        return {
-            "kind": "filter",
-            "group": GROUP,
-            "gps": False,
-            "told": "labelled drives",
-            "parameters": {name: car.dump() for name, car in self.cars.items()},
-        }
+def identified_estimate(cars: Mapping[str, IdentifiedVehicle], drive: TestDrive) -> FloatArray:
+    """Return the filter's estimate in the identified car of a drive's class, or in the first."""
+    default = next(iter(cars.values()))
+    return cars.get(drive.scenario.vehicle.name, default).estimate(drive_signals(drive))
 
 
 def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
@@ -367,6 +327,18 @@ class TuningDrives:
         """The drives' names."""
         return [name for name, _, _ in self.keys]
 
+    @cached_property
+    def drives(self) -> tuple[LabelledDrive, ...]:
+        """The beginning of each drive, as filters meet it: with unknown biases."""
+        drives = read_drives(self.warehouse, self.names)
+        return tuple(
+            replace(
+                drive.beginning(TUNING_S * SAMPLE_RATE_HZ),
+                car=class_car(model, mass_kg, self.warehouse.configs),
+            )
+            for drive, (_, model, mass_kg) in zip(drives, self.keys, strict=True)
+        )
+
     def load_or_tune(self, car: VehicleParameters, executor: Executor) -> Mapping[str, Any]:
         """Return the parameters stored below `tuned/`, or tune and store them.
 
@@ -390,40 +362,31 @@ class TuningDrives:
         parameters: dict[str, Any] = {}
         failures: list[str] = []
         try:
-            cars = {model: identified.dump() for model, identified in self._identified(executor)}
+            cars = self._identified(executor)
         except DataError as error:
             failures.append(f"no car can be identified: {error}")
-        for kind in {kind.module: kind for kind in reversed(FILTERS)}.values():
+        for kind in {kind.module_name: kind for kind in reversed(FILTERS)}.values():
             try:
                 best = kind.tune(self.drives, car, executor)
-                parameters[kind.module] = best.parameters.model_dump(mode="json")
+                parameters[kind.module_name] = best.parameters.model_dump(mode="json")
             except DataError as error:
                 failures.append(f"{kind.name} left untuned: {error}")
         return {"cars": cars, "parameters": parameters, "failing": failures}
 
-    def _identified(self, executor: Executor) -> Iterator[tuple[str, IdentifiedVehicle]]:
+    def _identified(self, executor: Executor) -> dict[str, Any]:
         """Identify each class of cars that has a file. Raises `DataError` as `identify`."""
-        classes: dict[str, list[LabelledDrive]] = {}
-        for (_, model, _), drive in zip(self.keys, self.drives, strict=True):
-            if drive.car is not None:
-                classes.setdefault(model, []).append(replace(drive, car=None))
-        for model, drives in sorted(classes.items()):
-            chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
-            car = load_vehicle(model, self.warehouse.configs)
-            yield model, identify(VehicleMeasures.of_vehicle(car), chosen, executor)
-
-    @cached_property
-    def drives(self) -> tuple[LabelledDrive, ...]:
-        """The beginning of each drive, as filters meet it: with unknown biases."""
-        signals, configs = self.warehouse.catalog.signals, self.warehouse.configs
-        with open_views(self.warehouse, "SELECT 1 FROM log") as database:
-            return tuple(
-                replace(
-                    read_drive(signals, database, name).beginning(TUNING_S * SAMPLE_RATE_HZ),
-                    car=class_car(model, mass_kg, configs),
-                )
-                for name, model, mass_kg in self.keys
-            )
+        cars = {}
+        for model in sorted({model for _, model, _ in self.keys if model}):
+            drives = [
+                replace(drive, car=None)
+                for (_, drive_model, _), drive in zip(self.keys, self.drives, strict=True)
+                if drive_model == model and drive.car is not None
+            ]
+            if drives:
+                car = VehicleMeasures.of_vehicle(load_vehicle(model, self.warehouse.configs))
+                chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
+                cars[model] = identify(car, chosen, executor).dump()
+        return cars
 
 
 def class_car(model: str, mass_kg: float | None, configs: Configs) -> VehicleParameters | None:

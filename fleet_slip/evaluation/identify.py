@@ -21,12 +21,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.single_track import (
-    STEP_S,
-    DriveSignals,
-    LabelledDrive,
-    measured_speed_mps,
-)
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive
+from fleet_slip.evaluation.single_track import measured_speed_mps
 from fleet_slip.evaluation.tuning import (
     SUBSAMPLE,
     Coordinates,
@@ -173,6 +169,10 @@ class IdentifiedVehicle(Answer):
     def estimate(self, signals: DriveSignals) -> FloatArray:
         """Estimate side-slip in rad by the filter, shape (rows,)."""
         return ekf.estimate(signals, self.car, self.noise)
+
+    def estimate_drive(self, drive: LabelledDrive) -> FloatArray:
+        """Estimate side-slip of a drive in rad by the filter, shape (rows,)."""
+        return self.estimate(drive.signals)
 
     def dump(self) -> dict[str, Any]:
         """Return its document."""
@@ -383,7 +383,7 @@ def identify_held_out(
     for fold in range(min(FOLDS, len(drives))):
         training = [drive for number, drive in enumerate(drives) if number % FOLDS != fold]
         vehicle, held_out = identify(measures, training, executor), drives[fold::FOLDS]
-        estimates = executor.map(vehicle.estimate, [drive.signals for drive in held_out])
+        estimates = executor.map(vehicle.estimate_drive, held_out)
         errors += [e - drive.sideslip_rad for e, drive in zip(estimates, held_out, strict=True)]
     error = np.concatenate(errors)
     error = error[np.isfinite(error)]

@@ -12,13 +12,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.single_track import (
-    STEP_S,
-    DriveSignals,
-    hold_last,
-    sideslip_angle,
-    undriven_axle,
-)
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
+from fleet_slip.evaluation.single_track import sideslip_angle, undriven_axle
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 Row = tuple[Any, ...]
@@ -207,43 +202,26 @@ TUNABLE = (
     "bias_std_mps2",
     *YAW_RATE_TUNABLE,
 )
-"""The parameters of Q, R and the first P that `identify.tune` should search."""
+"""The parameters of Q, R and the first P to search."""
+
+STARTS = (FilterNoise(),)
+"""Default parameters, with which a search begins."""
 
 
-class Covariances(NamedTuple):
-    """The diagonals of Q and R, and of P at the first fix, as variances per step."""
+def variances(noise: FilterNoise) -> tuple[Row, Row, Row]:
+    """Return the diagonals of P at the first fix, of Q = B1 W B1ᵀ, and of R.
 
-    q_ux: float
-    q_uy: float
-    q_bias: float
-    r_ux: float
-    r_uy: float
-    bias: float
-
-
-def covariances(noise: FilterNoise) -> Covariances:
-    """Return Q = B1 W B1ᵀ, where B1 multiplies the acceleration noise by Δt, and R."""
-    return Covariances(
-        q_ux=(noise.ax_std_mps2 * STEP_S) ** 2,
-        q_uy=(noise.ay_std_mps2 * STEP_S) ** 2,
-        q_bias=noise.bias_walk_mps2_per_sqrt_s**2 * STEP_S,
-        r_ux=noise.gps_vx_std_mps**2,
-        r_uy=noise.gps_vy_std_mps**2,
-        bias=noise.bias_std_mps2**2,
-    )
+    B1 multiplies the noise of the accelerometers by Δt.
+    """
+    bias, q_bias = noise.bias_std_mps2**2, noise.bias_walk_mps2_per_sqrt_s**2 * STEP_S
+    q_ux, q_uy = (noise.ax_std_mps2 * STEP_S) ** 2, (noise.ay_std_mps2 * STEP_S) ** 2
+    r_ux, r_uy = noise.gps_vx_std_mps**2, noise.gps_vy_std_mps**2
+    return (r_ux, bias, r_uy, bias), (q_ux, q_bias, q_uy, q_bias), (r_ux, r_uy)
 
 
 @kernel
-def initial_state(gps_vx: float, gps_vy: float, c: Covariances) -> GaussianState:
-    """Return the state at the first fix: its velocity, and biases around zero."""
-    return independent_state((gps_vx, 0.0, gps_vy, 0.0), (c.r_ux, c.bias, c.r_uy, c.bias))
-
-
-@kernel
-def predict(
-    x: GaussianState, ax: float, ay: float, yaw_rate: float, dt: float, c: Covariances
-) -> None:
-    """Time update, equations (6), (7) and (9).
+def predict(x: GaussianState, ax: float, ay: float, yaw_rate: float, dt: float, q: Row) -> None:
+    """Time update, equations (6), (7) and (9); `q` is the diagonal of Q.
 
         | 1      −Δt  ψ̇Δt   0  |            | Δt  0 |
     F = | 0       1    0    0  |   B1, B2 = | 0   0 |   x ← F x + B2 u
@@ -255,14 +233,14 @@ def predict(
     x.mean[0] = ux + dt * (ax - bx) + turn * uy
     x.mean[2] = uy + dt * (ay - by) - turn * ux
     f = ((1.0, -dt, turn, 0.0), (0.0, 1.0, 0.0, 0.0), (-turn, 0.0, 1.0, -dt), (0.0, 0.0, 0.0, 1.0))
-    predict_covariance(x, f, (c.q_ux, c.q_bias, c.q_uy, c.q_bias))
+    predict_covariance(x, f, q)
 
 
 @kernel
-def update(x: GaussianState, gps_vx: float, gps_vy: float, c: Covariances) -> None:
+def update(x: GaussianState, gps_vx: float, gps_vy: float, r: Row) -> None:
     """Measurement update by the two velocities of a fix, equations (10) and (11)."""
-    measurement_update(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], c.r_ux)
-    measurement_update(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], c.r_uy)
+    measurement_update(x, (1.0, 0.0, 0.0, 0.0), gps_vx - x.mean[0], r[0])
+    measurement_update(x, (0.0, 0.0, 1.0, 0.0), gps_vy - x.mean[2], r[1])
 
 
 @kernel
@@ -273,16 +251,17 @@ def _filter(
     gps_vx: FloatArray,
     gps_vy: FloatArray,
     first_fix: int,
-    dt: float,
-    c: Covariances,
+    first_variances: Row,
+    q: Row,
+    r: Row,
 ) -> FloatArray:
     means = np.full((4, len(ax)), np.nan)
-    state = initial_state(gps_vx[first_fix], gps_vy[first_fix], c)
+    state = independent_state((gps_vx[first_fix], 0.0, gps_vy[first_fix], 0.0), first_variances)
     for k in range(first_fix, len(ax)):
         if k > first_fix:
-            predict(state, ax[k], ay[k], yaw_rate[k], dt, c)
+            predict(state, ax[k], ay[k], yaw_rate[k], STEP_S, q)
             if not np.isnan(gps_vx[k] + gps_vy[k]):
-                update(state, gps_vx[k], gps_vy[k], c)
+                update(state, gps_vx[k], gps_vy[k], r)
         means[:, k] = state.mean
     return means
 
@@ -306,8 +285,7 @@ def fuse(drive: DriveSignals, yaw_rate_rad_s: FloatArray, noise: FilterNoise) ->
         drive.gps_vx_mps,
         drive.gps_vy_mps,
         fixes[0],
-        STEP_S,
-        covariances(noise),
+        *variances(noise),
     )
 
 

@@ -4,20 +4,17 @@ Without the held-out segments, columns are chosen by each model's own recipe and
 tuned and a car is identified: neither a fit nor a choice saw the rows that an error is taken on.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version as package_version
-from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.evaluation.combined import combine, training_drives
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     MissingSignalError,
@@ -26,30 +23,25 @@ from fleet_slip.evaluation.evaluator import (
     pooled_statistics,
     variation_between_drives,
 )
-from fleet_slip.evaluation.filters import (
-    FILTERS,
-    TABLE_ONE,
-    class_car,
-)
+from fleet_slip.evaluation.filters import FILTERS, TABLE_ONE, FilterEstimate, class_car
 from fleet_slip.evaluation.held_out import (
-    QUARTERS,
-    HeldOutDrive,
     Learner,
-    Segments,
+    combine,
     folds_by_kind,
     folds_of,
-    predict_drive,
     read_measured_drives,
+    training_drives,
 )
 from fleet_slip.evaluation.identify import IDENTIFIED, IdentifiedVehicle, identify, vehicle_with_fit
 from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
-from fleet_slip.evaluation.single_track import (
+from fleet_slip.evaluation.labelled_drives import (
+    QUARTERS,
     STEP_S,
-    DriveSignals,
     LabelledDrive,
-    follow,
-    measured_speed_mps,
+    Segments,
+    predict_drive,
 )
+from fleet_slip.evaluation.single_track import follow, measured_speed_mps
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.ingest.mapping import NO_WHEEL_SPEEDS, ONE_SPEED
@@ -64,6 +56,8 @@ from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.storage.runs import LOGGER
 from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
+
+T = TypeVar("T")
 
 FITTED = "fitted without held-out rows"
 CHOSEN = "chosen and fitted without held-out rows"
@@ -97,7 +91,7 @@ def evaluate_measured(
     runs, excluded = on_common_rows(all_rows)
     coverage = {name: row.coverage for name, row in pooled_statistics(all_rows).items()}
     errors = pooled_statistics(runs)
-    competition.warn_of_missing(excluded, errors)
+    _warn_of_missing({**excluded, **competition.failures}, errors)
     by_kind = cross_fitted({fold: fitted[fold] for fold in kinds.values()})
     of_kinds = pooled_statistics(on_common_rows(evaluate(competition.drives, by_kind))[0])
     order = sorted(errors, key=lambda name: errors[name].rmse_deg or 0.0)
@@ -153,6 +147,18 @@ def evaluate_measured(
     }
 
 
+def _warn_of_missing(reasons: Mapping[str, str], evaluated: Mapping[str, object]) -> None:
+    """Warn of models without a fit for some segments, and of estimators without figures.
+
+    Estimators with the same reason share a line.
+    """
+    partial_fits = {name: reason for name, reason in reasons.items() if name in evaluated}
+    failed = {name: reason for name, reason in reasons.items() if name not in evaluated}
+    for extent, group in (("segments without a fit", partial_fits), ("not evaluated", failed)):
+        for names, reason in group_reasons(group):
+            LOGGER.warning("%s: %s: %s.", ", ".join(names), extent, reason.rstrip("."))
+
+
 class FittedEstimator(NamedTuple):
     """An estimator that was fitted without held-out segments.
 
@@ -160,18 +166,18 @@ class FittedEstimator(NamedTuple):
     """
 
     source: str
-    estimate: Estimator[HeldOutDrive]
+    estimate: Estimator[LabelledDrive]
     parameters: Any = None
 
 
 FittedFold = Mapping[str, FittedEstimator]
 
 
-def cross_fitted(fitted: Mapping[Segments, FittedFold]) -> dict[str, Estimator[HeldOutDrive]]:
+def cross_fitted(fitted: Mapping[Segments, FittedFold]) -> dict[str, Estimator[LabelledDrive]]:
     """Combine the folds: each estimates the segments that it was not fitted on."""
 
-    def estimate(name: str, drive: HeldOutDrive) -> FloatArray:
-        combined = np.full(len(drive.rows), np.nan)
+    def estimate(name: str, drive: LabelledDrive) -> FloatArray:
+        combined = np.full(len(drive.sideslip_rad), np.nan)
         for held_out, fold in fitted.items():
             rows = drive.rows_in(held_out)
             if name in fold and rows.any():
@@ -194,27 +200,31 @@ class Competition:
         Models that are evaluated as published.
     learners
         Models that are trained again; with their sources of knowledge in words.
+    combined
+        Learners that are combined with a filter.
     vehicle
         The car of a file, for filters.
-    measured
+    measures
         Measures of the car, to identify it by.
     cars
         Calibration parameters of each car, for calibrated columns.
-    combined
-        Learners that are combined with a filter.
+    priors
+        Simulated priors, by campaign and feature set.
+    failures
+        Reasons of estimators that could not be fitted.
     """
 
-    catalog: Catalog
-    drives: Sequence[HeldOutDrive]
+    warehouse: Warehouse
+    drives: Sequence[LabelledDrive]
     published: Mapping[str, Predictor]
     learners: Mapping[str, tuple[str, Learner]]
+    combined: frozenset[str]
     vehicle: VehicleParameters | None
-    measured: VehicleMeasures | None
+    measures: VehicleMeasures | None
     cars: CarCounts
     executor: Executor
-    combined: frozenset[str] = frozenset()
-    _priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
-    _failures: dict[str, str] = field(default_factory=dict)
+    priors: dict[tuple[str, str], Cohort] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def collect(
@@ -222,12 +232,16 @@ class Competition:
         warehouse: Warehouse,
         versions: Sequence[ModelVersion],
         predicate: str,
-        drives: Sequence[HeldOutDrive],
+        drives: Sequence[LabelledDrive],
         car: VehicleParameters | VehicleMeasures | None,
         executor: Executor,
     ) -> "Competition":
         """Collect Table I, the versions, and filters in the car if there is one."""
         catalog, registry = warehouse.catalog, Registry.open(warehouse)
+        vehicle = car if isinstance(car, VehicleParameters) else None
+        measures = VehicleMeasures.of_vehicle(car) if isinstance(car, VehicleParameters) else car
+        if measures is not None:
+            drives = [prepare_drive(drive, vehicle_with_fit(measures)) for drive in drives]
         recipes = {
             f"table1/{row.name}": (FITTED, SelectionRequest(model=",".join(row.signals)))
             for row in load_model_list(catalog, TABLE_ONE).model
@@ -251,111 +265,97 @@ class Competition:
             catalog.feature_set(learner.plan.feature_set).calibrated
             for _, learner in learners.values()
         )
-        vehicle = car if isinstance(car, VehicleParameters) else None
-        measured = VehicleMeasures.of_vehicle(car) if isinstance(car, VehicleParameters) else car
         cars = calibrated_cars(warehouse) if is_calibrated else {}
-        if measured is not None:
-            drives = [prepare_drive(drive, vehicle_with_fit(measured)) for drive in drives]
         combined = frozenset(v.reference for v in versions if v.manifest.combination)
         return cls(
-            catalog, drives, published, learners, vehicle, measured, cars, executor, combined
+            warehouse, drives, published, learners, combined, vehicle, measures, cars, executor
         )
 
     def fit(self, held_out: Segments) -> FittedFold:
         """Fit, tune and identify without the held-out segments."""
         drives = training_drives(self.drives, held_out)
-        identified = self._identify(drives)
-        published = {
+        fitted = {
             name: FittedEstimator("as published", partial(predict_drive, model, self.cars))
             for name, model in self.published.items()
         }
-        return {**published, **self._train(held_out, identified), **self._tune(drives, identified)}
-
-    def _identify(self, drives: Sequence[LabelledDrive]) -> IdentifiedVehicle | None:
-        """Identify the car; None without measures of it, or if the drives lack a signal."""
-        try:
-            return identify(self.measured, drives, self.executor) if self.measured else None
-        except DataError as error:
-            self._failures["ekf_identified"] = str(error)
-            return None
-
-    def _train(
-        self, held_out: Segments, identified: IdentifiedVehicle | None
-    ) -> dict[str, FittedEstimator]:
-        """Train the learners that can be trained."""
-        fitted = {}
+        identified = None
+        if measures := self.measures:
+            name = "ekf_identified"
+            identified = self._attempt(name, lambda: identify(measures, drives, self.executor))
         for name, (source, learner) in self.learners.items():
-            try:
-                columns, model = learner.train(held_out, self._prior(learner, identified))
-            except (DataError, QuestionError) as error:
-                self._failures[name] = str(error)
-            else:
-                estimate = partial(predict_drive, model, self.cars)
-                fitted[name] = FittedEstimator(source, estimate, columns)
-        for name in self.combined & fitted.keys():
-            if combined := self._combine(name, held_out, identified):
-                fitted |= {f"{name} line": fitted[name], name: combined}
-        return fitted
+            fitted |= self._learn(name, source, learner, held_out, identified)
+        return {**fitted, **self._tune(drives, identified)}
 
-    def _combine(
-        self, name: str, held_out: Segments, identified: IdentifiedVehicle | None
-    ) -> FittedEstimator | None:
-        """Combine a learner with a filter; None if the drives lack a signal of the filter."""
-        if self.measured is None or identified is None:
-            return None
-        source, learner = self.learners[name]
-        prior = self._prior(learner, identified)
+    def _attempt(self, name: str, fit: Callable[[], T]) -> T | None:
+        """Return what a function fits; None if it cannot, with the reason in `failures`."""
         try:
-            combined = combine(
+            return fit()
+        except (DataError, QuestionError) as error:
+            self.failures[name] = str(error)
+            return None
+
+    def _learn(
+        self,
+        name: str,
+        source: str,
+        learner: Learner,
+        held_out: Segments,
+        identified: IdentifiedVehicle | None,
+    ) -> dict[str, FittedEstimator]:
+        """Train a learner, and combine it with a filter if its version is."""
+        trained = self._attempt(
+            name, lambda: learner.train(held_out, self._prior(learner, identified))
+        )
+        if trained is None:
+            return {}
+        columns, model = trained
+        line = FittedEstimator(source, partial(predict_drive, model, self.cars), columns)
+        measures = self.measures
+        if name not in self.combined or measures is None or identified is None:
+            return {name: line}
+        combined = self._attempt(
+            name,
+            lambda: combine(
                 learner,
-                self.drives,
-                self.measured,
+                measures,
                 held_out,
                 self.executor,
                 cars=self.cars,
                 identified=identified,
-                prior=prior,
-            )
-        except (DataError, QuestionError) as error:
-            self._failures[name] = str(error)
-            return None
-        return FittedEstimator(f"{source}, with a filter", combined, asdict(combined.choice))
-
-    def warn_of_missing(self, excluded: Mapping[str, str], evaluated: Collection[str]) -> None:
-        """Warn of models without a fit for some segments, and of estimators without figures.
-
-        Estimators with the same reason share a line.
-        """
-        reasons = {**excluded, **self._failures}
-        partial_fits = {name: reason for name, reason in reasons.items() if name in evaluated}
-        failed = {name: reason for name, reason in reasons.items() if name not in evaluated}
-        for extent, group in (("segments without a fit", partial_fits), ("not evaluated", failed)):
-            for names, reason in group_reasons(group):
-                LOGGER.warning("%s: %s: %s.", ", ".join(names), extent, reason.rstrip("."))
+                prior=self._prior(learner, identified),
+            ),
+        )
+        if combined is None:
+            return {name: line}
+        source, choice = f"{source}, with a filter", asdict(combined.choice)
+        return {
+            f"{name} line": line,
+            name: FittedEstimator(source, combined.estimate, choice),
+        }
 
     def _prior(self, learner: Learner, identified: IdentifiedVehicle | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""
         name, feature_set = learner.plan.request.prior, learner.plan.feature_set
         if name is None:
             return None
-        campaign = load_campaign(name, self.catalog.configs)
-        if self.measured and identified_prior(campaign):
+        campaign = load_campaign(name, self.warehouse.configs)
+        if self.measures and identified_prior(campaign):
             if identified is None:
                 raise DataError("the car of the prior cannot be identified without these drives.")
             plan = campaign.plan.model_copy(update={"vehicles": (identified.car,)})
             campaign = campaign.model_copy(update={"plan": plan})
-        key = campaign.digest, feature_set
-        if key not in self._priors:
-            self._priors[key] = simulate_prior(self.catalog, campaign, feature_set, self.executor)
-        return self._priors[key]
+        key, catalog = (campaign.digest, feature_set), self.warehouse.catalog
+        if key not in self.priors:
+            self.priors[key] = simulate_prior(catalog, campaign, feature_set, self.executor)
+        return self.priors[key]
 
     def _tune(
         self, drives: Sequence[LabelledDrive], identified: IdentifiedVehicle | None
     ) -> dict[str, FittedEstimator]:
         """Tune filters in the car of the file and in the identified car."""
-        if self.measured is None:
+        if self.measures is None:
             return {}
-        rolling = on_signals(rolling_sideslip, vehicle_with_fit(self.measured))
+        rolling = partial(rolling_sideslip, vehicle_with_fit(self.measures))
         fitted = {"kinematic": FittedEstimator("geometry", rolling)}
         cars: dict[str, tuple[str, VehicleParameters]] = {}
         if self.vehicle and (identified is None or self.vehicle.description != IDENTIFIED):
@@ -364,23 +364,20 @@ class Competition:
             cars["identified"] = ("the identified car", identified.car)
             fitted["ekf_identified"] = FittedEstimator(
                 "geometry, and a car identified from the other folds",
-                on_signals(identified.estimate),
+                identified.estimate_drive,
                 identified.as_dict()["found"],
             )
         has_gps = any(np.isfinite(drive.signals.gps_vx_mps).any() for drive in drives)
-        kinds = [kind for kind in FILTERS if not kind.informed and (has_gps or not kind.gps)]
-        for kind, (suffix, (source, car)) in product(kinds, cars.items()):
-            name = f"{kind.module}_{suffix}"
-            if name in fitted:
-                continue
-            try:
-                tuned = kind.tune(drives, car, self.executor).parameters
-            except DataError as error:
-                self._failures[name] = str(error)
-            else:
-                estimate = on_signals(kind.estimate, car, tuned)
-                content = tuned.model_dump(mode="json")
-                fitted[name] = FittedEstimator(f"{source}, tuned on labels", estimate, content)
+        for kind in FILTERS:
+            for suffix, (source, car) in cars.items():
+                name = f"{kind.module_name}_{suffix}"
+                if name not in fitted and not kind.informed and (has_gps or not kind.gps):
+                    tune = partial(kind.tune, drives, car, self.executor)
+                    if tuned := self._attempt(name, tune):
+                        estimate = partial(FilterEstimate(kind, tuned.parameters).on_labelled, car)
+                        content = tuned.parameters.model_dump(mode="json")
+                        told = f"{source}, tuned on labels"
+                        fitted[name] = FittedEstimator(told, estimate, content)
         return fitted
 
 
@@ -396,16 +393,11 @@ def identified_prior(campaign: Campaign | None) -> VehicleParameters | None:
     return cars[0] if len(cars) == 1 and cars[0].description == IDENTIFIED else None
 
 
-def on_signals(estimate: Callable[..., FloatArray], *parameters: object) -> Estimator[HeldOutDrive]:
-    """Return the estimator that applies a function of signals to a drive."""
-    return lambda drive: estimate(drive.signals, *parameters)
-
-
-def rolling_sideslip(signals: DriveSignals, vehicle: VehicleParameters) -> FloatArray:
+def rolling_sideslip(vehicle: VehicleParameters, drive: LabelledDrive) -> FloatArray:
     """Return side-slip in rad of rear wheels that roll without slip, arctan(b r / vx)."""
-    yaw_rate_rad_s, _ = estimate_yaw_rate(signals, vehicle, YawRateNoise())
+    yaw_rate_rad_s, _ = estimate_yaw_rate(drive.signals, vehicle, YawRateNoise())
     lateral_mps = vehicle.body.rear_axle_m * yaw_rate_rad_s
-    angle_rad: FloatArray = np.arctan2(lateral_mps, measured_speed_mps(signals, vehicle))
+    angle_rad: FloatArray = np.arctan2(lateral_mps, measured_speed_mps(drive.signals, vehicle))
     return angle_rad
 
 
@@ -413,7 +405,7 @@ WHEELS_LAG = 0.1
 """Share of a new sample in the acceleration from wheel speeds."""
 
 
-def prepare_drive(drive: HeldOutDrive, car: VehicleParameters) -> HeldOutDrive:
+def prepare_drive(drive: LabelledDrive, car: VehicleParameters) -> LabelledDrive:
     """Derive ax from wheel speeds where it is not logged."""
     if np.isfinite(drive.signals.ax_mps2).any():
         return drive

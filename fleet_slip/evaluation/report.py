@@ -3,13 +3,14 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import CLAIMS, PAPER_TABLE_TWO, Status, evaluate_claim
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
-from fleet_slip.evaluation.filters import LinearEstimate, restore_filter, train_models
+from fleet_slip.evaluation.filters import linear_estimate, restore_filter, train_models
 from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData, latest_evaluation
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
@@ -52,7 +53,7 @@ def _drawn_estimators(data: ReportData) -> dict[str, Estimator[TestDrive]]:
     """Restore the estimators that figures show from their descriptions in the evaluation."""
     about = data.estimators
     models = {
-        name: LinearEstimate(about[name]["intercept"], about[name]["coefficients"])
+        name: partial(linear_estimate, about[name]["intercept"], about[name]["coefficients"])
         for name in data.models.values()
     }
     filters = {name: restore_filter(name, about[name]) for name in DRAWN_FILTERS if name in about}

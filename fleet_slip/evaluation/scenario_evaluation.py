@@ -2,15 +2,14 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version as package_version
 from typing import Any
 
 import numpy as np
 
-from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.evaluation.combined import lateral_mps2
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     EvaluatedDrive,
@@ -23,26 +22,24 @@ from fleet_slip.evaluation.filters import (
     FilterEstimate,
     TrainedModels,
     TuningDrives,
-    drive_signals,
     filter_bank,
     train_models,
 )
-from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.evaluation.held_out import combined_estimate, pair_estimates
+from fleet_slip.evaluation.labelled_drives import predict_drive
 from fleet_slip.evaluation.test_drives import (
     TestDrive,
     blind_scenarios,
     find_stretches,
     simulate_drives,
 )
-from fleet_slip.grams.drive_sums import counts_of
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import calibrated_cars
-from fleet_slip.regression.combination import EstimateCombination, PairedEstimates, fit_combination
+from fleet_slip.regression.combination import PairedEstimates, fit_combination
 from fleet_slip.simulation.scenario import Failure, Scenario, load_scenario
 from fleet_slip.simulation.sensors import GPS_SIGNALS, Gps
 from fleet_slip.vehicle.parameters import VehicleParameters
-from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
@@ -57,13 +54,12 @@ def train_competitors(
     bank: EstimatorBank = {}
     for models in trained:
         bank |= models.bank()
-    with_mass = (
-        "mass_kg" in Predictor.from_manifest(warehouse.catalog.signals, one_car.manifest).plan.facts
-    )
+    predictor = Predictor.from_manifest(warehouse.catalog.signals, one_car.manifest)
+    with_mass = "mass_kg" in predictor.plan.facts
     drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     car = load_scenario("nominal", warehouse.configs).car
     bank |= filter_bank(drives, car, executor)
-    return trained, bank | combination_bank(drives, car, one_car, bank)
+    return trained, bank | combination_bank(drives, car, one_car, predictor, bank)
 
 
 # Line and filter together, where the paper has its Kalman filter: without and with satellite
@@ -73,25 +69,12 @@ COMBINATIONS = {"combination": "ekf_class_tuned", "combination_gps": "kalman_tun
 """Filter of each combination with the evaluated model."""
 
 
-@dataclass(frozen=True)
-class CombinedTestEstimate:
-    """A published model and a filter, combined."""
-
-    line: Estimator[TestDrive]
-    filter: Estimator[TestDrive]
-    combination: EstimateCombination
-
-    def __call__(self, drive: TestDrive) -> FloatArray:
-        """Return the estimate at each tick; the line's where the filter has none."""
-        line, signals = self.line(drive), drive_signals(drive)
-        filtered = self.filter(drive)
-        lateral = lateral_mps2(LabelledDrive(drive.name, signals, line))
-        combined = self.combination(line, filtered, lateral)
-        return np.where(np.isnan(filtered), line, combined)
-
-
 def combination_bank(
-    drives: TuningDrives, car: VehicleParameters, version: ModelVersion, bank: EstimatorBank
+    drives: TuningDrives,
+    default_car: VehicleParameters,
+    version: ModelVersion,
+    predictor: Predictor,
+    bank: EstimatorBank,
 ) -> EstimatorBank:
     """Return the combinations of a model with filters that could be tuned, anchored at the model.
 
@@ -99,18 +82,24 @@ def combination_bank(
     accurate than the model of a fleet; so the combination adds to the model a bounded share of the
     difference.
     """
+    cars = calibrated_cars(drives.warehouse) if predictor.plan.numbers else {}
     combined: EstimatorBank = {}
     for name, filter_name in COMBINATIONS.items():
         filtered, about = bank[filter_name]
         if not isinstance(filtered, FilterEstimate) or not about["tuned_on"]:
             continue
-        pairs = _paired_estimates(drives, car, version, filtered)
-        if not len(pairs):
+        in_class_car = partial(filtered.on_labelled, default_car)
+        line = partial(predict_drive, predictor, cars)
+        pairs = [
+            pair_estimates(drive, line, in_class_car, drive.evaluated, number)
+            for number, drive in enumerate(drives.drives)
+        ]
+        if not any(map(len, pairs)):
             continue
-        combination = fit_combination(pairs, "line_by_lateral")
-        line, _ = bank[version.reference]
+        combination = fit_combination(PairedEstimates.concatenate(pairs), "line_by_lateral")
+        both = bank[version.reference][0], filtered
         combined[name] = (
-            CombinedTestEstimate(line, filtered, combination),
+            partial(combined_estimate, combination, *both),
             {
                 "kind": "combination",
                 "group": GROUP,
@@ -122,28 +111,6 @@ def combination_bank(
             },
         )
     return combined
-
-
-def _paired_estimates(
-    drives: TuningDrives, car: VehicleParameters, version: ModelVersion, filtered: FilterEstimate
-) -> PairedEstimates:
-    """Return the estimates of a model and a filter on the tuning drives, each drive a group."""
-    predictor = Predictor.from_manifest(version.catalog.signals, version.manifest)
-    warehouse = drives.warehouse
-    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
-    query = "SELECT * FROM log_counts WHERE drive_id = $drive ORDER BY tick LIMIT $rows"
-    parts = []
-    with open_views(warehouse, "SELECT 1 FROM log_counts") as database:
-        for number, drive in enumerate(drives.drives):
-            params = {"drive": drive.drive_id, "rows": len(drive.signals)}
-            rows = database.sql(query, params=params).to_arrow_table()
-            numbers = cars.get(rows["vehicle_id"][0].as_py())
-            line = predictor(counts_of(rows, predictor.plan, None, numbers))
-            angle = filtered.filter.estimate(drive.signals, drive.car or car, filtered.parameters)
-            group = np.full(len(line), float(number))
-            pair = PairedEstimates(line, angle, drive.sideslip_rad, lateral_mps2(drive), group)
-            parts.append(pair.where(np.isfinite(line + angle + drive.sideslip_rad)))
-    return PairedEstimates.concatenate(parts)
 
 
 def evaluate_scenarios(
@@ -196,12 +163,10 @@ def evaluate_blind(
 
 def _scenario_document(run: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
     drive, scenario = run.drive, run.drive.scenario
-    inside = {section.name: run.within(section.rows) for section in drive.sections}
-    outside = {section.name: run.within(~section.rows) for section in drive.sections}
-
-    def errors(name: str, part: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
-        return asdict(part.statistics[name])
-
+    sides = {
+        "inside": {section.name: run.within(section.rows) for section in drive.sections},
+        "outside": {section.name: run.within(~section.rows) for section in drive.sections},
+    }
     return {
         "name": scenario.name,
         "description": scenario.description,
@@ -224,18 +189,23 @@ def _scenario_document(run: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
         ],
         "results": {
             name: {
-                **errors(name, run),
-                "inside": {section: errors(name, part) for section, part in inside.items()},
-                "outside": {section: errors(name, part) for section, part in outside.items()},
+                **asdict(run.statistics[name]),
+                **{side: _section_errors(parts, name) for side, parts in sides.items()},
             }
             for name in run.estimates
         },
     }
 
 
+def _section_errors(
+    sections: Mapping[str, EvaluatedDrive[TestDrive]], estimator: str
+) -> dict[str, Any]:
+    return {name: asdict(part.statistics[estimator]) for name, part in sections.items()}
+
+
 def _truth_document(drive: TestDrive) -> dict[str, Any]:
     sideslip_deg = np.degrees(drive.sideslip_rad[drive.evaluated])
-    ay = drive.signals["ay_mps2"] - drive.scenario.sensors.ay_bias_mps2
+    ay = drive.ay_mps2 - drive.scenario.sensors.ay_bias_mps2
     return {
         "rows": len(drive.time_s),
         "duration_s": len(drive.time_s) / 100,
@@ -283,6 +253,9 @@ def _group_document(name: str, runs: Sequence[EvaluatedDrive[TestDrive]]) -> dic
 MIN_COVERAGE = 0.99
 """Share of a drive's rows with an estimate below which an estimator does not compete."""
 
+NO_GPS = Gps(rate_hz=1, velocity_std_mps=0.0, time_between_outages_s=1.0, outage_duration_s=1.0)
+"""Satellite navigation of all drives, where it does not matter."""
+
 CLOSE = 1.25
 """Ratio to the winner's RMSE up to which a lost drive counts as close."""
 
@@ -295,14 +268,13 @@ def rank(
     Returns the section of a document. Drives that differ in satellite navigation alone count once:
     `same_as` names the first.
     """
-    standings = [
-        {
-            "scenario": run.name,
-            **_standing(run, estimator, excluded),
-            "same_as": _same_as(run.drive.scenario, runs[:number]),
-        }
-        for number, run in enumerate(runs)
-    ]
+    first: dict[Any, str] = {}
+    standings = []
+    for run in runs:
+        key = _without_gps(run.drive.scenario)
+        standing = {"scenario": run.name, **_standing(run, estimator, excluded)}
+        standings.append({**standing, "same_as": first.get(key)})
+        first.setdefault(key, run.name)
     counted = [standing for standing in standings if standing["same_as"] is None]
     lost = [row["ratio"] for row in counted if row["ratio"] is not None and not row["won"]]
     return {
@@ -314,6 +286,14 @@ def rank(
         "close": sum(ratio <= CLOSE for ratio in lost),
         "standings": standings,
     }
+
+
+def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
+    """Return what of a scenario matters to an estimator without satellite navigation."""
+    sensors = scenario.sensors.model_copy(update={"gps": NO_GPS})
+    drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
+    failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
+    return drive.digest, failures
 
 
 def _standing(
@@ -337,21 +317,6 @@ def _standing(
         "won": winner == estimator,
         "ratio": rmse_deg / winner_deg if rmse_deg is not None and winner_deg else None,
     }
-
-
-def _same_as(scenario: Scenario, runs: Sequence[EvaluatedDrive[TestDrive]]) -> str | None:
-    """Return the first of some drives that is the same to an estimator without GPS."""
-    gps = scenario.sensors.gps
-    key = _with_gps(gps, scenario)
-    return next((run.name for run in runs if _with_gps(gps, run.drive.scenario) == key), None)
-
-
-def _with_gps(gps: Gps, scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
-    """Return what of a scenario matters to an estimator without GPS, all with the same GPS."""
-    sensors = scenario.sensors.model_copy(update={"gps": gps})
-    drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
-    failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
-    return drive.digest, failures
 
 
 def compare_models(

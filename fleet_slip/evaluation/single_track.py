@@ -6,113 +6,20 @@ and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics" (2012), s
 4.E25).
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import NamedTuple, cast
 
-import duckdb
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.compiling import kernel
-from fleet_slip.errors import QuestionError
-from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.quality.drive_signals import SPEEDS, is_slow
-from fleet_slip.vehicle.parameters import VehicleParameters, constants
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
+from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants
 from fleet_slip.vehicle.tyre import cornering_stiffness
-from fleet_slip.warehouse.database import reading_files
 
-# Signals of a drive in SI units at 100 Hz, and speeds of its wheels.
-#
 # Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
 # reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque
 # rolls with the least slip.
-
-STEP_S = float(SAMPLE_TIME_S)
-"""Time Δt between two rows."""
-
-
-@dataclass(frozen=True)
-class DriveSignals:
-    """One drive in float64, axes as in docs/conventions.md; NaN where nothing was measured."""
-
-    ax_mps2: FloatArray
-    ay_mps2: FloatArray
-    yaw_rate_rad_s: FloatArray
-    wheel_fl_rad_s: FloatArray
-    wheel_fr_rad_s: FloatArray
-    wheel_rl_rad_s: FloatArray
-    wheel_rr_rad_s: FloatArray
-    steer_fl_rad: FloatArray
-    steer_fr_rad: FloatArray
-    gps_vx_mps: FloatArray
-    gps_vy_mps: FloatArray
-    steering_wheel_rad: FloatArray
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return len(self.ax_mps2)
-
-    @property
-    def has_road_wheels(self) -> bool:
-        """True if the angle of a front wheel is logged."""
-        return bool(np.isfinite([self.steer_fl_rad, self.steer_fr_rad]).any())
-
-
-@dataclass(frozen=True)
-class LabelledDrive:
-    """A drive with its true side-slip angle, for evaluation and tuning."""
-
-    drive_id: str
-    signals: DriveSignals
-    sideslip_rad: FloatArray
-    car: VehicleParameters | None = None
-    """The car of this drive, as filters assume it; None for the car of all drives."""
-
-    def beginning(self, rows: int) -> "LabelledDrive":
-        """Return the first rows."""
-        arrays = {name: values[:rows] for name, values in vars(self.signals).items()}
-        return replace(self, signals=DriveSignals(**arrays), sideslip_rad=self.sideslip_rad[:rows])
-
-
-def read_drive(
-    signals: SignalCatalog, database: duckdb.DuckDBPyConnection, drive_id: str
-) -> LabelledDrive:
-    """Read a drive from the view `log`, without labels where the car `is_slow`.
-
-    Raises `QuestionError` if there is no such drive.
-    """
-    label = signals[signals.label].column
-    speeds = {name: signals[name].column for name in SPEEDS if name in signals.signals}
-    read = [field.name for field in fields(DriveSignals)]
-    columns = list(dict.fromkeys([*read, label, *speeds.values()]))
-    with reading_files(database, f"reading the drive {drive_id!r}"):
-        rows = database.execute(
-            f"SELECT {', '.join(columns)} FROM log WHERE drive_id = $drive_id ORDER BY time_s",
-            {"drive_id": drive_id},
-        ).fetchnumpy()
-    if not len(rows[label]):
-        raise QuestionError(f"no drive is called {drive_id!r}. The view drives lists them.")
-    arrays = {name: np.ma.filled(rows[name].astype(np.float64), np.nan) for name in columns}
-    slow = is_slow({name: arrays[column] for name, column in speeds.items()})
-    sideslip_rad = np.where(slow, np.nan, arrays[label])
-    return LabelledDrive(
-        drive_id, DriveSignals(**{name: arrays[name] for name in read}), sideslip_rad
-    )
-
-
-def hold_last(values: FloatArray, name: str) -> FloatArray:
-    """Fill the gaps of a signal by the last value. Raises `MissingSignalError` without any."""
-    valid = np.isfinite(values)
-    if valid.all():
-        return values
-    if not valid.any():
-        raise MissingSignalError(
-            f"the drive has no {name}, which this estimator needs. Choose drives that have it, or "
-            "another estimator."
-        )
-    latest = np.maximum.accumulate(np.where(valid, np.arange(len(values)), valid.argmax()))
-    return values[latest]
 
 
 @dataclass(frozen=True)
@@ -295,15 +202,6 @@ def lateral_force(
     return LateralForce(cosine * force, per_vx, per_side, lever * per_side)
 
 
-class Chassis(NamedTuple):
-    """Mass, yaw inertia and the axles' distances from the centre of gravity."""
-
-    mass_kg: float
-    yaw_inertia_kgm2: float
-    front_m: float
-    rear_m: float
-
-
 class Rates(NamedTuple):
     """Lateral acceleration and yaw acceleration, with their derivatives."""
 
@@ -318,17 +216,17 @@ class Rates(NamedTuple):
 
 
 @kernel
-def rates(vx: float, vy: float, r: float, steer: float, axles: Axles, c: Chassis) -> Rates:
+def rates(vx: float, vy: float, r: float, steer: float, axles: Axles, c: Constants) -> Rates:
     """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
-    f = lateral_force(vx, vy, r, steer, c.front_m, axles.stiffness_front_n, axles.grip_front_n)
-    b = lateral_force(vx, vy, r, 0.0, -c.rear_m, axles.stiffness_rear_n, axles.grip_rear_n)
+    f = lateral_force(vx, vy, r, steer, c.front, axles.stiffness_front_n, axles.grip_front_n)
+    b = lateral_force(vx, vy, r, 0.0, -c.rear, axles.stiffness_rear_n, axles.grip_rear_n)
     return Rates(
-        (f.force + b.force) / c.mass_kg,
-        (f.per_vx + b.per_vx) / c.mass_kg,
-        (f.per_vy + b.per_vy) / c.mass_kg,
-        (f.per_r + b.per_r) / c.mass_kg,
-        (c.front_m * f.force - c.rear_m * b.force) / c.yaw_inertia_kgm2,
-        (c.front_m * f.per_vx - c.rear_m * b.per_vx) / c.yaw_inertia_kgm2,
-        (c.front_m * f.per_vy - c.rear_m * b.per_vy) / c.yaw_inertia_kgm2,
-        (c.front_m * f.per_r - c.rear_m * b.per_r) / c.yaw_inertia_kgm2,
+        (f.force + b.force) / c.mass,
+        (f.per_vx + b.per_vx) / c.mass,
+        (f.per_vy + b.per_vy) / c.mass,
+        (f.per_r + b.per_r) / c.mass,
+        (c.front * f.force - c.rear * b.force) / c.yaw_inertia,
+        (c.front * f.per_vx - c.rear * b.per_vx) / c.yaw_inertia,
+        (c.front * f.per_vy - c.rear * b.per_vy) / c.yaw_inertia,
+        (c.front * f.per_r - c.rear * b.per_r) / c.yaw_inertia,
     )

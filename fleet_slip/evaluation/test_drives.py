@@ -81,6 +81,11 @@ class TestDrive:
         scenario = self.scenario
         return {"vehicle_model": scenario.vehicle.name, "mass_kg": scenario.car.body.sprung_mass_kg}
 
+    @property
+    def ay_mps2(self) -> FloatArray:
+        """Lateral acceleration as the car measures it."""
+        return self.signals["ay_mps2"]
+
     @cached_property
     def sideslip_rad(self) -> FloatArray:
         """True side-slip angle arctan(vy / vx)."""

@@ -12,7 +12,7 @@ import numpy as np
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
-from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 P = TypeVar("P", bound=Config)

@@ -22,7 +22,7 @@ from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
     vehicle_with_fit,
 )
-from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.evaluation.tuning import Coordinates
 from fleet_slip.export.c import count_costs
 from fleet_slip.export.files import export_files, program_content, with_states

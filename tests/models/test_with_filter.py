@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.evaluation import combined, measured_evaluation
+from fleet_slip.evaluation import held_out as held_out_module
+from fleet_slip.evaluation import measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
-from fleet_slip.evaluation.held_out import QUARTERS, Segments
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
-from fleet_slip.evaluation.single_track import LabelledDrive
+from fleet_slip.evaluation.labelled_drives import QUARTERS, LabelledDrive, Segments
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations
 from fleet_slip.models.manifest import LINE_ALONE
@@ -50,7 +50,7 @@ def usual_car(
 
 @pytest.fixture
 def car(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(combined, "identify", usual_car)
+    monkeypatch.setattr(held_out_module, "identify", usual_car)
     monkeypatch.setattr(measured_evaluation, "identify", usual_car)
     file = tmp_path / "car.toml"
     file.write_text(CAR)
@@ -131,12 +131,12 @@ def test_inner_groups_never_contain_what_is_held_out() -> None:
 
     drives = [Drive(f"drive {number}") for number in range(6)]
     held_out: Segments = frozenset(("drive 0", quarter) for quarter in range(QUARTERS))
-    groups, kinds = combined.inner_groups(drives, held_out)  # type: ignore[arg-type]
+    groups, kinds = held_out_module.inner_groups(drives, held_out)  # type: ignore[arg-type]
     assert kinds == [], "all are of one kind"
-    assert len(groups) == combined.MAX_GROUPS
+    assert len(groups) == held_out_module.MAX_GROUPS
     assert not any(group & held_out for group in groups)
     assert len(frozenset().union(*groups)) == 5 * QUARTERS
-    quarters, _ = combined.inner_groups(drives[:1], frozenset([("drive 0", 3)]))  # type: ignore[arg-type]
+    quarters, _ = held_out_module.inner_groups(drives[:1], frozenset([("drive 0", 3)]))  # type: ignore[arg-type]
     assert quarters == [frozenset([("drive 0", quarter)]) for quarter in range(3)]
 
 
@@ -148,17 +148,17 @@ def test_every_estimate_of_a_group_comes_from_fits_without_it(
     def record(
         measures: VehicleMeasures, drives: Sequence[LabelledDrive], executor: Executor, **_: object
     ) -> IdentifiedVehicle:
-        trained.append({drive.drive_id for drive in drives})
+        trained.append({drive.name for drive in drives})
         return usual_car(measures, drives)
 
     pairs: list[PairedEstimates] = []
-    monkeypatch.setattr(combined, "identify", record)
+    monkeypatch.setattr(held_out_module, "identify", record)
 
     def choose(found: PairedEstimates, kinds: PairedEstimates | None) -> CombinationChoice:
         pairs.append(found)
         return choose_combination(found, kinds)
 
-    monkeypatch.setattr(combined, "choose_combination", choose)
+    monkeypatch.setattr(held_out_module, "choose_combination", choose)
     done_on(smoke_copy, "publish", "both", "--models", "table1", "--with-filter", car, "--force")
     whole, *inner = trained
     assert len(inner) >= len(pairs[0].groups) > 1

@@ -21,12 +21,12 @@ from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
 from fleet_slip.evaluation.filters import (
     FILTERS,
     FilterEstimate,
-    PublishedEstimate,
     checksum_of_sources,
     class_car,
+    published_estimate,
 )
+from fleet_slip.evaluation.labelled_drives import read_drive
 from fleet_slip.evaluation.scenario_evaluation import rank
-from fleet_slip.evaluation.single_track import read_drive
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visible_signals
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
@@ -186,7 +186,7 @@ def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives(SIGNALS, [load_scenario("nominal", SHIPPED_CONFIGS)])
     assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
     manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
-    estimate = PublishedEstimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest))(drive)
+    estimate = published_estimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest), drive)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
 
 
@@ -216,7 +216,7 @@ def test_filters_use_the_mass_if_the_model_does() -> None:
     scenario = drive.scenario.model_copy(update={"sprung_mass_kg": 1500.0})
     heavy = replace(drive, scenario=scenario)
     for weighed, kg in ((False, drive.scenario.vehicle.body.sprung_mass_kg), (True, 1500.0)):
-        estimate = FilterEstimate(FILTERS[1], FILTERS[1].parameters, weighed)
+        estimate = FilterEstimate(FILTERS[1], FILTERS[1].default, weighed)
         assert estimate.car(heavy).body.sprung_mass_kg == kg
     assert class_car("suv", 2000.0, SHIPPED_CONFIGS) == load_vehicle(
         "suv", SHIPPED_CONFIGS
@@ -230,7 +230,7 @@ def test_a_filter_gives_the_same_estimates_here_as_by_itself(root: Path) -> None
     with connect(root, query="SELECT source FROM log") as database:
         alone = read_drive(SIGNALS, database, scenario.drive_id)
     expected = kalman.estimate(alone.signals, scenario.car, kalman.FilterNoise())
-    found = FilterEstimate(FILTERS[0], FILTERS[0].parameters)(drive)
+    found = FilterEstimate(FILTERS[0], FILTERS[0].default)(drive)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 

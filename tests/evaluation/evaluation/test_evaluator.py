@@ -15,9 +15,9 @@ from fleet_slip.evaluation.evaluator import (
     pooled_statistics,
     variation_between_drives,
 )
-from fleet_slip.evaluation.held_out import HeldOutDrive, Segments, folds_of
+from fleet_slip.evaluation.held_out import folds_of
+from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import FittedEstimator, cross_fitted
-from fleet_slip.evaluation.single_track import DriveSignals
 
 ROWS = 100
 
@@ -94,17 +94,17 @@ def test_the_standard_error_is_that_of_a_ratio_over_drives() -> None:
     assert variation_between_drives(runs[:1], "any")["rmse_standard_error_deg"] is None
 
 
-def measured(name: str) -> HeldOutDrive:
+def measured(name: str) -> LabelledDrive:
     signals = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
     rows = pa.table({"tick": np.arange(ROWS)})
-    return HeldOutDrive(name, signals, np.zeros(ROWS), rows=rows, trip=name)
+    return LabelledDrive(name, signals, np.zeros(ROWS), rows=rows, trip=name)
 
 
 def returning(value: float) -> FittedEstimator:
     return FittedEstimator("", lambda drive: np.full(len(drive.rows), value))
 
 
-def by_fold(folds: list[Segments], drive: HeldOutDrive) -> list[float]:
+def by_fold(folds: list[Segments], drive: LabelledDrive) -> list[float]:
     """Return the number of the fold that estimates each quarter of a drive."""
     fitted = {fold: {"any": returning(number)} for number, fold in enumerate(folds)}
     estimate = cross_fitted(fitted)["any"](drive)

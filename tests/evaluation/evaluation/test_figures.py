@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import error_statistics
-from fleet_slip.evaluation.filters import LinearEstimate
+from fleet_slip.evaluation.filters import linear_estimate
 from fleet_slip.evaluation.test_drives import TestDrive, apply_failure, join, peak_slip
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Failure, load_scenario
@@ -48,11 +48,11 @@ def test_an_estimator_without_any_estimate_has_no_statistics() -> None:
 
 
 def test_a_null_signal_leaves_no_estimate() -> None:
-    model = LinearEstimate(0.5, {"ay_mps2": 2.0, "yaw_rate_rad_s": -1.0})
+    coefficients = {"ay_mps2": 2.0, "yaw_rate_rad_s": -1.0}
     signals = {"ay_mps2": np.array([1.0, np.nan]), "yaw_rate_rad_s": np.array([3.0, 3.0])}
     zero, scenario = np.zeros(2), load_scenario("nominal", SHIPPED_CONFIGS)
     drive = TestDrive(scenario, zero, signals, zero, zero, zero, zero, None)
-    np.testing.assert_array_equal(model(drive), [-0.5, np.nan])
+    np.testing.assert_array_equal(linear_estimate(0.5, coefficients, drive), [-0.5, np.nan])
 
 
 def test_a_stuck_signal_keeps_its_value_and_a_missing_one_has_none() -> None:

@@ -11,17 +11,10 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, filters, measured_evaluation
-from fleet_slip.evaluation.held_out import (
-    HeldOutDrive,
-    Learner,
-    Segments,
-    folds_by_kind,
-    folds_of,
-    read_measured_drives,
-)
+from fleet_slip.evaluation.held_out import Learner, folds_by_kind, folds_of, read_measured_drives
 from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
+from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import prepare_drive
-from fleet_slip.evaluation.single_track import DriveSignals
 from fleet_slip.evaluation.tuning import TuningResult
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
@@ -40,11 +33,11 @@ ROWS = 400
 NO_SIGNALS = DriveSignals(*[np.full(ROWS, np.nan)] * 12)
 
 
-def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) -> HeldOutDrive:
+def a_drive(number: int, *, trip: str | None = None, speed_mps: float = 10.0) -> LabelledDrive:
     wheels = np.full(ROWS, speed_mps / 0.31)
     signals = replace(NO_SIGNALS, wheel_rl_rad_s=wheels, ay_mps2=np.ones(ROWS))
     name, rows = f"drive-{number}", pa.table({"tick": np.arange(ROWS)})
-    return HeldOutDrive(name, signals, np.zeros(ROWS), rows=rows, trip=trip or name)
+    return LabelledDrive(name, signals, np.zeros(ROWS), rows=rows, trip=trip or name)
 
 
 def drives_of(held_out: Segments) -> list[int]:

@@ -7,29 +7,22 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.ekf import EkfNoise, axles_of, chassis, variances
+from fleet_slip.evaluation.ekf import EkfNoise, axles_of, variances
 from fleet_slip.evaluation.kalman import (
     GaussianState,
     independent_state,
     measurement_update,
 )
-from fleet_slip.evaluation.single_track import (
-    STEP_S,
-    Axles,
-    DriveSignals,
-    Rates,
-    lateral_force,
-    loaded_axles,
-    rates,
-)
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals
+from fleet_slip.evaluation.single_track import Axles, Rates, lateral_force, loaded_axles, rates
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle.parameters import load_vehicle
+from fleet_slip.vehicle.parameters import constants, load_vehicle
 from tests.support.drives import noisy, rolling_drive, steady_sideslip_rad
 
 CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
 FRONT_M = CAR.body.front_axle_m
-CHASSIS = chassis(CAR)
-NOISE = variances(EkfNoise())
+CHASSIS = constants(CAR, 1.0)
+Q, R = variances(EkfNoise())
 AT_REST = Axles(*loaded_axles(CAR, np.zeros(1), np.zeros(1), adhesion=1.0)[:, 0].tolist())
 UNCERTAIN = np.array(
     [
@@ -122,8 +115,8 @@ def test_prediction_and_measurement_are_the_textbook_algebra() -> None:
     state = x.mean.copy()
     columns = [(flow(state + e) - flow(state - e)) / (2 * h) for e in h * np.eye(4)]
     f = np.array(columns).T
-    q = np.diag([NOISE.q_vx, NOISE.q_vy, NOISE.q_r, 0.0])
-    ekf.predict(x, ax, steer, STEP_S, AT_REST, CHASSIS, NOISE)
+    q = np.diag(Q)
+    ekf.predict(x, ax, steer, STEP_S, AT_REST, CHASSIS, Q)
     np.testing.assert_allclose(x.mean, flow(state), rtol=1e-14)
     np.testing.assert_allclose(x.covariance, f @ UNCERTAIN @ f.T + q, rtol=0, atol=1e-8)
 
@@ -189,8 +182,8 @@ def test_covariance_stays_positive_definite() -> None:
     for k in range(20_000):
         steer = 0.1 * np.sin(0.01 * k)
         turning, ay = 0.2 * np.sin(0.01 * k), 4 * np.sin(0.01 * k)
-        ekf.predict(x, 0.0, steer, STEP_S, AT_REST, CHASSIS, NOISE)
-        ekf.update(x, 20.0, turning, ay, steer, AT_REST, CHASSIS, NOISE)
+        ekf.predict(x, 0.0, steer, STEP_S, AT_REST, CHASSIS, Q)
+        ekf.update(x, 20.0, turning, ay, steer, AT_REST, CHASSIS, R)
     assert np.linalg.eigvalsh(x.covariance).min() > 0
 
 

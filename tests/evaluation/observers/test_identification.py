@@ -22,7 +22,7 @@ from fleet_slip.evaluation.identify import (
     vehicle_with_fit,
 )
 from fleet_slip.evaluation.kalman import FilterNoise
-from fleet_slip.evaluation.single_track import DriveSignals, LabelledDrive
+from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive
 from fleet_slip.evaluation.tuning import rmse_rad, tune
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
@@ -111,7 +111,7 @@ def test_the_held_out_error_is_that_of_a_fit_without_the_drive(
     drive: LabelledDrive, executor: Executor
 ) -> None:
     drive = drive.beginning(2000)
-    wrong = replace(drive, drive_id="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
+    wrong = replace(drive, name="wrong", sideslip_rad=drive.sideslip_rad + np.radians(1))
     found = identify_held_out(MEASURED, [drive, wrong], executor)
     assert found.held_out_rad is not None
     assert np.degrees(found.held_out_rad) > 0.8 > np.degrees(found.fit_rad)

@@ -14,13 +14,13 @@ from fleet_slip.evaluation import kalman
 from fleet_slip.evaluation.kalman import (
     FilterNoise,
     GaussianState,
-    covariances,
     fuse,
     independent_state,
     predict,
     update,
+    variances,
 )
-from fleet_slip.evaluation.single_track import STEP_S, DriveSignals
+from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import (
@@ -131,23 +131,26 @@ def test_agrees_with_the_joint_gaussian_posterior() -> None:
 
 
 def last_state(drive: DriveSignals, yaw_rate: FloatArray, noise: FilterNoise) -> GaussianState:
-    c = covariances(noise)
-    state = kalman.initial_state(drive.gps_vx_mps[0], drive.gps_vy_mps[0], c)
+    first, q, r = variances(noise)
+    fix = drive.gps_vx_mps[0], drive.gps_vy_mps[0]
+    state = independent_state((fix[0], 0.0, fix[1], 0.0), first)
     for k in range(1, len(drive)):
-        predict(state, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, c)
+        predict(state, drive.ax_mps2[k], drive.ay_mps2[k], yaw_rate[k], STEP_S, q)
         if np.isfinite(drive.gps_vx_mps[k]):
-            update(state, drive.gps_vx_mps[k], drive.gps_vy_mps[k], c)
+            update(state, drive.gps_vx_mps[k], drive.gps_vy_mps[k], r)
     return state
 
 
 @kernel
-def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.float64]:
-    state = kalman.initial_state(20.0, 0.0, c)
+def covariances_over(
+    steps: int, every: int, turn: float, first: Any, q: Any, r: Any
+) -> NDArray[np.float64]:
+    state = independent_state((20.0, 0.0, 0.0, 0.0), first)
     kept = np.empty((steps // every, 4, 4))
     for k in range(steps):
-        predict(state, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, c)
+        predict(state, 0.0, 0.0, turn * np.sin(0.001 * k), STEP_S, q)
         if k % 10 == 0:
-            update(state, 20.0, 0.0, c)
+            update(state, 20.0, 0.0, r)
         if k % every == every - 1:
             kept[k // every] = state.covariance
     return kept
@@ -158,7 +161,7 @@ def covariances_over(steps: int, every: int, turn: float, c: Any) -> NDArray[np.
 def test_covariance_stays_positive_definite_over_a_million_steps(gps_std: float) -> None:
     """With no bias walk the biases' variance falls for ever; that is where definiteness is lost."""
     noise = FilterNoise(gps_vx_std_mps=gps_std, gps_vy_std_mps=gps_std)
-    for covariance in covariances_over(1_000_000, 1000, 0.4, covariances(noise)):
+    for covariance in covariances_over(1_000_000, 1000, 0.4, *variances(noise)):
         assert np.array_equal(covariance, covariance.T)
         scale = 1 / np.sqrt(np.diag(covariance))
         assert np.linalg.eigvalsh(covariance * np.outer(scale, scale)).min() > 0
@@ -168,7 +171,7 @@ def test_josephs_form_retains_variances_that_rounding_would_lose() -> None:
     """P (I − K H) of a very precise fix after great uncertainty rounds to zero and below."""
     vague = FilterNoise(gps_vx_std_mps=1e-5, gps_vy_std_mps=1e-5)
     state = independent_state((0.0, 0.0, 0.0, 0.0), (1e10, 1.0, 1e10, 1.0))
-    update(state, 1.0, 2.0, covariances(vague))
+    update(state, 1.0, 2.0, variances(vague)[2])
     np.testing.assert_allclose(state.mean, [1, 0, 2, 0], atol=1e-12)
     np.testing.assert_allclose(np.diag(state.covariance), [1e-10, 1, 1e-10, 1], rtol=1e-9)
 
