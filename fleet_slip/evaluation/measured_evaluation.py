@@ -376,8 +376,8 @@ class Competition:
                     if tuned := self._attempt(name, tune):
                         estimate = partial(FilterEstimate(kind, tuned.parameters).on_labelled, car)
                         content = tuned.parameters.model_dump(mode="json")
-                        told = f"{source}, tuned on labels"
-                        fitted[name] = FittedEstimator(told, estimate, content)
+                        origin = f"{source}, tuned on labels"
+                        fitted[name] = FittedEstimator(origin, estimate, content)
         return fitted
 
 

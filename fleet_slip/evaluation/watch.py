@@ -3,27 +3,21 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
-from numpy.typing import NDArray
 
-from fleet_slip.arrays import FloatArray, IntArray, float_column
+from fleet_slip.arrays import FloatArray, float_column
 from fleet_slip.base import pluralize
-from fleet_slip.catalog.definitions import Definition
-from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S, SignalCatalog
-from fleet_slip.columns.drive_columns import ColumnPlan, as_counts, compute_columns
+from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.test_drives import simulate_drives
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.resources import Configs
-from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.simulate import MOTION
@@ -32,12 +26,12 @@ from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
 
 if TYPE_CHECKING:
-    from fleet_slip.simulation.traffic import TrafficDrive
+    pass
 
 FRAMES_PER_S = 25
 SPACING_M = 3.0
 SMOOTHED_TICKS = 51
-WHEELS = ("fl", "fr", "rl", "rr")
+WHEELS = tuple(f"wheel_{wheel}_rad_s" for wheel in ("fl", "fr", "rl", "rr"))
 FACTS = ("vehicle_model", "mass_kg")
 
 
@@ -56,17 +50,13 @@ class DriveFrames:
     estimate_deg
         The estimate; NaN where the model lacks a signal.
     wheel_rad_s
-        Speeds of fl, fr, rl, rr; NaN where they were not logged.
+        Speeds of fl, fr, rl, rr, shape (4, frames); NaN where they were not logged.
     steer_rad
         Mean angle of the front wheels.
-    gates
-        Opening of each gate of the model, from 0 to 1.
     track
         x and y of the track's centre line; empty without a track.
     reference
         Word for the angle on the page: true, or reference for a measured one.
-    other_cars
-        x, y and heading of the other cars in traffic by frame, shape (3, cars).
     """
 
     title: str
@@ -78,11 +68,9 @@ class DriveFrames:
     heading_rad: FloatArray
     sideslip_deg: FloatArray
     estimate_deg: FloatArray
-    wheel_rad_s: Mapping[str, FloatArray]
+    wheel_rad_s: FloatArray
     steer_rad: FloatArray
-    gates: Mapping[str, FloatArray]
     track: tuple[FloatArray, FloatArray]
-    other_cars: NDArray[np.object_]
     reference: str = "true"
 
     def part(self, from_s: float, until_s: float | None) -> "DriveFrames":
@@ -95,13 +83,10 @@ class DriveFrames:
                 f"the drive lasts from {self.time_s[0]:.1f} to {self.time_s[-1]:.1f} s; choose a "
                 "part of it."
             )
-        changed: dict[str, Any] = {}
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                changed[name] = value[mask]
-            elif isinstance(value, Mapping):
-                changed[name] = {key: array[mask] for key, array in value.items()}
-        return replace(self, **changed)
+        series: dict[str, Any] = {
+            name: v[..., mask] for name, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
+        return replace(self, **series)
 
 
 def is_scenario(name: str, configs: Configs) -> bool:
@@ -115,10 +100,7 @@ def drive_frames(warehouse: Warehouse, name: str, version: ModelVersion) -> Driv
     Raises `QuestionError` if there is no such drive, or several.
     """
     names = [signal.column for signal in warehouse.catalog.signals.signals.values()]
-    query = (
-        "SELECT time_s, source, campaign, day, track, vehicle_model, mass_kg, "
-        f"{', '.join(names)} FROM log"
-    )
+    query = f"SELECT time_s, source, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
     with open_views(warehouse, f"{query}, drives") as database:
         named = "SELECT drive_id FROM drives WHERE $name IN (drive_id, drive_name, source_file)"
         ids = [drive for (drive,) in database.sql(named, params={"name": name}).fetchall()]
@@ -134,26 +116,13 @@ def drive_frames(warehouse: Warehouse, name: str, version: ModelVersion) -> Driv
             f"{name!r} is neither a drive nor a scenario. See: "
             'fleet-slip sql "SELECT drive_id, drive_name, source_file FROM drives"'
         )
-    campaign, day = rows["campaign"][0].as_py(), rows["day"][0].as_py()
-    traffic = _traffic_of(drive_id, campaign, day, warehouse.configs)
     columns = {name: float_column(rows, name) for name in names}
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    frames = frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version, traffic)
+    frames = frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version)
     return replace(
         frames, reference="reference" if rows["source"][0].as_py() == MEASURED else "true"
     )
-
-
-def _traffic_of(
-    drive_id: str, campaign: str | None, day: date, configs: Configs
-) -> "TrafficDrive | None":
-    """Compute the traffic of a drive of a campaign again."""
-    try:
-        drives = load_campaign(campaign or "", configs).drives(day)
-    except ConfigError:
-        return None
-    return next((drive.in_traffic for drive in drives if drive.drive_id == drive_id), None)
 
 
 def frames_of(
@@ -162,7 +131,6 @@ def frames_of(
     facts: Mapping[str, Any],
     time_s: FloatArray,
     version: ModelVersion,
-    traffic: "TrafficDrive | None" = None,
 ) -> DriveFrames:
     """Return the frames of a drive. Raises `DataError` without a velocity.
 
@@ -177,8 +145,7 @@ def frames_of(
     constants = {name: pa.array([value] * len(time_s)) for name, value in facts.items()}
     estimate = version.predict(pa.table({**constants, "time_s": time_s, **arrays}))
     vx, vy = _velocity(columns)
-    x, y, heading, track = _places(version.catalog.configs, columns, facts, time_s, vx, vy, traffic)
-    gates = gates_on(version.catalog.signals, version.manifest, columns, facts)
+    x, y, heading, track = _places(version.catalog.configs, columns, facts, time_s, vx, vy)
     return DriveFrames(
         title=title,
         model=version.reference,
@@ -189,11 +156,9 @@ def frames_of(
         heading_rad=heading[frames],
         sideslip_deg=np.degrees(columns["sideslip_rad"])[frames],
         estimate_deg=np.degrees(np.asarray(estimate, dtype=np.float64))[frames],
-        wheel_rad_s={wheel: columns[f"wheel_{wheel}_rad_s"][frames] for wheel in WHEELS},
+        wheel_rad_s=np.stack([columns[name] for name in WHEELS])[:, frames],
         steer_rad=((columns["steer_fl_rad"] + columns["steer_fr_rad"]) / 2)[frames],
-        gates={name: values[frames] for name, values in gates.items()},
         track=track,
-        other_cars=_other_cars(traffic, columns["station_m"], frames),
     )
 
 
@@ -202,7 +167,7 @@ def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray
     vx, vy = columns["vx_mps"], columns["vy_mps"]
     if np.isfinite(vx).any():
         return np.nan_to_num(vx), np.nan_to_num(vy)
-    wheels = [columns[f"wheel_{wheel}_rad_s"] for wheel in WHEELS]
+    wheels = [columns[name] for name in WHEELS]
     if not np.isfinite(wheels).any():
         speed = columns["vehicle_speed_mps"]
         if not np.isfinite(speed).any():
@@ -235,12 +200,11 @@ def _places(
     time_s: FloatArray,
     vx: FloatArray,
     vy: FloatArray,
-    traffic: "TrafficDrive | None",
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
     """Return x, y and heading of the car, and the centre line of its track if it has one."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
     empty = np.empty(0)
-    track = traffic.profile.track if traffic else _find_track(facts.get("track"), configs)
+    track = _find_track(facts.get("track"), configs)
     if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
@@ -258,59 +222,11 @@ def _places(
 
 
 def _find_track(name: str | None, configs: Configs) -> Track | None:
-    """Return a track by name; None if its file is not here, as of a campaign by path."""
+    """Return a track by name; None for a road of highway-env, or a file that is not here."""
     try:
         return load_track(name, configs) if name else None
     except ConfigError:
         return None
-
-
-def _other_cars(
-    traffic: "TrafficDrive | None", station_m: FloatArray, frames: IntArray
-) -> NDArray[np.object_]:
-    """Return x, y and heading of the other cars by frame, each of shape (3, cars)."""
-    places = np.empty(len(frames), dtype=object)
-    places[:] = [np.empty((3, 0))] * len(frames)
-    if traffic is None or not np.isfinite(station_m).all():
-        return places
-    line = traffic.profile.track.centre_line(SPACING_M)
-    stations = _smooth(station_m)[frames]
-    for frame, (station, x, y, along) in enumerate(zip(stations, *line.at(stations), strict=True)):
-        ahead, aside, turned = traffic.other_cars_at(station).T
-        cosine, sine = np.cos(along), np.sin(along)
-        places[frame] = np.stack(
-            [x + cosine * ahead - sine * aside, y + sine * ahead + cosine * aside, along + turned]
-        )
-    return places
-
-
-def gates_on(
-    signals: SignalCatalog,
-    manifest: Manifest,
-    columns: Mapping[str, FloatArray],
-    facts: Mapping[str, Any],
-) -> Mapping[str, FloatArray]:
-    """Return the opening of each gate by tick: 0 at the first knot, 1 at the last, linear."""
-    gates: dict[str, tuple[Definition, set[int]]] = {}
-    for term in manifest.terms:
-        gate = term.definition.gate if term.definition else None
-        if gate is not None:
-            _, knots = gates.setdefault(
-                f"{gate.by.of} over {gate.by.ticks} ticks", (gate.by, set())
-            )
-            knots.update(count for count in (gate.low, gate.peak, gate.high) if count is not None)
-    if not gates:
-        return {}
-    plan = ColumnPlan.from_definitions(
-        tuple(f"gate_{number}" for number in range(len(gates))),
-        {},
-        {f"gate_{number}": by for number, (by, _) in enumerate(gates.values())},
-    )
-    opening = compute_columns(plan, as_counts(signals, columns, plan.signals, facts))
-    return {
-        name: np.interp(column, sorted(knots), np.linspace(0, 1, len(knots)))
-        for (name, (_, knots)), column in zip(gates.items(), opening, strict=True)
-    }
 
 
 def write_page(frames: DriveFrames, file: Path) -> None:
@@ -327,7 +243,7 @@ def render_watch(frames: DriveFrames) -> str:
 
 
 def _data(frames: DriveFrames) -> dict[str, Any]:
-    wheels = np.array([frames.wheel_rad_s[name] for name in WHEELS])
+    wheels = frames.wheel_rad_s
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = wheels.mean(axis=0)
         excess = 100 * np.where(mean > 1, wheels / mean - 1, np.nan)
@@ -341,11 +257,7 @@ def _data(frames: DriveFrames) -> dict[str, Any]:
         "estimate": _listed(frames.estimate_deg, 3),
         "steer": _listed(frames.steer_rad, 4),
         "wheels": [_listed(wheel, 2) for wheel in excess],
-        "gates": [_listed(gate, 3) for gate in frames.gates.values()],
         "track": [_listed(axis, 1) for axis in frames.track],
-        "others": [
-            [_listed(row, 2) for row in cars] if cars.size else [] for cars in frames.other_cars
-        ],
     }
 
 
@@ -358,8 +270,7 @@ def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     """Return the frames of a test drive, which is simulated. Raises `ConfigError`."""
     scenario = load_scenario(name, version.catalog.configs)
     (drive,) = simulate_drives(version.catalog.signals, [scenario])
-    traffic = scenario.batch().drives[0].in_traffic
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
     facts = {**drive.vehicle_attributes, "track": scenario.way.name, "drive_id": scenario.drive_id}
     title = f"{scenario.name}: {scenario.description}"
-    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version, traffic)
+    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version)

@@ -12,7 +12,7 @@ from datetime import date, timedelta
 from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationInfo, model_validator
@@ -36,9 +36,6 @@ from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
 from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Receiver, Receivers, Sensors
 from fleet_slip.vehicle.batch import Surface
-
-if TYPE_CHECKING:
-    from fleet_slip.simulation.traffic import TrafficDrive
 
 ROAD_SPACING_M = 1.0
 """Spacing of the tables of curvature and target speed, in m."""
@@ -69,7 +66,7 @@ class DriveSpec(CarOnRoad):
     """Variation of a scenario's speed, in addition to the planned profile."""
 
     @cached_property
-    def in_traffic(self) -> "TrafficDrive | None":
+    def in_traffic(self) -> SpeedProfile | None:
         """Path and speed in traffic, as highway-env decides them; None without traffic."""
         if self.traffic is None:
             return None
@@ -84,7 +81,7 @@ class DriveSpec(CarOnRoad):
     def profile(self) -> SpeedProfile:
         """The track and the speed within the limits, with the pace, without the speed factor."""
         if self.in_traffic:
-            return self.in_traffic.profile
+            return self.in_traffic
         planned = speed_profile(self.track, self.limits, ROAD_SPACING_M)
         if not self.pace:
             return planned
@@ -126,7 +123,7 @@ class DriveSpec(CarOnRoad):
         """Return the surface of the road at the stations of the profile."""
         track_rng = random_generator(self.seed, "slopes", self.track.name)
         drive_rng = self._generator("weather", self.drive_id)
-        track = self.in_traffic.profile.track if self.in_traffic else self.track
+        track = self.in_traffic.track if self.in_traffic else self.track
         return surface(self.flaws.road, track, station_m, track_rng, drive_rng)
 
 

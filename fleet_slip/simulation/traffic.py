@@ -9,7 +9,6 @@ until the drive is long enough. Where the car would wait, it rolls at `SLOWEST_M
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -208,29 +207,6 @@ class OurDriver(Driver):
         return points
 
 
-@dataclass(frozen=True)
-class TrafficDrive:
-    """Path and speed of our car as highway-env decides them, and the other cars."""
-
-    profile: SpeedProfile
-    station_m: FloatArray
-    """Station of our car at each step of highway-env, shape (steps,)."""
-    other_cars: tuple[FloatArray, ...]
-    """Other cars at each step, shape (cars, 3): m ahead of ours, m to its left, rad to the left."""
-
-    def other_cars_at(self, station_m: float) -> FloatArray:
-        """Return the other cars when ours is at a station, interpolated between two steps."""
-        last = len(self.other_cars) - 1
-        i = min(max(int(np.searchsorted(self.station_m, station_m)) - 1, 0), last)
-        before, after = self.other_cars[i], self.other_cars[min(i + 1, last)]
-        if before.shape != after.shape or i == last:
-            return before
-        step_m = self.station_m[i + 1] - self.station_m[i]
-        share = min(max((station_m - self.station_m[i]) / max(step_m, 1e-9), 0.0), 1.0)
-        between: FloatArray = before + share * (after - before)
-        return between
-
-
 class TrafficStep(NamedTuple):
     """State at the beginning of a step of highway-env."""
 
@@ -246,8 +222,8 @@ def drive_in_traffic(
     speed_factor: float,
     spacing_m: float,
     generator: np.random.Generator,
-) -> TrafficDrive:
-    """Let highway-env drive a car. The result depends on the arguments alone, on every machine.
+) -> SpeedProfile:
+    """Let highway-env plan the path and speed of a car; they depend on the arguments alone.
 
     `speed_factor` is the desired speed over the limit of the road or of `limits`.
     """
@@ -270,7 +246,7 @@ def drive_in_traffic(
 
 def _planned(
     traffic: "Traffic", steps: Sequence[TrafficStep], speed_factor: float, spacing_m: float
-) -> TrafficDrive:
+) -> SpeedProfile:
     lengths = np.array([step.length_m for step in steps])
     ends: FloatArray = np.cumsum(lengths)
     station_m = ends - lengths
@@ -280,8 +256,7 @@ def _planned(
     track = traffic.track.through(curvature, float(line_m[1]))
     grid_m, even_m = track.grid(spacing_m)
     speed = np.interp(grid_m, station_m, [max(step.speed_mps, SLOWEST_MPS) for step in steps])
-    profile = SpeedProfile(track, even_m, grid_m, speed / speed_factor)
-    return TrafficDrive(profile, station_m, tuple(step.other_cars for step in steps))
+    return SpeedProfile(track, even_m, grid_m, speed / speed_factor)
 
 
 def _episode(

@@ -16,9 +16,9 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import traffic
 from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
 from fleet_slip.simulation.imperfections import Uniform
-from fleet_slip.simulation.roads import SLOWEST_MPS
+from fleet_slip.simulation.roads import SLOWEST_MPS, SpeedProfile
 from fleet_slip.simulation.simulate import simulate_batch, simulate_logs
-from fleet_slip.simulation.traffic import SITES, TrafficDrive
+from fleet_slip.simulation.traffic import SITES
 from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run
 
@@ -84,13 +84,13 @@ def spec(request: pytest.FixtureRequest) -> DriveSpec:
     return one
 
 
-def planned(spec: DriveSpec) -> TrafficDrive:
+def planned(spec: DriveSpec) -> SpeedProfile:
     assert spec.in_traffic
     return spec.in_traffic
 
 
 def test_the_plan_keeps_the_driver_s_limits_and_lasts_as_long_as_asked(spec: DriveSpec) -> None:
-    profile, limits = planned(spec).profile, spec.limits
+    profile, limits = planned(spec), spec.limits
     speed = profile.speed_mps * spec.speed_factor
     lateral = np.abs(profile.track.curvature(profile.station_m)) * speed**2
     along = np.diff(speed**2 / 2) / profile.spacing_m
@@ -109,21 +109,8 @@ def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
     assert log.metadata["track"] == spec.track.name
 
 
-def test_there_are_others_and_they_move_between_two_steps(spec: DriveSpec) -> None:
-    plan = planned(spec)
-    assert max(len(cars) for cars in plan.other_cars) >= 2
-    step = next(
-        k
-        for k in range(len(plan.other_cars) - 1)
-        if len(plan.other_cars[k]) == len(plan.other_cars[k + 1]) > 0
-        and plan.station_m[k + 1] > plan.station_m[k]
-    )
-    middle = plan.other_cars_at((plan.station_m[step] + plan.station_m[step + 1]) / 2)
-    np.testing.assert_allclose(middle, (plan.other_cars[step] + plan.other_cars[step + 1]) / 2)
-
-
 def test_lanes_are_changed_on_the_highway_and_turns_taken_at_the_roundabout() -> None:
-    highway, roundabout = (planned(one).profile for one in drives(["highway", "roundabout"], 60.0))
+    highway, roundabout = (planned(one) for one in drives(["highway", "roundabout"], 60.0))
     bends = np.sign(np.round(highway.track.curvature(highway.station_m), 4))
     assert {-1.0, 1.0} <= set(bends)
     assert np.abs(roundabout.track.curvature(roundabout.station_m)).max() > 1 / 25
