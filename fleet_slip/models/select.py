@@ -47,7 +47,7 @@ from fleet_slip.models.request import (
     parse_tolerance,
     require_odd,
 )
-from fleet_slip.models.summary import NestedErrors, SearchedModels, Selection, group_skipped
+from fleet_slip.models.summary import NestedErrors, SearchedModels, Selection, group_reasons
 from fleet_slip.regression.choice import (
     Rule,
     Winner,
@@ -323,8 +323,8 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
             skipped[f"{search.title} (search)"] = str(error)
     models += [model for search_result in searched for model in search_result.models]
     if not models:
-        reasons = [f"{names}: {reason.rstrip('.')}" for names, reason in group_skipped(skipped)]
-        raise DataError(f"no candidate model can be fitted: {'; '.join(reasons)}.")
+        reasons = (f"{', '.join(names)}: {reason}" for names, reason in group_reasons(skipped))
+        raise DataError(f"no candidate model can be fitted. {' '.join(reasons)}")
     winner = choose_by(compared, models)
     if winner.model.name in {candidate.name for candidate in rows.candidates}:
         winner = _refit(winner, folds, rows, catalog, intercept=intercept)

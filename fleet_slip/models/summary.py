@@ -6,13 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from fleet_slip.base import Record, document_of, pluralize
+from fleet_slip.base import Record, pluralize
 from fleet_slip.calibration.course_label import CourseLabelQuality
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.grams.cohort import (
-    BANDS,
-    PARTS,
     Cohort,
     DownweightedDrive,
     remark_left_out,
@@ -88,6 +86,13 @@ class Selection(Answer):
         Errors with the whole choice repeated without the drives to test; None if not computed.
     """
 
+    DOCUMENT = (
+        "winner=winner.model.name reason=winner.reason cohort=cohort.predicate.text "
+        "drives=cohort.drive_count rows=cohort.rows rows_without drives_left_out=cohort.left_out "
+        "intercept=compared.intercept skipped drives_weighed=weighted label_noise_deg choice? "
+        "without_label? remark? examined? nested_cross_validation=nested?"
+    )
+
     cohort: Cohort
     compared: ModelList
     models: tuple[CrossValidation, ...]
@@ -147,43 +152,23 @@ class Selection(Answer):
 
     def as_dict(self) -> dict[str, Any]:
         """Return what `select --json` prints."""
-        document: dict[str, Any] = {
-            "models": [
-                {**model.as_dict(), "gram_rows": self.cohort.gram_condition(model.signals)}
-                for model in self.models
-            ],
-            "winner": self.winner.model.name,
-            "reason": self.winner.reason,
-            "cohort": self.cohort.predicate.text,
-            "feature_set": self.cohort.catalog.identity(self.cohort.feature_set),
-            "drives": self.cohort.drive_count,
-            "rows": self.cohort.rows,
-            "rows_without": self.rows_without,
-            "drives_without_log": self.cohort.count_onboard_with(),
-            "drives_left_out": self.cohort.left_out,
-            "intercept": self.compared.intercept,
-            "folds": {
-                "by": self.compared.folds.by,
-                "count": len(self.models[0].folds),
-            },
-            "skipped": self.skipped,
-            "drives_weighed": document_of(self.weighted),
-            "label_noise_deg": self.label_noise_deg,
+        cohort, folds = self.cohort, len(self.models[0].folds)
+        models = [
+            {**model.as_dict(), "gram_rows": cohort.gram_condition(model.signals)}
+            for model in self.models
+        ]
+        for model, gap in zip(models, self.winner.gaps, strict=False):
+            model["shortfall"] = gap.as_dict()
+        document = {"models": models, **super().as_dict()} | {
+            "feature_set": cohort.catalog.identity(cohort.feature_set),
+            "drives_without_log": cohort.count_onboard_with(),
+            "folds": {"by": self.compared.folds.by, "count": folds},
         }
-        for model, shortfall in zip(document["models"], self.winner.gaps, strict=False):
-            model["shortfall"] = shortfall.as_dict()
-        optional = {
-            "choice": self.choice,
-            "search": self.searched_winner or next(iter(self.searched), None),
-            "without_label": self.without_label,
-            "remark": self.remark,
-            "examined": self.examined,
-            "nested_cross_validation": self.nested,
-        }
-        document |= {name: document_of(value) for name, value in optional.items() if value}
-        if self.cohort.prior:
-            weight = str(self.cohort.weight)
-            document["prior"] = {"campaign": str(self.request.prior), "weight": weight}
+        if self.searched:
+            document["search"] = (self.searched_winner or self.searched[0]).as_dict()
+        if cohort.prior:
+            campaign = str(self.request.prior)
+            document["prior"] = {"campaign": campaign, "weight": str(cohort.weight)}
         return document
 
 
@@ -212,6 +197,7 @@ MANY_SIGNALS = 30
 BEST = 10
 """Number of models in a table without --all."""
 CONDITION_WIDTH = 120
+"""Maximum number of characters of a cohort in a table without --all."""
 
 
 def summarize(selection: Selection, everything: bool = False, hint: str = "") -> Iterator[Part]:
@@ -219,37 +205,39 @@ def summarize(selection: Selection, everything: bool = False, hint: str = "") ->
 
     `hint` is the option that prints all models.
     """
+    cohort, winner = selection.cohort, selection.winner.model
     if selection.examined:
         yield Remark(selection.examined)
-    winner = selection.winner
-    yield f"winner: {winner.model.name}. {winner.reason}"
+    yield f"winner: {winner.name}. {selection.winner.reason}"
     if selection.searched_winner is not None:
-        count = pluralize(len(winner.model.signals), "column")
-        columns = in_families(selection.cohort.catalog, winner.model.signals)
-        search = selection.searched_winner.search
+        search, count = selection.searched_winner.search, pluralize(len(winner.signals), "column")
+        columns = in_families(cohort.catalog, winner.signals)
         yield f"{count}, found by {search.method} search {search.title!r}: {columns}"
     if selection.choice is not None:
-        yield from _choice(selection.choice)
-    yield _models(selection, everything, hint)
-    yield from _left_out(selection)
-    if selection.compared.folds.by in (PARTS, BANDS):
-        model = winner.model
-        yield TextTable(
-            f"\nmodel {model.name}, each fold left out in turn",
-            "fold|rows|correlation|RMSE deg|error mean deg|error std deg",
-            zip(model.fold_names, model.folds, strict=True),
-            "{0}|{1.rows:,}|{1.correlation:.4f}|{1.rmse_deg:.4f}|{1.error_mean_deg:+.4f}|"
-            "{1.error_std_deg:.4f}",
-        )
-    for names, reason in group_skipped(selection.skipped):
-        first, *relations = reason.split("; ")
-        more = pluralize(len(relations), "relation")
-        more = f"; and {more} more, see --json." if relations else ""
-        yield Remark(f"Skipped {names}: {first}{more}")
-    if selection.nested is not None:
-        chosen_deg, nested = winner.model.pooled.rmse_deg, selection.nested
+        yield _order_table(selection.choice)
+    yield _model_table(selection, everything, hint)
+    yield from remark_skipped_rows(selection.rows_without, cohort.rows)
+    if without_log := cohort.count_onboard_with():
+        without = pluralize(without_log, "drive")
+        yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
+    yield from remark_left_out(cohort.left_out, cohort.feature_set)
+    yield from outlier_remarks(selection.weighted)
+    if selection.remark:
+        yield Remark(selection.remark)
+    if selection.without_label is not None:
+        yield from _course_remarks(selection.without_label)
+    elif selection.label_noise_deg is None:
+        yield Remark("label noise unknown: it is part of every RMSE here.")
+    else:
         yield Remark(
-            f"RMSE of {winner.model.name}: {chosen_deg:.4f} deg in the folds that chose it; "
+            f"every RMSE here includes the label's noise, {selection.label_noise_deg:.4f} deg; "
+            f"without it the winner has {selection.beyond_label_noise_deg:.4f} deg."
+        )
+    for names, reason in group_reasons(selection.skipped):
+        yield Remark(f"Skipped {', '.join(names)}: {reason}")
+    if (nested := selection.nested) is not None:
+        yield Remark(
+            f"RMSE of {winner.name}: {winner.pooled.rmse_deg:.4f} deg in the folds that chose it; "
             f"{nested.figures.rmse_deg:.4f} deg on held-out drives with the choice repeated "
             f"without them, in {nested.groups} groups: expect this one."
         )
@@ -271,30 +259,10 @@ def group_reasons(reasons: Mapping[str, str]) -> Iterator[tuple[list[str], str]]
         yield names, reasons[names[0]] if len(names) == 1 else f"{reason.rstrip('.')}."
 
 
-def group_skipped(skipped: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Yield each reason once, after the candidates and searches that it applies to."""
-    for names, reason in group_reasons(skipped):
-        searches = [name for name in names if name.endswith(")")]
-        models = ", ".join(name for name in names if name not in searches)
-        if models:
-            searches.insert(0, f"models {models}" if ", " in models else f"model {models}")
-        yield ", ".join(searches), reason
-
-
-def _shortened(predicate: str, everything: bool, hint: str) -> str:
-    """Return a cohort for display; a long predicate is cut."""
-    text = describe_cohort(predicate)
-    if everything:
-        return text and f" where {predicate}"
-    beginning = text[:CONDITION_WIDTH].rstrip()
-    return f"{beginning} …{hint and f' ({hint})'}" if len(text) > CONDITION_WIDTH else text
-
-
-def _models(selection: Selection, everything: bool, hint: str) -> TextTable:
+def _model_table(selection: Selection, everything: bool, hint: str) -> TextTable:
     """Return a table of the models, or of the best listed ones and the winner.
 
-    It omits signals if a table above has them. For models of a search it has the number of columns:
-    these change from size to size.
+    For models of a search it has the number of columns: these change from size to size.
     """
     cohort, models, where = selection.cohort, selection.models, selection.cohort.predicate.text
     searched = [] if everything else [m for s in selection.searched for m in s.models]
@@ -302,17 +270,17 @@ def _models(selection: Selection, everything: bool, hint: str) -> TextTable:
     best = sorted(listed, key=lambda model: model.pooled.rmse)[:BEST]
     names = {selection.winner.model.name, *(model.name for model in best)}
     shown = models if everything else [model for model in models if model.name in names]
-    title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}"
-    title += _shortened(where, everything, hint)
+    if everything:
+        condition = f" where {where}"
+    elif len(condition := describe_cohort(where)) > CONDITION_WIDTH:
+        condition = f"{condition[:CONDITION_WIDTH].rstrip()} …{hint and f' ({hint})'}"
+    title = f"{pluralize(cohort.drive_count, 'drive')}, {pluralize(cohort.rows, 'row')}{condition}"
     title += f"; {pluralize(len(models[0].folds), 'fold')} by {selection.compared.folds.by}"
     title += "" if selection.compared.intercept else "; no intercept"
-    title += "" if len(shown) == len(models) else f"; {len(shown)} of {len(models)} models"
-    title += f" ({hint})" if hint and len(shown) < len(models) else ""
-    header, row = "model", "{model.name}"
-    if has_signals := selection.choice is None:
-        header, row = f"{header}|signals", f"{row}|{{signals}}"
-    header += "|correlation|RMSE deg"
-    row += "|{pooled.correlation:.4f}|{pooled.rmse_deg:.4f}"
+    if len(shown) < len(models):
+        title += f"; {len(shown)} of {len(models)} models{hint and f' ({hint})'}"
+    header = "model|signals|correlation|RMSE deg"
+    row = "{model.name}|{signals}|{pooled.correlation:.4f}|{pooled.rmse_deg:.4f}"
     if everything:
         header += "|error mean deg|error std deg|condition number|drives"
         row += (
@@ -329,21 +297,10 @@ def _models(selection: Selection, everything: bool, hint: str) -> TextTable:
         }
         for model in shown
     )
-    return TextTable(title, header, rows, row, text_columns=1 + has_signals)
+    return TextTable(title, header, rows, row, text_columns=2)
 
 
-def _label_noise(selection: Selection) -> Remark:
-    """Return the share of the label's noise in the errors."""
-    noise = selection.label_noise_deg
-    if noise is None:
-        return Remark("label noise unknown: it is part of every RMSE here.")
-    return Remark(
-        f"every RMSE here includes the label's noise, {noise:.4f} deg; without it the winner has "
-        f"{selection.beyond_label_noise_deg:.4f} deg."
-    )
-
-
-def _without_label(quality: CourseLabelQuality) -> Iterator[Remark]:
+def _course_remarks(quality: CourseLabelQuality) -> Iterator[Remark]:
     """Yield the quality of a label from course changes, and its limits."""
     over = ", ".join(f"{seconds:g}" for seconds in quality.change_s)
     figures = f"learned from changes of the course over {over} s: the figures are of these changes"
@@ -364,22 +321,6 @@ def _without_label(quality: CourseLabelQuality) -> Iterator[Remark]:
     )
 
 
-def _left_out(selection: Selection) -> Iterator[Remark]:
-    """Yield which drives of the cohort the models were not made of, and what the label is worth."""
-    yield from remark_skipped_rows(selection.rows_without, selection.cohort.rows)
-    if without_log := selection.cohort.count_onboard_with():
-        without = pluralize(without_log, "drive")
-        yield Remark(f"{without} of these have no log: their cars sent Gram rows.")
-    yield from remark_left_out(selection.cohort.left_out, selection.cohort.feature_set)
-    yield from outlier_remarks(selection.weighted)
-    if selection.remark:
-        yield Remark(selection.remark)
-    if selection.without_label is not None:
-        yield from _without_label(selection.without_label)
-    else:
-        yield _label_noise(selection)
-
-
 def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
     """Return the names of signals, or of their families if there are many."""
     if len(signals) <= MANY_SIGNALS:
@@ -389,8 +330,8 @@ def in_families(catalog: Catalog, signals: Sequence[str]) -> str:
     return f"{len(signals)}: " + " ".join(names)
 
 
-def _choice(choice: NestedChoice) -> Iterator[Part]:
-    """Yield the table of the k+1 models of an order, the empty one first.
+def _order_table(choice: NestedChoice) -> TextTable:
+    """Return the table of the k+1 models of an order, the empty one first.
 
     The distance D is that of the paper's equation (2), in units of the noise: from the full model,
     and as it is to be expected from the true one.
@@ -398,7 +339,7 @@ def _choice(choice: NestedChoice) -> Iterator[Part]:
     evidence, criterion = choice.evidence, choice.rule.criterion
     size = len(choice.winner.model.signals)
     columns = zip(evidence.excess(), evidence.distances(), choice.values, strict=True)
-    yield TextTable(
+    return TextTable(
         f"order by {choice.rule.ranking}; with {evidence.kind} as independent observations: "
         f"{evidence.rows:,.0f} effective rows",
         "|added|contribution A|D to full|expected D|"

@@ -88,8 +88,8 @@ MAX_ANGLE_ERROR_DEG = 0.15
 from the mounting of reference sensors (`calibration.intercept`)."""
 USUAL_YAW_RATE_RAD_S = 0.25
 """Standard deviation of the yaw rate of cars without moments of the course."""
-MAX_CARS, MAX_FAULTS = 5, 3
-"""Cars and faults in a message."""
+MAX_CARS = 5
+"""Maximum number of cars in a message."""
 
 
 def require_sound_course(warehouse: Warehouse, manifest: Manifest) -> None:
@@ -134,39 +134,31 @@ def _require_in_time(
         if car in delays
     }
 
-    def error_deg(car: str, delay_s: float) -> float:
-        return math.degrees(abs(delay_s) * yaw_rates.get(car, USUAL_YAW_RATE_RAD_S))
+    def is_large(car: str, delay_s: float | None) -> bool:
+        yaw_rate = yaw_rates.get(car, USUAL_YAW_RATE_RAD_S)
+        return delay_s is None or math.degrees(abs(delay_s) * yaw_rate) > MAX_ANGLE_ERROR_DEG
 
-    unsure = {
-        car: error_deg(car, math.inf if (error := delays[car].uncertainty) is None else error)
-        for car in remaining
-    }
-    unsure = {car: error for car, error in unsure.items() if error > MAX_ANGLE_ERROR_DEG}
-    late = [c for c, delay_s in remaining.items() if error_deg(c, delay_s) > MAX_ANGLE_ERROR_DEG]
+    unsure = [car for car in remaining if is_large(car, delays[car].uncertainty)]
+    late = [car for car, delay_s in remaining.items() if is_large(car, delay_s)]
     problems = []
     if unsure:
-        worst = max(unsure.values())
-        effect = "" if math.isinf(worst) else f", an error of the label of {worst:.2f} deg"
         problems.append(
-            f"delays are too uncertain ({_named(delays, list(unsure))}{effect}; "
-            f"at most {MAX_ANGLE_ERROR_DEG:g} deg)"
+            f"delays are too uncertain ({_named(delays, unsure)}; they may cause more than "
+            f"{MAX_ANGLE_ERROR_DEG:g} deg)"
         )
     if unknown := len(cars) - len(remaining):
-        cars_text = pluralize(unknown, "car")
-        problems.append(f"that of {cars_text} cannot be estimated from their drives")
+        problems.append(f"that of {pluralize(unknown, 'car')} cannot be estimated")
     if late:
         problems.append(
-            "the Gram rows of some cars are corrected by an outdated delay "
-            f"({_named(delays, late)}): run fleet-slip gram --features course, and send the new "
-            "delay to cars that count on board"
+            f"Gram rows are corrected by an outdated delay ({_named(delays, late)}): run "
+            "fleet-slip gram --features course, and send the new delay to cars that count on board"
         )
     if problems:
         raise RefusedError(
             f"{manifest.name} was not published: a late course looks like side-slip, and "
-            f"{'; '.join(problems)}. See: fleet-slip calibrate --car NAME. Choose "
-            "other cars, add drives, or set the receiver type (receiver in the mapping). "
-            f"To publish it anyway: fleet-slip publish {manifest.name} --label "
-            "course --force"
+            f"{'; '.join(problems)}. See: fleet-slip calibrate --car NAME. Choose other cars, add "
+            "drives, or set the receiver type (receiver in the mapping). To publish it anyway: "
+            f"fleet-slip publish {manifest.name} --label course --force"
         )
     return remaining
 
@@ -187,12 +179,11 @@ def _require_course_of_cars(
             faults[car] = fault
     if not faults:
         return
-    first = next(iter(faults.values()))
-    named = "; ".join(f"{car}: {fault.figure}" for car, fault in list(faults.items())[:MAX_FAULTS])
-    more = f", and {len(faults) - MAX_FAULTS} more" if len(faults) > MAX_FAULTS else ""
+    (car, fault), *remaining = faults.items()
+    more = f", and {pluralize(len(remaining), 'other car')}" if remaining else ""
     raise RefusedError(
         f"{manifest.name} was not published: the course of {len(faults)} of "
-        f"{pluralize(len(moments), 'car')} is implausible ({named}{more}). {first.remedy} Then "
-        "ingest again, or choose other cars; fleet-slip quality lists the drives. To publish it "
-        f"anyway: fleet-slip publish {manifest.name} --label course --force"
+        f"{pluralize(len(moments), 'car')} is implausible ({car}: {fault.figure}{more}). "
+        f"{fault.remedy} Then ingest again, or choose other cars; fleet-slip quality lists the "
+        f"drives. To publish it anyway: fleet-slip publish {manifest.name} --label course --force"
     )

@@ -224,11 +224,13 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
     """
     part = gram.restrict(inputs)
     relations = [
-        _relation(part, column, weights, intercept=intercept)
+        _relation(part, column, weights)
         for column, weights in exact.dependent_columns(moments(part, intercept=intercept)).items()
     ]
     if not relations:
         return ""
+    if (more := len(relations) - MAX_RELATIONS) > 0:
+        relations = [*relations[:MAX_RELATIONS], f"and {pluralize(more, 'other relation')}"]
     rows = f" There are only {pluralize(gram.n, 'row')}." if gram.n <= len(inputs) else ""
     return (
         f"the model has no unique solution: {'; '.join(relations)}.{rows} Leave out one signal of "
@@ -236,22 +238,16 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
     )
 
 
-def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction], *, intercept: bool) -> str:
-    """Describe a signal as a combination of others, with its coefficients if they are simple."""
+MAX_RELATIONS = 3
+"""Maximum number of relations in a message."""
+
+
+def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction]) -> str:
+    """Describe a signal as a combination of others."""
     name = gram.signals[column]
-    constant = Fraction(0)
-    if intercept:
-        level = gram.sums[column] - sum(b * gram.sums[i] for i, b in weights.items())
-        constant = Fraction(level) / gram.n
     if not weights:
-        return f"{name} is constant ({constant} counts)"
-    terms = {gram.signals[i]: b for i, b in weights.items()}
-    text = f"{name} is a linear combination of {', '.join(terms)}"
-    if len(terms) <= 3 and all(b.denominator <= 1000 for b in (*terms.values(), constant)):
-        right = " + ".join(f"{b} {other}" if b != 1 else other for other, b in terms.items())
-        level_text = f" + {constant}" if constant else ""
-        text += f" (in counts: {name} = {right}{level_text})".replace("+ -", "- ")
-    return text
+        return f"{name} is constant"
+    return f"{name} is a linear combination of {', '.join(gram.signals[i] for i in weights)}"
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:

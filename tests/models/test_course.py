@@ -167,7 +167,7 @@ def test_a_delay_may_be_as_uncertain_as_its_effect_on_the_label_is_small(
     if is_allowed:
         assert without_label(fleet).learned_from
         return
-    with pytest.raises(RefusedError, match=r"\+- 30 ms, an error of the label of 0\.\d\d deg"):
+    with pytest.raises(RefusedError, match=r"\+- 30 ms; they may cause more than 0\.15 deg"):
         without_label(fleet)
 
 

@@ -96,8 +96,7 @@ def test_dependent_signals_are_named_with_the_relation() -> None:
     with pytest.raises(DataError) as raised:
         fit(gram, inputs, "sideslip")
     assert "steer_fr is a linear combination of steer_fl, ay" in str(raised.value)
-    assert "steer_fr = 2 steer_fl - 1 ay + 3" in str(raised.value)
-    assert "ax is constant (6 counts)" in str(raised.value)
+    assert "ax is constant" in str(raised.value)
     assert "steer_fl is" not in str(raised.value)
     with pytest.raises(DataError, match="steer_fr is a linear"):
         nested_fits(gram, inputs, "sideslip")
