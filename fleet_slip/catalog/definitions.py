@@ -223,7 +223,24 @@ class ParameterFactor(Config):
         return self
 
 
-class Combination(Config):
+class Composite(Config):
+    """A column that is made of others."""
+
+    @property
+    def columns(self) -> tuple["Definition", ...]:
+        """The columns that it is made of, in the order of its fields."""
+        return tuple(_definitions_in(self))
+
+
+def _definitions_in(part: object) -> Iterator["Definition"]:
+    if isinstance(part, Definition):
+        yield part
+    elif isinstance(part, Config | tuple):
+        for value in part if isinstance(part, tuple) else vars(part).values():
+            yield from _definitions_in(value)
+
+
+class Combination(Composite):
     """A linear combination of columns: `(intercept + sum(c * column)) / divisor`.
 
     `line` is the digest of its first-stage model, "" if that has not been fitted yet.
@@ -234,11 +251,6 @@ class Combination(Config):
     divisor: Annotated[int, Field(ge=1, le=LARGEST_DIVISOR)] = 1
     line: Annotated[LineId | None, _LEFT_OUT] = None
 
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        return tuple(column for _, column in self.terms)
-
 
 def _product_ratio(value: Fraction) -> Fraction:
     if not 0 < value.numerator <= 2**12 or value.denominator > 2**40:
@@ -246,16 +258,11 @@ def _product_ratio(value: Fraction) -> Fraction:
     return value
 
 
-class Product(Config):
+class Product(Composite):
     """The product of up to two columns and `ratio`."""
 
     of: tuple["Definition", ...] = Field(max_length=2)
     ratio: Annotated[Fraction, AfterValidator(_product_ratio)] = Fraction(1)
-
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        return self.of
 
 
 def _weight(value: Fraction) -> Fraction:
@@ -276,13 +283,8 @@ class Equation(Config):
     x: tuple["Definition | Whole", ...] = Field(min_length=1, max_length=4)
     weight: Annotated[Fraction, AfterValidator(_weight)] = Fraction(1)
 
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        return (self.y, *(column for column in self.x if isinstance(column, Definition)))
 
-
-class Slope(Config):
+class Slope(Composite):
     """The first unknown of equations, by least squares over all ticks since the drive's start.
 
     Products of columns, each a sixteenth and rounded, are summed up over the ticks that lack
@@ -303,11 +305,6 @@ class Slope(Config):
         if any(equation.bits > COUNT_BITS for equation in self.columns):
             raise ValueError(f"the columns of a slope have {COUNT_BITS} bits")
         return self
-
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        return tuple(column for equation in self.equations for column in equation.columns)
 
 
 class ObserverInput(Config):
@@ -354,7 +351,7 @@ class ObserverCar(Config):
     yaw_acceleration_std_rad_s2: Positive
 
 
-class Observer(Config):
+class Observer(Composite):
     """An extended Kalman filter of the single-track model (`fleet_slip.columns.observer`).
 
     Its value is the side-slip angle in 2⁻¹⁶ rad.
@@ -379,14 +376,8 @@ class Observer(Config):
     axle: Literal["front", "rear"] = "rear"
     car: ObserverCar
 
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        inputs = (self.ay, self.yaw_rate, self.speed, self.steer, self.ax, self.wheels)
-        return tuple(column for entry in inputs if entry for column in entry.of)
 
-
-class Blend(Config):
+class Blend(Composite):
     """The filter plus a share of the clipped difference to the line, in 2⁻¹⁶ rad.
 
     See `fleet_slip.regression.combination`; `shares` are in 2⁻¹⁶, `limits` in 2⁻¹⁶ rad, at `knots`
@@ -410,11 +401,6 @@ class Blend(Config):
         if (self.lateral is None) != (len(self.knots) == 1):
             raise ValueError("several knots need a column lateral, a single one has none")
         return self
-
-    @property
-    def columns(self) -> tuple["Definition", ...]:
-        """The columns that it is made of."""
-        return tuple(column for column in (self.filter, self.line, self.lateral) if column)
 
 
 Made = Combination | Product | Slope | Observer | Blend

@@ -19,7 +19,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import COURSE, YAW_RATE
 from fleet_slip.catalog.definitions import Definition, Slope, limit_of, plain_column, rows_behind
 from fleet_slip.catalog.signals import SignalCatalog
-from fleet_slip.columns.column_sql import CountedColumns, components_of, rows_of
+from fleet_slip.columns.column_sql import CountedColumns, rows_of
 from fleet_slip.columns.lowering import (
     OPERATIONS,
     POWERS,
@@ -146,26 +146,12 @@ class ColumnPlan:
     @property
     def facts(self) -> tuple[str, ...]:
         """The drive columns that are needed."""
-        components = [component for column in self._columns for component in components_of(column)]
-        return tuple(
-            dict.fromkeys(component.fact.name for component in components if component.fact)
-        )
-
-    @property
-    def _columns(self) -> list[Definition]:
-        """The columns that look back, and those that the combinations among them are made of."""
-        columns, seen = list(self.windows.values()), set[int]()
-        for column in columns:
-            if column.made and id(column.made) not in seen:
-                seen.add(id(column.made))
-                columns += [c for c in column.made.columns if c.made or c.fact or c.number]
-        return columns
+        return tuple(dict.fromkeys(fact.name for fact in self.program.counted.lowered.facts))
 
     @property
     def numbers(self) -> tuple[str, ...]:
         """Calibration parameters of the car that the columns need."""
-        names = (column.number.name for column in self._columns if column.number)
-        return tuple(dict.fromkeys(names))
+        return tuple(number.name for number in self.program.counted.lowered.numbers)
 
     @property
     def limits(self) -> tuple[int, ...]:

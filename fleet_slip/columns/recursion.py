@@ -83,10 +83,10 @@ class Recursion:
         for number in self.members:
             name, plain = operation_of(self.steps[number]), plain_of(self.steps[number])
             operands = [self.places[i] for i in operands_of(self.steps[number])]
-            plain_numbers = plain[len(operands) :] if name != "state" else ()
-            rows.append(
-                [NAMES.index(name), self.places[number], *operands, *plain_numbers, 0, 0][:4]
-            )
+            plain_numbers = plain[len(operands) :] if name != "state" else (0, 0)
+            # An operation on one operand reads it twice.
+            reads = [*operands, *plain_numbers, *operands][:2]
+            rows.append([NAMES.index(name), self.places[number], *reads])
         return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
     def memory(self) -> NDArray[np.int64]:
@@ -125,15 +125,6 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
                 value = (a + half) >> second if a >= 0 else -((half - a) >> second)
                 values[out], present[out] = value, present[first]
                 continue
-            if operation in (NEGATE, ABSOLUTE, SIGN):
-                if operation == NEGATE:
-                    value = -a
-                elif operation == ABSOLUTE:
-                    value = abs(a)
-                else:
-                    value = np.int64(1 if a > 0 else (-1 if a < 0 else 0))
-                values[out], present[out] = value, present[first]
-                continue
             b = values[second]
             valid = present[first] & present[second]
             if operation == ADD:
@@ -157,6 +148,12 @@ def run_recursion(  # noqa: PLR0912, PLR0915 - one branch for each operation
                 value = min(a, b)
             elif operation == MOST:
                 value = max(a, b)
+            elif operation == NEGATE:
+                value = -a
+            elif operation == ABSOLUTE:
+                value = abs(a)
+            elif operation == SIGN:
+                value = np.int64(1 if a > 0 else (-1 if a < 0 else 0))
             elif operation == AT_LEAST:
                 valid = valid if a >= b else 0
                 value = a
