@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -167,18 +166,6 @@ def test_an_unreachable_scheduler_is_told_in_bounded_time(run_command: RunComman
         assert done.exit_code == 11
         assert f"{address}: no Dask scheduler can be reached there" in done.stderr
         assert len(done.stderr.splitlines()) == 1
-
-
-def test_without_dask_the_option_says_what_to_install(tmp_path: Path) -> None:
-    program = (
-        "import sys; sys.modules['distributed'] = None\n"
-        "from fleet_slip.cli.main import main; main()"
-    )
-    options = ["--root", str(tmp_path), "gram", "--cluster", "tcp://x:1"]
-    command = [sys.executable, "-c", program, *options]
-    done = run(command)
-    assert done.exit_code == 13
-    assert 'pip install "fleet-slip[cluster]"' in done.stderr
 
 
 def test_a_bounded_number_of_tasks_is_under_way() -> None:

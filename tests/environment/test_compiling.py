@@ -82,12 +82,6 @@ def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
     return compiling.code_folder.__wrapped__(own.name.removeprefix(compiling.PREFIX))
 
 
-def test_without_a_part_code_is_compiled_anew_and_kept(compiled: Path, cache: Path) -> None:
-    kept(cache, ".nbc").unlink()
-    assert halve(compiled, cache).stdout.strip() == ""
-    assert kept(cache, ".nbc").exists()
-
-
 def run_if_unpickled(cache: Path, mark: Path) -> None:
     """Plant what makes a file when numba reads the code, and its checksum."""
     file = kept(cache, ".nbi")
@@ -131,19 +125,6 @@ def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
     tmp_path.chmod(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kept(cache, ".nbi")))  # no folder
     assert compiling.code_folder.__wrapped__("0") is None
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder away")
-def test_so_is_a_folder_of_another_user(
-    cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(compiling.LOGGER, "propagate", True)
-    (own,) = cache.iterdir()
-    for folder in (own, cache):
-        os.chown(folder, 12345, 12345)
-        assert found_by(cache, monkeypatch) is None
-        assert f"can write {folder}" in caplog.text
-        os.chown(folder, 0, 0)
 
 
 def test_a_change_of_what_a_kernel_imports_or_of_the_compiler_takes_another_folder(

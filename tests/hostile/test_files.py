@@ -47,18 +47,6 @@ def test_a_million_columns_are_refused_in_little_memory(
     assert not (tmp_path / "data").exists()
 
 
-def test_a_link_to_a_file_is_read_and_left_alone(warehouse: Warehouse, tmp_path: Path) -> None:
-    file = tmp_path / "elsewhere" / "log.csv"
-    file.parent.mkdir()
-    file.write_text(csv_text(good_columns()))
-    link = tmp_path / "link.csv"
-    link.symlink_to(file)
-    assert ingest_file(warehouse, link, a_mapping()).new
-    assert link.is_symlink()
-    assert list(file.parent.iterdir()) == [file]
-    assert not ingest_file(warehouse, file, a_mapping()).new
-
-
 @pytest.mark.parametrize("target", ["/dev/zero", "folder", "/proc/self/mem", "nowhere"])
 def test_links_to_what_is_no_file_are_refused(
     warehouse: Warehouse, tmp_path: Path, target: str
@@ -180,13 +168,6 @@ def test_a_config_that_cannot_be_read_is_not_replaced_by_the_shipped_one(
         load_config(Configs(tmp_path).file("publish.toml"), PublishThresholds)
 
 
-def test_a_named_config_that_leads_nowhere_is_told(tmp_path: Path) -> None:
-    (tmp_path / "campaigns").mkdir()
-    (tmp_path / "campaigns" / "smoke.toml").symlink_to("nowhere")
-    with pytest.raises(ConfigError, match="no such file"):
-        read_named_file(Configs(tmp_path).find("campaigns", "smoke"))
-
-
 @pytest.mark.parametrize("kind", ["models", "mappings"])
 def test_a_folder_of_configs_that_leads_nowhere_does_not_count_as_empty(
     tmp_path: Path, kind: str
@@ -194,15 +175,6 @@ def test_a_folder_of_configs_that_leads_nowhere_does_not_count_as_empty(
     (tmp_path / kind).symlink_to("nowhere")
     with pytest.raises(ConfigError, match=f"{kind}: not a folder that can be read"):
         Configs(tmp_path)
-
-
-def test_a_pipe_given_to_a_command_is_refused_at_once(
-    tmp_path: Path, run_command: RunCommand
-) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    done = run_command("ingest", str(tmp_path / "pipe"))
-    assert done.exit_code == InputError.exit_code
-    assert "pipe" in done.stderr
 
 
 @pytest.mark.timeout(60)
@@ -218,17 +190,6 @@ def test_a_clock_before_1970_is_refused(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr("time.time", lambda: -86400.0)
     with pytest.raises(StorageError, match="before 1970"):
         data_root(tmp_path)
-
-
-def test_the_list_of_configs_tells_of_a_link_that_leads_nowhere(
-    tmp_path: Path, run_command: RunCommand
-) -> None:
-    own = tmp_path / "own"
-    own.mkdir()
-    (own / "publish.toml").symlink_to("nowhere")
-    done = run_command("--config", str(own), "features", "--files")
-    assert done.exit_code == ConfigError.exit_code
-    assert "publish.toml: no such file" in done.stderr
 
 
 Place = Callable[[Path], Path]
@@ -264,13 +225,6 @@ def test_a_lock_is_taken_on_a_file_only(
     assert done.exit_code == StorageError.exit_code
     assert ".run-smoke.lock: a link, a folder or a pipe" in done.stderr
     assert untouched(other)
-
-
-def test_a_lock_keeps_what_its_file_holds(tmp_path: Path) -> None:
-    (tmp_path / "lock").write_text("who knows")
-    with LocalFolder(tmp_path).exclusive("lock", lambda: None):
-        pass
-    assert (tmp_path / "lock").read_text() == "who knows"
 
 
 @pytest.mark.parametrize("place", [a_link, a_pipe])

@@ -1,6 +1,5 @@
 """Conversions that files state: applied as they say, or refused; never run, and never left out."""
 
-import inspect
 import re
 from importlib.util import find_spec
 from pathlib import Path
@@ -211,23 +210,3 @@ def test_only_numbers_of_their_own_are_read_from_hdf5(
         assert told in refusal(tmp_path / "log.h5", "ax", "mat73")
     else:
         np.testing.assert_array_equal(read(tmp_path / "log.h5", "ax", "mat73"), X)
-
-
-def test_what_is_private_to_other_packages_is_there(tmp_path: Path) -> None:
-    """The upper bounds of their versions in pyproject.toml hold until this is looked at again."""
-    with MDF(write_mdf(tmp_path, {"formula": "X1"})) as mdf:
-        inner: Any = mdf._mdf
-        channel: Any = mdf.groups[1].channels[1]
-        assert hasattr(mdf, "_select_fallback")
-        for name in ("_file", "_delete_on_close", "_closed", "extract_attachment", "masters_db"):
-            assert hasattr(inner, name), name
-        assert channel.conversion_addr == channel.conversion.address != 0
-        assert (channel.conversion.id, channel.conversion.conversion_type) == (b"##CC", 3)
-    assert {"record_offset", "record_count", "raw"} <= set(
-        inspect.signature(MDF._select_fallback).parameters
-    )
-    with nptdms.TdmsFile.open(tdms(tmp_path)) as file:
-        (segment,) = file._reader._segments
-        for name in ("next_segment_pos", "segment_incomplete", "final_chunk_lengths_override"):
-            assert hasattr(segment, name), name
-        assert file["g"]["ax"].scaler_data_types is None

@@ -12,7 +12,6 @@ from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.storage.documents import (
     DocumentFolder,
     accept_losses,
-    document_folders,
     find_lost,
 )
 from fleet_slip.storage.folder import Folder
@@ -61,14 +60,6 @@ def test_a_lost_document_is_an_error_until_it_is_restored(
     assert folder.append({"n": 5}).number == 5
 
 
-def test_a_lost_folder_is_an_error(folder: DocumentFolder) -> None:
-    shutil.rmtree(path_of(folder.folder))
-    with pytest.raises(StorageError, match=r"1\.json \(and 3 more\)"):
-        folder.numbers()
-    assert len(folder.faults()) == 4
-    assert document_folders(folder.root) == [folder]
-
-
 def test_a_lost_document_of_an_object_store_is_an_error(root: Folder) -> None:
     folder = DocumentFolder(root, PATH)
     for number in range(1, 4):
@@ -90,13 +81,6 @@ def test_an_accepted_loss_stays_and_its_number_is_not_taken_again(
     assert folder.numbers() == [n for n in range(1, 5) if n != number]
     assert folder.append({"n": 5}).number == 5
     assert not folder.faults()
-
-
-def test_the_losses_of_a_folder_are_accepted_together(folder: DocumentFolder) -> None:
-    for number in (1, 4):
-        file(folder, number).unlink()
-    assert accept_losses(folder.root, [PATH]) == [f"{PATH}/1.json", f"{PATH}/4.json"]
-    assert folder.numbers() == [2, 3]
 
 
 @pytest.mark.parametrize("path", [f"{PATH}/2.json", PATH, "", "other", "../x"])

@@ -190,19 +190,6 @@ def test_an_answer_with_a_flipped_bit_is_no_answer(
     assert ask_all(stored) == (usual, 0)
 
 
-def test_single_flipped_answers_among_many_change_nothing(
-    server: Server, stored: Warehouse
-) -> None:
-    usual, _ = ask_all(stored)
-    refusals = 0
-    for _ in range(4):
-        with flipping(server, "/(grams/[^_]|logs/day=|models/)", 0.2):
-            found, refused = ask_all(stored)
-        refusals += refused
-        assert found == {name: usual[name] for name in found}
-    assert refusals
-
-
 def test_gram_rows_are_not_made_of_flipped_logs(server: Server, stored: Warehouse) -> None:
     with flipping(server, "/logs/day="), pytest.raises(StorageError, match="do not match"):
         update_grams(stored, feature_set="motion")

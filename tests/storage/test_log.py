@@ -1,6 +1,5 @@
 """The history of runs."""
 
-import json
 import logging
 import os
 import socket
@@ -14,13 +13,8 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import HIDDEN, InputError, StorageError
-from fleet_slip.operations.status import status_of
-from fleet_slip.operations.verify import Verification, verify_documents
-from fleet_slip.storage import runs as records
-from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.runs import (
-    Run,
     current_run_id,
     find_changed_lines,
     process_began,
@@ -32,11 +26,8 @@ from fleet_slip.storage.runs import (
     step,
     write_line,
 )
-from fleet_slip.views import connect
-from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand, finish, start
 from tests.support.logs import ask
-from tests.support.s3_server import Server
 
 
 def runs(root: Path) -> list[dict[str, Any]]:
@@ -180,21 +171,6 @@ def test_every_flipped_bit_is_found(history: Path) -> None:
     assert missed == []
 
 
-@pytest.mark.parametrize("place", [0.1, 0.5, 0.9, 0.99])
-def test_a_flipped_bit_is_told_with_its_line(history: Path, place: float) -> None:
-    content = bytearray(history.read_bytes())
-    at = int(len(content) * place)
-    at += content[at] == ord("\n")
-    content[at] ^= 4
-    line = bytes(content[:at]).count(b"\n") + 1
-    history.write_bytes(content)
-    report = Verification()
-    verify_documents(LocalFolder(history.parents[1]), report)
-    ((path, problem),) = [(one.path, one.problem) for one in report.damage]
-    assert path == f"runs/{history.name}"
-    assert f"line {line} " in problem
-
-
 def test_readers_take_nothing_from_a_changed_line(history: Path) -> None:
     root = LocalFolder(history.parents[1])
     history.write_text(history.read_text().replace("mass_kg", "mess_kg", 1))
@@ -210,13 +186,6 @@ def test_a_torn_line_is_damage(history: Path) -> None:
     whole = history.read_bytes()
     history.write_bytes(whole + b"\n" + whole.split(b"\n")[1][:40])
     assert len(changed(history)) == 1
-
-
-def test_a_line_without_a_checksum_is_changed(history: Path) -> None:
-    record = json.loads(history.read_bytes().split(b"\n")[1])
-    del record["sha256"]
-    assert read_lines(json.dumps(record).encode()) == ([], [1])
-    assert read_lines(write_line(record))[0]
 
 
 def run_of(**changes: Any) -> dict[str, Any]:
@@ -250,15 +219,6 @@ def test_the_state_of_a_run(changes: dict[str, Any], state: str) -> None:
     assert state_of(run_of(**changes)) == state
 
 
-def test_where_the_system_does_not_tell_a_run_counts_as_running(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    recorded = run_of()
-    monkeypatch.setattr(records, "PROC", tmp_path)
-    assert process_began(os.getpid()) is None
-    assert state_of(recorded) == "running"
-
-
 def under_way(tmp_path: Path, *runs: dict[str, Any]) -> list[str]:
     """Return the runs under way of a root with the beginnings of some runs."""
     lines = b"".join(write_line(run_of(**run)) + b"\n" for run in runs)
@@ -278,28 +238,3 @@ def test_a_live_run_of_this_machine_is_under_way_whatever_the_clock_says(tmp_pat
     began = f"{datetime.now(UTC) - timedelta(hours=30):%Y%m%dT%H%M%S.%fZ}"
     runs = [{"run_id": f"{began}-{host}", "host": host} for host in hosts]
     assert under_way(tmp_path, *runs) == [f"{began}-{hosts[0]}"]
-
-
-def runs_in(root: Folder) -> list[tuple[object, ...]]:
-    with connect(root, query="runs") as database:
-        return database.execute(
-            "SELECT arguments[1], command, outcome, rows FROM runs ORDER BY ALL"
-        ).fetchall()
-
-
-def test_status_asks_for_no_record_older_than_a_year(root: Folder, server: Server) -> None:
-    record_old(root, days=800)
-    record_old(root, days=30)
-    with server.misbehaving() as watched:
-        (last,) = status_of(Warehouse(root)).last_runs
-    assert last["started_at"] > datetime.now(UTC) - timedelta(days=31)
-    assert len({request for request in watched.seen if "/runs/" in request}) == 2
-    assert len(runs_in(root)) == 2
-
-
-def record_old(root: Folder, days: int) -> None:
-    run = Run.start("gram", [])
-    run.started_at -= timedelta(days=days)
-    run.run_id = f"{days}"
-    for line in (run.beginning(), run.end(None, 1.0)):
-        root.append(f"runs/{run.started_at:%Y-%m}.jsonl", write_line(line) + b"\n")

@@ -7,8 +7,6 @@ import pickle
 import shutil
 import threading
 import weakref
-from dataclasses import replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +17,7 @@ import pytest
 import xxhash
 from deltalake import DeltaTable
 
-from fleet_slip.errors import ConflictError, RefusedError, StorageError
+from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.storage.data_files import (
     CHECKSUM_DIGITS,
     ROW_GROUP_ROWS,
@@ -29,7 +27,7 @@ from fleet_slip.storage.data_files import (
 )
 from fleet_slip.storage.folder import TEMPORARY_PREFIX
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import SCALE, AppTransaction, Change, retry_conflicts
+from fleet_slip.storage.table import AppTransaction, Change, retry_conflicts
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.logs import DAY, land, log_rows, path_of, random_counts
 
@@ -246,17 +244,6 @@ def test_a_table_in_the_place_of_another_is_opened(warehouse: Warehouse) -> None
     assert warehouse.logs.snapshot().rows == 7
 
 
-def test_counts_in_other_scales_are_refused_of_an_opened_table(warehouse: Warehouse) -> None:
-    land(warehouse, "one", log_rows("one", COUNTS))
-    logs = warehouse.logs
-    assert logs.snapshot().rows == 5
-    place = logs.schema.get_field_index("ax")
-    finer = logs.schema.field("ax").with_metadata({SCALE: "0.0001"})
-    schema: pa.Schema = logs.schema.set(place, finer)
-    with pytest.raises(RefusedError, match="other scales"):
-        replace(logs, schema=schema).snapshot()
-
-
 @pytest.mark.parametrize("nulls", [0, 1, 2, 5])
 def test_a_column_is_declared_to_have_no_null_if_it_has_none(nulls: int) -> None:
     counts = [None if i < nulls else i for i in range(5)]
@@ -268,13 +255,6 @@ def test_a_column_is_declared_to_have_no_null_if_it_has_none(nulls: int) -> None
     assert not read.schema.field("tick").nullable
     statistics = json.loads(encoded.statistics)
     assert statistics == {"numRecords": 5, "nullCount": {"ax": nulls, "tick": 0}}
-
-
-def test_the_column_of_the_partition_is_left_to_the_folder_and_counted_all_the_same() -> None:
-    rows = pa.table({"day": [date(2024, 5, 1)] * 3, "n": [1, 2, 3]})
-    encoded = Encoding().encode(rows, omitted=["day", "not there"])
-    assert pq.read_schema(pa.BufferReader(encoded.content)).names == ["n"]
-    assert set(json.loads(encoded.statistics)["nullCount"]) == {"day", "n"}
 
 
 def test_the_encodings_are_those_asked_for_in_groups_of_a_fixed_size() -> None:

@@ -7,16 +7,14 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-import fleet_slip
 from fleet_slip.errors import DataError
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.status import status_of
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.storage.table import Change, Table
+from fleet_slip.storage.table import Change
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
-from fleet_slip.warehouse.table_views import TABLE_VIEWS
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import RunCommand
 from tests.support.logs import ask, land, log_rows, random_counts
@@ -115,16 +113,3 @@ def test_an_erasure_that_is_under_way_is_hidden_and_no_problem(tmp_path: Path) -
     ErasureLog(warehouse.root).begin(ErasureSubject("vehicle", "beta"), 2, [])
     assert ask(warehouse.root, "SELECT DISTINCT vehicle_id FROM drives") == [("alfa",)]
     assert not any("erased" in problem for problem in status_of(warehouse).problems)
-
-
-def test_without_erasures_no_file_is_read_for_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    warehouse = filled(tmp_path)
-
-    def refuse(*_: object) -> None:
-        pytest.fail("a file was read")
-
-    monkeypatch.setattr(Table, "read_combinations", refuse)
-    with fleet_slip.connect(warehouse.root, query=" ".join(TABLE_VIEWS)) as database:
-        assert database.sql("SELECT count(*) FROM drives").fetchall() == [(4,)]
