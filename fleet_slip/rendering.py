@@ -11,8 +11,8 @@ from typing import Any
 from fleet_slip.base import Record
 from fleet_slip.errors import FleetSlipError, printable
 
-GAPS = (2, 1)
-"""Spaces between two columns: by default, and on a narrow terminal."""
+GAP = 2
+"""Spaces between two columns."""
 FILE_WIDTH = 200
 """Line width in characters for files and pipes."""
 
@@ -40,15 +40,12 @@ class TextTable:
     def text(self, width: int = FILE_WIDTH, *, bold: bool = False) -> str:
         """Return the table within `width`; words and numbers are not broken.
 
-        If it does not fit, columns move closer; if that is not enough, each row becomes a paragraph
-        with a line per column.
+        If it does not fit, each row becomes a paragraph with a line per column.
         """
         header = self.header.split("|")
         rows = [[printable(text) for text in self._cells(record)] for record in self.records]
-        for gap in GAPS:
-            if widths := _fit_columns(header, rows, width, gap):
-                break
-        else:
+        widths = _fit_columns(header, rows, width)
+        if widths is None:
             return _paragraphs(header, rows, width)
         sides = [str.ljust if i < self.text_columns else str.rjust for i in range(len(header))]
 
@@ -62,7 +59,7 @@ class TextTable:
                     side(text, wide - _cells_of(text) + len(text))
                     for side, text, wide in zip(sides, texts, widths, strict=True)
                 )
-                yield (" " * gap).join(padded).rstrip()
+                yield (" " * GAP).join(padded).rstrip()
 
         head = [*lines(header, below=True)] if any(header) else []
         if bold:
@@ -151,13 +148,13 @@ def _cells_of(text: str) -> int:
 
 
 def _fit_columns(
-    header: Sequence[str], rows: Sequence[Sequence[str]], width: int, gap: int
+    header: Sequence[str], rows: Sequence[Sequence[str]], width: int
 ) -> list[int] | None:
     """Return the column widths, at least the longest word each; None if they do not fit."""
     columns = [[name, *(row[i] for row in rows)] for i, name in enumerate(header)]
     wished = [max(map(_cells_of, cells)) for cells in columns]
     widths = [max((_cells_of(w) for c in cells for w in c.split()), default=0) for cells in columns]
-    free = width - sum(widths) - gap * (len(widths) - 1)
+    free = width - sum(widths) - GAP * (len(widths) - 1)
     if free < 0:
         return None
     while free and widths != wished:

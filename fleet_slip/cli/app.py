@@ -28,7 +28,7 @@ from fleet_slip.errors import (
     UsageError,
     is_lack_of_memory,
 )
-from fleet_slip.limits import memory_bytes
+from fleet_slip.resources import memory_bytes
 
 # A module is imported when one of its commands runs: --help and shell completion import none. The
 # list of commands takes their docstrings from the module's compiled code. Help is plain text: boxes

@@ -9,7 +9,7 @@ import sys
 from typing import Any
 
 from fleet_slip.errors import INTERRUPTED, StorageError, is_lack_of_memory
-from fleet_slip.limits import memory_bytes
+from fleet_slip.resources import memory_bytes
 
 
 def _leave(_signal: int, _frame: Any) -> None:

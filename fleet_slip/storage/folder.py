@@ -192,6 +192,10 @@ _FILE_ERRORS = {
     errno.EACCES: "permission denied. Check the owner of the folder, or choose another.",
     errno.EROFS: "the file system is read-only. Choose a writable folder.",
     errno.EISDIR: "a folder, not a file. Name a file.",
+    **dict.fromkeys(
+        (errno.EEXIST, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG),
+        "the path is too long, or has a file or a broken link in it. Choose another path.",
+    ),
     errno.EMFILE: "this process may have no more files open. Raise the limit: ulimit -n 1024",
     errno.EIO: "the disk cannot be read or written (I/O error). Have it examined, then restore "
     "what is damaged from a backup: fleet-slip verify",

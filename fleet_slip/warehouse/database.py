@@ -21,8 +21,7 @@ from fleet_slip.errors import (
     StorageError,
     printable,
 )
-from fleet_slip.limits import data_needed, memory_bytes
-from fleet_slip.resources import folder
+from fleet_slip.resources import data_needed, folder, memory_bytes
 from fleet_slip.storage.data_files import check_local_files, missing_file_error
 from fleet_slip.storage.folder import SPILL_PREFIX, Folder
 

@@ -7,16 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from fleet_slip import limits
+from fleet_slip import resources
 from fleet_slip.errors import StorageError
 from tests.support.commands import COMMAND, Finished, run
 
 pytestmark = pytest.mark.long
 
-ENOUGH_KIB = (limits.LIBRARIES_BYTES + limits.THREAD_BYTES * len(os.sched_getaffinity(0))) // 2**10
+ENOUGH_KIB = (
+    resources.LIBRARIES_BYTES + resources.THREAD_BYTES * len(os.sched_getaffinity(0))
+) // 2**10
 
 
-ENOUGH_DATA_KIB = limits.data_needed() // 2**10
+ENOUGH_DATA_KIB = resources.data_needed() // 2**10
 
 
 @pytest.mark.parametrize(
@@ -51,16 +53,16 @@ def test_the_limit_of_a_control_group_is_found(
     (tmp_path / "fs" / file).parent.mkdir(parents=True)
     (tmp_path / "fs" / file).write_text("123456789\n")
     (tmp_path / "fs/memory.max").touch()
-    monkeypatch.setattr(limits, "CGROUPS", tmp_path / "fs")
-    monkeypatch.setattr(limits, "OWN_CGROUP", tmp_path / "cgroup")
-    assert limits.memory_bytes() == 123456789
+    monkeypatch.setattr(resources, "CGROUPS", tmp_path / "fs")
+    monkeypatch.setattr(resources, "OWN_CGROUP", tmp_path / "cgroup")
+    assert resources.memory_bytes() == 123456789
 
 
 @pytest.mark.parametrize(
     ("address_space", "data", "left"),
     [
-        (limits.LIBRARIES_BYTES + 10**9, resource.RLIM_INFINITY, 10**9),
-        (resource.RLIM_INFINITY, 2 * 10**9, 2 * 10**9 - limits.DATA_BYTES // 2),
+        (resources.LIBRARIES_BYTES + 10**9, resource.RLIM_INFINITY, 10**9),
+        (resource.RLIM_INFINITY, 2 * 10**9, 2 * 10**9 - resources.DATA_BYTES // 2),
     ],
 )
 def test_data_gets_what_the_libraries_leave(
@@ -68,7 +70,7 @@ def test_data_gets_what_the_libraries_leave(
 ) -> None:
     hard = {resource.RLIMIT_AS: address_space, resource.RLIMIT_DATA: data}
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (hard[kind], hard[kind]))
-    assert limits.memory_bytes() == left
+    assert resources.memory_bytes() == left
 
 
 FULL = Path("/dev/full")
