@@ -248,24 +248,21 @@ class Cohort:
         `QuestionError` if the feature set has no blocks. Reads Gram rows again if only sums of
         other folds were read.
         """
-        folds = self._folds_without_prior(by, count)
+        folding = Folding(by=by, count=count)
+        if self.sums is not None and folding == self.folding:
+            folds = self.sums
+        elif self.sums is not None and self.source is not None:
+            cohort = load_cohort(self.source, self.predicate, self.feature_set, folding)
+            folds = cohort.folds(by, count)
+        else:
+            require_blocks(self.catalog, self.feature_set, by)
+            values = self.drives[FOLD_KEYS[by]].to_pylist()
+            assignment = assign_folds(values, by, count)
+            folds = CohortFolds.from_tables(self.tables, assignment, self.drive_numbers)
         if self.prior is None:
             return folds
         auxiliary = tuple(table.total() for table in self.prior.tables)
         return replace(folds, auxiliary=auxiliary, weight=self.weight)
-
-    def _folds_without_prior(self, by: FoldKey, count: FoldCount) -> CohortFolds:
-        folding = Folding(by=by, count=count)
-        if self.sums is not None and folding == self.folding:
-            return self.sums
-        if self.sums is not None and self.source is not None:
-            cohort = load_cohort(self.source, self.predicate, self.feature_set, folding)
-            return cohort._folds_without_prior(by, count)
-        require_blocks(self.catalog, self.feature_set, by)
-        values = self.drives[FOLD_KEYS[by]].to_pylist()
-        return CohortFolds.from_tables(
-            self.tables, assign_folds(values, by, count), self.drive_numbers
-        )
 
     def complete_cases(self, inputs: Sequence[str]) -> CompleteCases:
         """Return the drives that contain the label and all inputs. Raises `DataError` for none."""

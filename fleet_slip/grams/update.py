@@ -7,7 +7,7 @@ serves new days, interrupted and repeated runs, deletions and compaction.
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date
 from hashlib import blake2b
 from itertools import accumulate
@@ -23,7 +23,6 @@ from fleet_slip.calibration.receiver_delay import course_delays
 from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import COURSE_LATE
 from fleet_slip.catalog.features import PLAIN
-from fleet_slip.catalog.signals import RECEIVED_FILES
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams
 from fleet_slip.regression.gram import GramTable
@@ -209,15 +208,13 @@ def _update_set(
     paths: Collection[str] | None,
 ) -> GramReport:
     """Update one feature set: find the work, compute and write Gram rows, commit."""
-    work = _find_work(warehouse, feature_set)
+    work = _find_work(warehouse, feature_set, paths)
     if work.logs.version is None and work.stale:
         raise StorageError(
             f"{warehouse.logs.folder}: the logs that Gram rows were computed from are gone, of "
             f"{pluralize(len(work.stale), 'file')}. Nothing is changed: restore the folder from "
             "a backup."
         )
-    if paths is not None:
-        work = work.limited_to(paths)
     grams, superseded = work.grams, 0
     if work:
         rows = compute_grams(warehouse, work.files, progress, feature_set, executor, work.delays)
@@ -270,27 +267,40 @@ class _Work:
     def __bool__(self) -> bool:
         return bool(self.files or self.stale)
 
-    def limited_to(self, paths: Collection[str]) -> "_Work":
-        """Return the work without the log files that are not in `paths`."""
-        files = tuple(file for file in self.files if file.path in paths)
-        return replace(self, files=files, outdated=self.outdated & frozenset(paths))
 
-
-def _find_work(warehouse: Warehouse, feature_set: str) -> _Work:
-    """Compare the Gram rows of a feature set with the log files; change nothing."""
+def _find_work(
+    warehouse: Warehouse, feature_set: str, paths: Collection[str] | None = None
+) -> _Work:
+    """Compare the Gram rows of a feature set with the log files, or some; change nothing."""
     # The snapshot of the logs is the later one. Who removes a drive from the logs after it changes
     # the Gram rows after the snapshot of these, and a commit on that snapshot is a conflict.
     grams = warehouse.grams.snapshot()
     logs = warehouse.logs.snapshot()
     identity = warehouse.catalog.identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
-    files, delays, outdated = backlog.missing, None, frozenset[str]()
-    if warehouse.catalog.feature_set(feature_set).in_time:
-        active = {file.path: file for file in logs.files}
-        delays = course_delays(warehouse, grams, frozenset(active))
-        outdated = frozenset(files_of_other_delay(grams, identity, delays) & active.keys())
-        files += tuple(active[path] for path in sorted(outdated))
-    return _Work(grams, logs, identity, files, outdated, backlog.stale, delays)
+    delays = _delays(warehouse, feature_set, grams, logs)
+    outdated = set[str]()
+    if delays is not None:
+        outdated = {
+            path
+            for path, car, delay in recorded_delays(grams, identity)
+            if delay != delays.get(car, 0)
+        }
+    requested = [file for file in logs.files if paths is None or file.path in paths]
+    missing = {file.path for file in backlog.missing}
+    old = [file for file in requested if file.path in outdated]
+    files = (*(file for file in requested if file.path in missing), *old)
+    outdated_paths = frozenset(file.path for file in old)
+    return _Work(grams, logs, identity, files, outdated_paths, backlog.stale, delays)
+
+
+def _delays(
+    warehouse: Warehouse, feature_set: str, grams: Snapshot, logs: Snapshot
+) -> Mapping[str, int] | None:
+    """Return the course delay of each car; None for a feature set that is not corrected for it."""
+    if not warehouse.catalog.feature_set(feature_set).in_time:
+        return None
+    return course_delays(warehouse, grams, frozenset(file.path for file in logs.files))
 
 
 def _write_files(
@@ -344,11 +354,7 @@ def commit_ahead(
         # The logs are opened last, as in `_find_work`, in the scales that they have.
         logs = Snapshot(warehouse.logs, warehouse.logs.open_delta())
         require_active(logs, replaced)
-        delays = None
-        if warehouse.catalog.feature_set(name).in_time:
-            active = frozenset(file.path for file in logs.files)
-            delays = course_delays(warehouse, grams, active)
-        rows = aggregate(warehouse, missing, name, delays)
+        rows = aggregate(warehouse, missing, name, _delays(warehouse, name, grams, logs))
         _commit(grams, logs, identity, write_rows(warehouse, [rows]))
 
 
@@ -573,28 +579,7 @@ def require_active(logs: Snapshot, files: Collection[TableFile]) -> None:
         )
 
 
-# Receiver delays that the courses in Gram rows were corrected for.
-
-
-def files_of_other_delay(grams: Snapshot, identity: str, delays: Mapping[str, int]) -> set[str]:
-    """Return the log files whose Gram rows of a feature set have another delay than their cars."""
-    return {
-        path
-        for path, car, delay in _recorded_delays(grams, identity)
-        if delay != delays.get(car, 0) and not path.startswith(RECEIVED_FILES)
-    }
-
-
-def recorded_delays(grams: Snapshot, identity: str, log_file: str) -> dict[str, int]:
-    """Return the delays that Gram rows of a log file were corrected for, by car."""
-    return {
-        car: delay
-        for path, car, delay in _recorded_delays(grams, identity)
-        if path == log_file and delay
-    }
-
-
-def _recorded_delays(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
+def recorded_delays(grams: Snapshot, identity: str) -> set[tuple[str, str, int]]:
     """Return the log files, cars and delays in the Gram rows of a feature set; 0 if unknown."""
     triples: set[tuple[str, str, int]] = set()
     for rows in rows_of_set(grams, identity, "file", "vehicle_id", COURSE_LATE):

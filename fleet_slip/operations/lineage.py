@@ -5,7 +5,7 @@ The format is that of https://openlineage.io/docs/spec/object-model, written by 
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib.metadata import version as package_version
@@ -48,7 +48,7 @@ driver."""
 
 @contextmanager
 def emit_lineage(
-    target: str, warehouse: "Warehouse", run: Run, arguments: Mapping[str, object]
+    target: str, warehouse: "Warehouse", run: Run, arguments: Mapping[str, Any]
 ) -> Iterator[None]:
     """Emit the events of a run to a file or a URL. Errors of emitting are warnings.
 
@@ -80,16 +80,13 @@ def emit_lineage(
         return kind(namespace=place, name=path, facets=facets)
 
     def send(state: event_v2.RunState, outputs: Mapping[str, int], error: str | None) -> None:
-        facets: dict[str, Any] = {}
-        if error:
-            facets["errorMessage"] = facet_v2.error_message_run.ErrorMessageRunFacet(
-                error, "PYTHON"
-            )
-        reads = [table for table in INPUT_TABLES.get(run.command, ()) if table in before]
+        message = facet_v2.error_message_run.ErrorMessageRunFacet(error or "", "PYTHON")
+        facets: dict[str, Any] = {"errorMessage": message} if error else {}
         inputs = [dataset(event_v2.InputDataset, folder) for folder in folders]
         inputs += [
             dataset(event_v2.InputDataset, f"{warehouse.root}/{table}", before[table])
-            for table in reads
+            for table in INPUT_TABLES.get(run.command, ())
+            if table in before
         ]
         event = event_v2.RunEvent(
             eventTime=datetime.now(UTC).isoformat(),
@@ -129,32 +126,25 @@ def emit_lineage(
 
 def _emitter(target: str) -> Callable[[Any], object]:
     """Return the function that sends an event to a file or a URL. Raises `UsageError`."""
-    if "://" not in target:
-        if Path(target).is_dir() or not Path(target).parent.is_dir():
-            raise UsageError(f"--lineage {target}: name a file in a folder that exists.")
-        from openlineage.client.transport.file import (  # noqa: PLC0415 - an extra
-            FileConfig,
-            FileTransport,
-        )
+    from openlineage.client.transport import get_default_factory  # noqa: PLC0415 - an extra
 
-        return FileTransport(FileConfig(log_file_path=target, append=True)).emit
-    url = urlsplit(target)
-    try:
-        valid = url.scheme in ("http", "https") and bool(url.hostname) and url.port != 0
-    except ValueError:  # a port that is no number of a port
-        valid = False
+    valid, config = False, dict[str, Any]()
+    if "://" not in target:
+        valid = Path(target).parent.is_dir() and not Path(target).is_dir()
+        config = {"type": "file", "log_file_path": target, "append": True}
+    else:
+        with suppress(ValueError):  # a port that is no number of a port
+            url = urlsplit(target)
+            valid = url.scheme in ("http", "https") and bool(url.hostname) and url.port != 0
+            config = {"type": "http", "url": f"{url.scheme}://{url.netloc}", "timeout": TIMEOUT_S}
+            config |= {"endpoint": endpoint} if (endpoint := url.path.strip("/")) else {}
+            config["retry"] = {"total": 0}
     if not valid:
         raise UsageError(
-            f"--lineage {hide_passwords(target, to_end=True)}: not a URL of a server. Name a file, "
-            "or a URL such as http://HOST:PORT."
+            f"--lineage {hide_passwords(target, to_end=True)}: name a file in a folder that "
+            "exists, or a URL of a server such as http://HOST:PORT."
         )
-    from openlineage.client.transport.http import HttpConfig, HttpTransport  # noqa: PLC0415
-
-    options: dict[str, Any] = {"timeout": TIMEOUT_S, "retry": {"total": 0}}
-    if endpoint := url.path.strip("/"):
-        options["endpoint"] = endpoint
-    server = f"{url.scheme}://{url.netloc}"
-    return HttpTransport(HttpConfig.from_dict({"url": server, **options})).emit
+    return get_default_factory().create(config).emit
 
 
 def _table_versions(warehouse: "Warehouse") -> dict[str, int]:
@@ -176,14 +166,9 @@ def _table_versions(warehouse: "Warehouse") -> dict[str, int]:
     return versions
 
 
-def _log_folders(arguments: Mapping[str, object]) -> list[str]:
+def _log_folders(arguments: Mapping[str, Any]) -> list[str]:
     """Return the folders of the measured logs among the arguments of a command."""
-    names: list[str] = []
-    for argument in INPUT_ARGUMENTS:
-        value = arguments.get(argument)
-        if isinstance(value, str | Path):
-            names.append(str(value))
-        elif isinstance(value, Sequence):
-            names += [str(name) for name in value]
-    folders = (Path(name) if Path(name).is_dir() else Path(name).parent for name in names)
-    return sorted({str(folder) for folder in folders})
+    values = [arguments.get(argument) or () for argument in INPUT_ARGUMENTS]
+    lists = [[value] if isinstance(value, str | Path) else value for value in values]
+    names = [Path(name) for names in lists for name in names]
+    return sorted({str(name if name.is_dir() else name.parent) for name in names})

@@ -13,18 +13,16 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from itertools import compress
 from statistics import fmean, stdev
 
-from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import AlarmError, DataError, StorageError
 from fleet_slip.grams.cohort import remark_left_out, sum_days
-from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.quality.peers import thresholds
 from fleet_slip.regression.folds import error_sums, least_squares
 from fleet_slip.regression.gram import Gram
-from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.predicate import Predicate, parse_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -164,52 +162,31 @@ def monitor(
             f"{sum(training)} in the cohort {predicate.quoted}. Choose another cohort, or a later "
             "--since."
         )
-    models = _models(catalog, manifest, feature_set, grams, training)
+    champion = manifest.counts_model(catalog, feature_set)
+    refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
+    total = sum(compress(grams, training), Gram.zero(grams[0].signals))
     charted: list[Day] = []
-    for day, gram, drives, model, is_training in zip(
-        days, grams, sums.drives, models, training, strict=True
-    ):
+    for day, gram, drives, is_training in zip(days, grams, sums.drives, training, strict=True):
+        model = refit(total - gram) if is_training else champion
         errors = error_sums(model, gram).figures(catalog.input_scales[model.label])
         mean_deg, std_deg = errors.error_mean_deg, errors.error_std_deg
         charted.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, is_training))
-    usual = [day for day in charted if day.training]
-    mean = Limits.from_values([day.error_mean_deg for day in usual], limits.false_alarms_per_day)
-    std = Limits.above([day.error_std_deg for day in usual], limits.false_alarms_per_day)
-    judged = tuple(day if day.training else _judged(day, mean, std) for day in charted)
+    usual = [charted_day for charted_day in charted if charted_day.training]
+    mean = Limits.from_values([d.error_mean_deg for d in usual], limits.false_alarms_per_day)
+    std = Limits.above([d.error_std_deg for d in usual], limits.false_alarms_per_day)
+    for i, new in enumerate(charted):
+        checked = (("mean", mean, new.error_mean_deg), ("std", std, new.error_std_deg))
+        alarms = tuple(name for name, bounds, value in checked if bounds.beyond(value))
+        charted[i] = new if new.training else replace(new, alarms=alarms)
     return Chart(
         version.reference,
         predicate.text,
-        judged,
+        tuple(charted),
         mean,
         std,
         feature_set,
         sums.left_out,
         manifest.line_remark,
-    )
-
-
-def _models(
-    catalog: Catalog,
-    manifest: Manifest,
-    feature_set: str,
-    grams: Sequence[Gram],
-    training: Sequence[bool],
-) -> list[LinearModel]:
-    """Return the model that predicts each day: of a training day, the one made without it."""
-    of_training = [gram for gram, is_training in zip(grams, training, strict=True) if is_training]
-    total = sum(of_training[1:], of_training[0])
-    champion = manifest.counts_model(catalog, feature_set)
-    refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
-    return [
-        refit(total - gram) if is_training else champion
-        for gram, is_training in zip(grams, training, strict=True)
-    ]
-
-
-def _judged(day: Day, mean: Limits, std: Limits) -> Day:
-    checked = (("mean", mean, day.error_mean_deg), ("std", std, day.error_std_deg))
-    return replace(
-        day, alarms=tuple(name for name, limits, value in checked if limits.beyond(value))
     )
 
 

@@ -295,7 +295,8 @@ def _long_drives(cohort: Cohort, min_rows: int) -> Iterator[tuple[GramTable, pa.
     start = 0
     for table in cohort.tables:
         long = table.n >= min_rows
-        yield table.take(long), cohort.drives.slice(start, len(table)).filter(pa.array(long))
+        if long.any():
+            yield table.take(long), cohort.drives.slice(start, len(table)).filter(pa.array(long))
         start += len(table)
 
 

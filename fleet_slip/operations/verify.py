@@ -554,7 +554,8 @@ def _compare_ways(
     stored = stored_grams(stored_in, [file], identity).get(file.path, {})
     if not stored and feature_set != PLAIN:
         return 0
-    delays = recorded_delays(stored_in, identity, file.path)
+    recorded = recorded_delays(stored_in, identity)
+    delays = {car: delay for path, car, delay in recorded if path == file.path and delay}
     rows = wide_grams(warehouse, [file], feature_set, delays)
     computed, references = grams_of(rows), {"the stored Gram rows": stored}
     if has_statement(warehouse.catalog, feature_set):

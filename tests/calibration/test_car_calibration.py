@@ -237,18 +237,6 @@ def test_one_drive_is_as_sure_as_it_is_where_roads_differ() -> None:
     assert 0.33 < np.mean(squares) < 2
 
 
-def test_bends_too_tight_for_their_bank_tell_no_speed() -> None:
-    rng = np.random.default_rng(13)
-    signals = [cars.drive(rng, 2.0) for _ in range(3)]
-    for one in signals:
-        for name in ("yaw_rate", "ay"):
-            one[name] *= 3
-    found = evidence([gram_row("car", n, cars.counts(one)) for n, one in enumerate(signals)])
-    assert "yaw_rate_offset" in calibrated(found, "car")
-    assert "speed_ratio" not in calibrated(found, "car")
-    assert "satellite" in refusals(found, "car")["speed_ratio"]
-
-
 def test_the_lean_of_roads_is_what_the_cars_do_not_explain() -> None:
     offsets = [Fraction(i - 10, 100) for i in range(21)]
     assert estimate_roads(True, offsets).lean == 0

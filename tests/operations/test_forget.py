@@ -21,7 +21,6 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import (
     Retention,
     forget,
-    quarantined_of,
     retain,
 )
 from fleet_slip.operations.rewriting import compact, vacuum
@@ -111,15 +110,6 @@ def test_where_a_delta_log_was_lost_nothing_is_deleted(
     assert sorted(tmp_path.rglob("*.parquet")) == files
 
 
-def test_refused_rows_are_of_a_drive_or_of_the_whole_that_it_was_cut_from() -> None:
-    ids = ["log", "log-1", "log-10", "log2", None]
-    rows = pa.table({"drive_id": ids, "vehicle_id": ["a", None, "b", "a", "a"]})
-    drive = ErasureSubject("drive", "log-1")
-    assert quarantined_of(rows, drive, set()).to_pylist() == [True, True, False, False, False]
-    by_car = quarantined_of(rows, ErasureSubject("vehicle", "a"), {"log-10"}).to_pylist()
-    assert by_car == [True, False, True, True, True]
-
-
 def test_the_record_names_nobody_and_can_be_asked(tmp_path: Path) -> None:
     warehouse = fill(tmp_path, *CARS)
     erasure_log = ErasureLog(LocalFolder(tmp_path))
@@ -188,21 +178,6 @@ def test_a_car_all_of_whose_rows_were_refused_goes_too(tmp_path: Path, subject: 
     left = mentions(tmp_path / "data", "secretive") + mentions(tmp_path / "data", "777.125")
     assert not left
     assert not forget(warehouse, chosen).changed
-
-
-def test_a_refused_row_of_no_drive_goes_with_its_car_and_counts_as_none(
-    warehouse: Warehouse, tmp_path: Path
-) -> None:
-    columns = good_columns(50) | {"day": ["2024-05-31"] * 49 + ["unknown"]}
-    (tmp_path / "x.csv").write_text(csv_text(columns))
-    mapping = a_mapping(drive={"day": {"column": "day"}})
-    assert ingest_file(warehouse, tmp_path / "x.csv", mapping).counts.drives == 1
-    (path,) = warehouse.quarantine.snapshot().paths
-    assert pq.read_table(path).select(["drive_id", "vehicle_id"]).to_pylist() == [
-        {"drive_id": None, "vehicle_id": "car"}
-    ]
-    assert forget(warehouse, ErasureSubject("vehicle", "car"), now=True).drives == 1
-    assert not warehouse.quarantine.snapshot().files
 
 
 def test_retention_forgets_by_age_and_refuses_to_leave_nothing(tmp_path: Path) -> None:

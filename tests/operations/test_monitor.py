@@ -2,7 +2,6 @@
 
 import math
 import shutil
-from dataclasses import replace
 from datetime import date, timedelta
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from scipy import stats
 import fleet_slip
 from fleet_slip.errors import DataError, UsageError
 from fleet_slip.grams.update import update_grams
-from fleet_slip.models.manifest import CombinedWithFilter
 from fleet_slip.models.publish import manifest_of, publish_challenger
 from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.request import SelectionRequest
@@ -58,21 +56,6 @@ def of_training_days(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def trained(of_training_days: Path, warehouse: Warehouse) -> tuple[Warehouse, ModelVersion]:
     shutil.copytree(of_training_days, str(warehouse.root))
     return warehouse, Registry(warehouse.root, CATALOG).resolve("m")
-
-
-def test_a_version_with_a_filter_is_charted_as_its_line_and_says_so(
-    trained: tuple[Warehouse, ModelVersion],
-) -> None:
-    warehouse, version = trained
-    plain = monitor(warehouse, version)
-    term = version.manifest.terms[0]
-    combination = CombinedWithFilter.model_construct(method="constant", term=term)
-    manifest = version.manifest.model_copy(update={"combination": combination})
-    chart = monitor(warehouse, replace(version, manifest=manifest))
-    assert chart.days == plain.days
-    assert "linear model alone" in str(chart)
-    assert "remark" in chart.as_dict()
-    assert "remark" not in plain.as_dict()
 
 
 def new_days(chart: Chart) -> list[tuple[date, tuple[str, ...]]]:

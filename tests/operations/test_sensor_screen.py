@@ -126,26 +126,6 @@ def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
     assert fleet.models.publish("m", chosen, force=True).new
 
 
-def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
-    tmp_path: Path, smoke_root: Path
-) -> None:
-    landing = Landing(tmp_path / "landing", smoke_root)
-    landing.prepare()
-    fleet, drives = fleet_slip.open(tmp_path / "data"), landing.drives()
-    late = "coalesce(lag(sideslip_rad, 60) OVER (PARTITION BY drive_id ORDER BY time_s), 0)"
-    for name, some, changes in (("a", drives[:4], {}), ("b", drives[4:], {"sideslip_rad": late})):
-        day = date(2026, 10, 5 + (name == "b"))
-        fleet.ingest(landing.land(name, some, day, **changes), str(landing.mapping))
-        fleet.gram()
-        if name == "a":
-            assert fleet.models.publish("m", fleet.cohort()).new
-    assert fleet.cohort().examine().faults == {"late sideslip": 4}
-    chosen = fleet.cohort(include_faulty=True).select()
-    with pytest.raises(RefusedError, match=r"of 4 inspected drives .*late sideslip\? it is \+0\.6"):
-        fleet.models.publish("m", chosen)
-    assert fleet.models.publish("m", chosen, candidate=True).candidate
-
-
 def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_columns(
     fleet: Fleet, run_command: RunCommand, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
