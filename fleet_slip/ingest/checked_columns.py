@@ -182,18 +182,9 @@ def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
     """Return whether a row meets all of the mapping's conditions. Raises `ValueError`."""
     predicates = []
     for condition in mapping.where:
-        signal = condition.signal
-        name = find_held(
-            str(condition.column if signal is None else mapping.signals[signal].column), schema
-        )
-        if signal is not None:
-            source = mapping.signals[signal]
-            value = _si_value(mapping, signal, source, _signed(source, name, schema, mapping))
-        elif condition.one_of:
-            value = as_text(name, schema, mapping)
-        else:
-            value = _number(name, schema, mapping)
-        predicates.append(condition.is_met(value))
+        column = find_held(condition.column, schema)
+        read = as_text if condition.one_of else _number
+        predicates.append(condition.is_met(read(column, schema, mapping)))
     return pl.all_horizontal(predicates)
 
 

@@ -19,7 +19,7 @@ import polars as pl
 from pydantic import Field, field_validator, model_validator
 
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
-from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, Identifier, Signal, SignalCatalog
+from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S, Signal, SignalCatalog
 from fleet_slip.config import Config, Name, PositiveFloat, added
 from fleet_slip.ingest.formats.source import OWN_TIME
 
@@ -202,16 +202,22 @@ class SignalColumn(Config):
     antenna_y_m: OffsetM | None = added(None)
     """How far it is to the left of the centre of gravity."""
 
-    @model_validator(mode="after")
-    def _gain_is_something(self) -> "SignalColumn":
-        if self.gain == 0:
+    @field_validator("unit")
+    @classmethod
+    def _unit_is_chosen(cls, unit: str) -> str:
+        if unit == CHOOSE:
+            raise ValueError("the file has no unit: write the right one")
+        return unit
+
+    @field_validator("gain")
+    @classmethod
+    def _gain_is_something(cls, gain: float) -> float:
+        if gain == 0:
             raise ValueError("gain cannot be 0")
-        return self
+        return gain
 
     def require_unit_of(self, signal: str, si_unit: str) -> None:
         """Raise `ValueError` if the column cannot be this signal."""
-        if self.unit == CHOOSE:
-            raise ValueError("has no unit in the file: write the right one")
         is_wheel = signal.startswith(WHEEL_PREFIX)
         if self.radius_m is not None and not is_wheel:
             raise ValueError("has radius_m, which is for wheel speeds only")
@@ -261,7 +267,7 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
         )
         if name not in {COURSE, SATELLITE_SPEED} and any(key is not None for key in keys):
             raise ValueError(f"signals.{name}: antenna and direction are keys of the course")
-    course = signals.get(COURSE)
+    course, speed = signals.get(COURSE), signals.get(SATELLITE_SPEED)
     if course is None:
         return
     if course.component is None and course.clockwise_from_north is None:
@@ -274,10 +280,9 @@ def require_satellites(signals: Named[str, SignalColumn]) -> None:
             "signals.course: set antenna_x_m (forward of the centre of gravity) and antenna_y_m "
             "(left of it). A 1 m error costs about 1° in bends"
         )
-    for needed in (SATELLITE_SPEED, "yaw_rate"):
-        if needed not in signals:
-            raise ValueError(f"signals.course: needs {needed}, too")
-    speed = signals[SATELLITE_SPEED]
+    if speed is None or "yaw_rate" not in signals:
+        needed = SATELLITE_SPEED if speed is None else "yaw_rate"
+        raise ValueError(f"signals.course: needs {needed}, too")
     if (course.time, course.delay_s) != (speed.time, speed.delay_s):
         raise ValueError(
             "signals.course: give satellite_speed the same time and delay_s: it is one receiver"
@@ -345,24 +350,22 @@ class TimeBase(Config):
     @model_validator(mode="after")
     def _consistent(self) -> "TimeBase":
         if [self.column is None, self.rate_hz is None, not self.own_clock].count(False) != 1:
-            raise ValueError(
-                "needs either 'column' or 'rate_hz', or 'own_clock' for files with clocks, as MDF"
-            )
-        if self.column is None and (self.unit is not None or self.format is not None):
+            raise ValueError("needs either 'column', 'rate_hz', or 'own_clock' for files as MDF")
+        has_unit, has_format = self.unit is not None, self.format is not None
+        has_clock = has_format and reads_clock(str(self.format))
+        if self.column is None and (has_unit or has_format):
             raise ValueError("'unit' and 'format' need a 'column'")
-        if self.unit is not None and self.format is not None:
+        if has_unit and has_format:
             raise ValueError("'unit' is for numbers and 'format' for timestamps: give one of them")
-        if self.epoch and self.unit is None:
+        if self.epoch and not has_unit:
             raise ValueError("'epoch' is for numbers: give their 'unit'")
         if self.assumed and self.rate_hz is None:
             raise ValueError("'assumed' is for an unknown rate_hz")
-        if self.date is not None:
-            if self.format is None or not reads_clock(self.format):
-                raise ValueError("'date' needs a column whose 'format' has the time of day alone")
-            if not _reads_back(str(self.moment_format)):
-                raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
-        zoned = self.format is not None and "%z" in self.format
-        if self.zone is not None and (zoned or self.unit is not None or self.rate_hz is not None):
+        if self.date is not None and not has_clock:
+            raise ValueError("'date' needs a column whose 'format' has the time of day alone")
+        if self.date is not None and not _reads_back(str(self.moment_format)):
+            raise ValueError(f"{self.date.format!r} is not a strftime format of a date")
+        if self.zone and (has_unit or self.rate_hz or "%z" in (self.format or "")):
             raise ValueError("'zone' is for timestamps or a clock without a time zone")
         if self.longest_gap_s > self.split_gap_s:
             raise ValueError("longest_gap_s cannot be larger than split_gap_s")
@@ -496,13 +499,9 @@ _BOUNDS: dict[str, Callable[[pl.Expr, float], Any]] = {
 
 
 class RowCondition(Config):
-    """A condition on one column, in the column's own unit; a missing value does not meet it.
+    """A condition on one column, in the column's own unit; a missing value does not meet it."""
 
-    Or on a signal of the mapping, in the catalog's unit.
-    """
-
-    column: Name | None = None
-    signal: Identifier | None = added(None)
+    column: Name
     at_least: Bound | None = None
     at_most: Bound | None = None
     above: Bound | None = added(None)
@@ -513,14 +512,8 @@ class RowCondition(Config):
 
     @model_validator(mode="after")
     def _says_something(self) -> "RowCondition":
-        if (self.column is None) == (self.signal is None):
-            raise ValueError("needs either 'column' or 'signal'")
-        if self.one_of and self.bounds:
-            raise ValueError("give 'one_of', or 'at_least' and 'at_most', and not both")
-        if not self.one_of and not self.bounds:
-            raise ValueError("needs 'at_least', 'at_most' or 'one_of'")
-        if self.one_of and self.signal is not None:
-            raise ValueError("'one_of' is for a column: a signal is a number")
+        if bool(self.one_of) == bool(self.bounds):
+            raise ValueError("needs either 'one_of', or bounds such as 'at_least' and 'at_most'")
         return self
 
     @property
@@ -541,7 +534,7 @@ def describe(conditions: Sequence[RowCondition]) -> str:
     """Return conditions as a message shows them."""
     texts = []
     for condition in conditions:
-        fields = condition.model_dump(exclude_defaults=True, exclude={"column", "signal"})
-        parts = [f"{key.replace('_', ' ')} {value}" for key, value in fields.items()]
-        texts.append(f"{condition.column or condition.signal!r} is {' and '.join(parts)}")
+        bounds = {"one_of": condition.one_of} if condition.one_of else condition.bounds
+        limits = " and ".join(f"{key.replace('_', ' ')} {value}" for key, value in bounds.items())
+        texts.append(f"{condition.column!r} is {limits}")
     return " and ".join(texts)

@@ -2,8 +2,7 @@
 
 import os
 import re
-from collections.abc import Container, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Container, Iterable
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -33,7 +32,6 @@ from fleet_slip.config import (
 )
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
-    CHOOSE,
     WHEEL_PREFIX,
     OffsetM,
     RowCondition,
@@ -122,6 +120,10 @@ class FromColumn(Config):
     column: Name
 
 
+MAX_STARS = 2
+"""Stars of a pattern: the time to match a path grows as its length to the power of their number."""
+
+
 class FromPath(Config):
     """A drive's metadata in the path of its file, where the pattern has `{}`.
 
@@ -136,49 +138,29 @@ class FromPath(Config):
     def _has_one_place(cls, path: str) -> str:
         if path.count("{}") != 1:
             raise ValueError("write {} once, in place of the value: '{}/*' is the folder's name")
+        if path.count("*") > MAX_STARS:
+            raise ValueError(f"at most {MAX_STARS} * can be matched: one stands for any text")
         return path
 
     def find(self, file: Path) -> str:
         """Return the text of `{}` in a file's path. Raises `InputError` for another path."""
-        components = self.path.split("/")
+        if (match := self.match(file)) is None:
+            raise InputError(
+                f"{quote_name(file)}: the path does not end as in path = {self.path!r}."
+            )
+        return match[1]
+
+    def match(self, file: Path) -> tuple[Path, str] | None:
+        """Return the folder above the pattern, and the text at `{}`; None for another path.
+
+        A `*` takes as much as it can, and `{}` as little as it can, but one character.
+        """
+        meanings = {"{}": "([^/]+?)", "*": "[^/]*"}
+        parts = re.split(r"(\{\}|\*)", self.path)
+        pattern = "".join(meanings.get(part, re.escape(part)) for part in parts)
         path = os.path.abspath(file)  # noqa: PTH100 - follows no link
-        names = path.split("/")[1:][-len(components) :]
-        if len(names) == len(components):
-            matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
-            if None not in matches:
-                return "".join(value for value in matches if value is not None)
-        raise InputError(f"{quote_name(file)}: the path does not end as in path = {self.path!r}.")
-
-
-def match_name(pattern: str, name: str) -> str | None:
-    """Return the text that `{}` matches in a file's name, empty without one; None if none matches.
-
-    The time is that of the product of both lengths. A `*` takes as much as it can, the first one
-    first, and `{}` as little as it can, but one character.
-    """
-    elements = [element for element in re.split(r"(\{\}|\*)", pattern) if element]
-    positions = {len(name)}  # where the elements after the present one can begin
-    starts = [positions]
-    for element in reversed(elements):
-        if element in {"*", "{}"}:
-            positions = set(range(max(positions, default=-1) + (element == "*")))
-        else:
-            size = len(element)
-            ends = (end for end in positions if name.endswith(element, 0, end))
-            positions = {end - size for end in ends}
-        starts.insert(0, positions)
-    if 0 not in positions:
-        return None
-    position, value = 0, ""
-    for element, following in zip(elements, starts[1:], strict=True):
-        if element == "*":
-            position = max(following)
-        elif element == "{}":
-            end = min(start for start in following if start > position)
-            position, value = end, name[position:end]
-        else:
-            position += len(element)
-    return value
+        match = re.fullmatch(f"(.*/){pattern}", path, re.DOTALL)
+        return None if match is None else (Path(match[1]), match[2])
 
 
 Elsewhere = FromColumn | FromPath
@@ -235,14 +217,7 @@ class FilePattern(Config):
 
     def find(self, file: Path) -> tuple[Path, str] | None:
         """Return the folder above the pattern, and the text at {}; None for another file."""
-        components = self.path.split("/")
-        names = file.parts[-len(components) :]
-        if len(names) < len(components):
-            return None
-        matches = [match_name(*pair) for pair in zip(components, names, strict=True)]
-        if None in matches:
-            return None
-        return Path(*file.parts[: -len(components)]), "".join(map(str, matches))
+        return FromPath(path=self.path).match(file)
 
 
 class Mapping(Config):
@@ -280,21 +255,9 @@ class Mapping(Config):
             raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
         return where
 
-    @model_validator(mode="before")
-    @classmethod
-    def _is_filled_in(cls, content: Any) -> Any:
-        if len(missing := list(_missing_keys(content))) > 1:
-            raise ValueError(f"to be filled in: {', '.join(missing)}")
-        return content
-
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Mapping":
         self._signal_catalog = signals_of(info)
-        for condition in self.where:
-            if condition.signal is not None and condition.signal not in self.signals:
-                raise ValueError(f"where: {condition.signal!r} is not a signal of this mapping")
-            if condition.signal is not None and self.signals[condition.signal].component:
-                raise ValueError(f"where: name the column of the file, not {condition.signal!r}")
         signals = self._signal_catalog.signals
         for name, column in self.signals.items():
             if name not in signals:
@@ -363,9 +326,7 @@ class Mapping(Config):
         names = [self.drive.column]
         names += [source.column for source in metadata if isinstance(source, FromColumn)]
         names += [self.time.date.column] if self.time.date else []
-        for condition in self.where:
-            signal = condition.signal
-            names.append(condition.column if signal is None else self.signals[signal].column)
+        names += [condition.column for condition in self.where]
         names += [signal.sign.column for signal in self.signals.values() if signal.sign]
         return list(dict.fromkeys(name for name in names if name is not None))
 
@@ -401,10 +362,9 @@ class Mapping(Config):
         """Columns that conditions compare with numbers alone, and those of `one_of`."""
         texts: dict[str, frozenset[str]] = {}
         for condition in self.where:
-            if condition.column is not None:
-                texts[condition.column] = texts.get(condition.column, frozenset()).union(
-                    condition.one_of
-                )
+            texts[condition.column] = texts.get(condition.column, frozenset()).union(
+                condition.one_of
+            )
         return {column: names for column, names in texts.items() if all(map(is_number, names))}
 
     @property
@@ -421,22 +381,6 @@ class Mapping(Config):
     def canonical_json(self) -> str:
         """Return JSON of the mapping that does not depend on the layout of its TOML file."""
         return canonical_ascii(self.model_dump(mode="json", exclude={"vehicle"}))
-
-
-def _missing_keys(content: Any) -> Iterator[str]:
-    """Yield the keys that a draft leaves open: metadata of drives, and units."""
-    sections = content if isinstance(content, dict) else {}
-    drive, time = sections.get("drive", {}), sections.get("time", {})
-    if isinstance(drive, dict):
-        with suppress(ValidationError):
-            is_dated = TimeBase.model_validate(time).is_dated
-            if drive.get("day") is None and not is_dated:
-                yield "drive.day"
-        yield from (f"drive.{k}" for k in ("vehicle_id", "vehicle_model") if k not in drive)
-    signals = sections.get("signals", {})
-    for name, signal in signals.items() if isinstance(signals, dict) else ():
-        if isinstance(signal, dict) and signal.get("unit") == CHOOSE:
-            yield f"the unit of signals.{name} ({signal.get('column')})"
 
 
 def load_mapping(name_or_path: str, catalog: Catalog) -> Mapping:

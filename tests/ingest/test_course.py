@@ -152,8 +152,6 @@ def test_a_course_comes_with_speed_and_yaw_rate() -> None:
             a_mapping(signals=some)
     with pytest.raises(ValidationError, match="give the speed too"):
         a_mapping(signals={**VELOCITIES, "satellite_speed": ANGLE["satellite_speed"]})
-    with pytest.raises(ValidationError, match="name the column of the file"):
-        a_mapping(signals=VELOCITIES, where=[{"signal": "satellite_speed", "above": 5}])
 
 
 def test_a_course_that_turns_the_other_way_is_suspicious() -> None:

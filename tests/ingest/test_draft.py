@@ -78,7 +78,7 @@ def test_a_draft_does_not_load_until_its_units_are_chosen(tmp_path: Path) -> Non
     text = call(tmp_path, "mapping", "suggest", str(tmp_path / "log.csv"))
     assert '# Choose the unit: "m/s" or "km/h" or "mph".\nvehicle_speed = {' in text
     (tmp_path / "draft.toml").write_text(filled_in(text[text.index("name = ") :], units=False))
-    with pytest.raises(ConfigError, match=r"to be filled in: the unit of signals\.ax"):
+    with pytest.raises(ConfigError, match=r"signals\.ax\.unit: the file has no unit"):
         load_mapping(str(tmp_path / "draft.toml"), CATALOG)
 
 

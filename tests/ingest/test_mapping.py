@@ -9,14 +9,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from fleet_slip.catalog.catalog import Catalog, load_catalog
 from fleet_slip.errors import ConfigError, InputError
 from fleet_slip.ingest.columns import conversion_factor
-from fleet_slip.ingest.mapping import FromPath, load_mapping, match_name
+from fleet_slip.ingest.mapping import FromPath, load_mapping
 from fleet_slip.ingest.ticks import choose_grid, place_samples
 from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -95,7 +95,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ),
         ("negate", "negat", "signals.ax.negat: unknown key"),
         ('unit = "s"', 'unit = "m"', "t is in 'm', it needs a time"),
-        ('unit = "s"', "rate_hz = 100", "either 'column' or 'rate_hz'"),
+        ('unit = "s"', "rate_hz = 100", "either 'column', 'rate_hz'"),
         ('unit = "s"', 'unit = "s", format = "%s"', "give one of them"),
         ('unit = "s"', 'format = "%Q nonsense"', "not a strftime format"),
         ('unit = "s"', 'unit = "s", split_gap_s = 0.01', "longest_gap_s cannot be larger"),
@@ -326,7 +326,6 @@ def columns() -> dict[str, Any]:
             [{"column": "speed", "above": 5}, {"column": "fix", "one_of": ["RTK"]}],
             [2, *range(5, 18)],
         ),
-        ([{"signal": "vehicle_speed", "above": 5.1}], [2, *range(5, 20)]),
     ],
 )
 def test_rows_that_do_not_meet_the_conditions_are_counted(
@@ -349,11 +348,9 @@ def test_rows_that_do_not_meet_the_conditions_are_counted(
     ("where", "message"),
     [
         ("speed > 5", "write it as tables"),
-        ([{"signal": "ay", "above": 1}], "'ay' is not a signal of this mapping"),
-        ([{"signal": "ax", "one_of": ["1"]}], "'one_of' is for a column"),
-        ([{"at_least": 1}], "needs either 'column' or 'signal'"),
-        ([{"column": "speed"}], "needs 'at_least', 'at_most' or 'one_of'"),
-        ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "and not both"),
+        ([{"at_least": 1}], "column\n  Field required"),
+        ([{"column": "speed"}], "needs either 'one_of', or bounds"),
+        ([{"column": "speed", "at_least": 1, "one_of": ["a"]}], "needs either 'one_of', or bounds"),
         ([{"column": "speed", "at_least": float("nan")}], "finite number"),
         ([{"column": "speed", "at_least": 1}] * 65, "at most 64 items"),
     ],
@@ -402,22 +399,6 @@ def test_a_drive_ends_where_the_ignition_is_off(tmp_path: Path) -> None:
     assert whole.counts.drives == 1
 
 
-PATTERN = st.text("*ab_.", max_size=9).flatmap(
-    lambda text: st.integers(0, len(text)).map(lambda place: f"{text[:place]}{{}}{text[place:]}")
-)
-
-
-@given(PATTERN, st.text("ab_.", max_size=14))
-@example("*a{}a*", "aaaaa")
-@example("{}*_", "a__")
-def test_a_pattern_matches_a_name_as_a_regular_expression_does(pattern: str, name: str) -> None:
-    meanings = {"{}": "(.+?)", "*": ".*"}
-    tokens = re.split(r"(\{\}|\*)", pattern)
-    expression = "".join(meanings.get(token, re.escape(token)) for token in tokens)
-    match = re.fullmatch(expression, name)
-    assert match_name(pattern, name) == (match and match[1])
-
-
 @pytest.mark.parametrize(
     ("pattern", "path", "value"),
     [
@@ -439,10 +420,9 @@ def test_a_pattern_matches_the_end_of_a_path(pattern: str, path: str, value: str
         assert FromPath(path=pattern).find(Path(path)) == value
 
 
-@pytest.mark.timeout(60)
-def test_a_pattern_of_many_stars_ends() -> None:
-    with pytest.raises(InputError, match="does not end as in"):
-        FromPath(path="*_" * 60 + "{}.csv").find(Path("/" + "_" * 205 + ".txt"))
+def test_a_pattern_of_many_stars_is_refused() -> None:
+    with pytest.raises(ValidationError, match="at most 2"):
+        FromPath(path="*_*_{}*.csv")
 
 
 @pytest.mark.parametrize("unit", ["grad", "Grad", "grad/s", "Grad/s", "GRAD/s", "grad/sec"])
@@ -463,7 +443,5 @@ signals.ay = { column = "b", unit = "choose" }
     (tmp_path / "draft.toml").write_text(text)
     with pytest.raises(ConfigError) as caught:
         load_mapping(str(tmp_path / "draft.toml"), CATALOG)
-    assert (
-        "to be filled in: drive.day, drive.vehicle_id, drive.vehicle_model, the unit of signals.ax "
-        "(a), the unit of signals.ay (b)"
-    ) in str(caught.value)
+    for key in ("drive.vehicle_id", "drive.vehicle_model", "signals.ax.unit", "signals.ay.unit"):
+        assert key in str(caught.value)
