@@ -489,7 +489,7 @@ def test_arrays_of_structs_and_rows_of_a_matrix(
         assert log.drives["ax"].to_pylist() == AX_COUNTS
         assert log.drives["sideslip"].to_pylist() == BETA_COUNTS
     wide = failure(file, a_mapping(time={"column": "rec.X.Data"}, signals=signals("both", "both")))
-    assert "Map one of its signals, such as ['both(1,:)']" in wide
+    assert "no column 'both'. Did the mapping mean 'both(" in wide
     if write is write_structs5:
         guesses = draft_mapping(SIGNALS, file, profile_file(file)).guesses
         assert guesses["ax"].column == "rec.Y(1).Data"

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nptdms import ChannelObject
 
-from fleet_slip.ingest.formats import matlab, tdms
+from fleet_slip.ingest.formats import matlab
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.reading import open_source
 from fleet_slip.ingest.formats.source import OWN_TIME
@@ -99,7 +99,7 @@ def test_values_do_not_depend_on_segments_or_blocks(
             for rows, end in zip(lengths, ends, strict=True)
         ],
     )
-    with mock.patch.object(tdms, "READ_AHEAD", ahead), mock.patch.object(matlab, "WINDOW_ROWS", 3):
+    with mock.patch.object(matlab, "WINDOW_ROWS", ahead):
         found = read(file, "plain")
         assert found["plain"].to_list() == values.astype(float).tolist()
         assert read(file, "scaled")["scaled"].to_list() == (0.5 * values + 2.0).tolist()

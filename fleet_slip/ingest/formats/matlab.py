@@ -4,9 +4,13 @@ A column is the path of a vector, `Data.Vehicle.yawRate`, also in an array of st
 `rec.Y(2).Data`, or one column of a matrix, `wheels(:,2)`, or row, `wheels(2,:)`.
 """
 
+import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,8 +29,8 @@ from fleet_slip.ingest.formats.source import (
     missing_column,
 )
 
-_COLUMN = re.compile(r"(.+)\((?::,(\d+)|(\d+),:)\)")
-_MAX_COLUMNS = 64
+_MAX_SIGNALS = 64
+"""Signals of a matrix. One with more columns, such as 4 x n, has its signals in its rows."""
 _NUMBERS = re.compile(r"u?int(8|16|32|64)|double|single|logical")
 _PACKED = {"scale_factor", "add_offset"}
 """Attributes of netCDF for integers that encode physical values."""
@@ -39,153 +43,137 @@ _COUNTS = (
     f"has counts, with {' and '.join(sorted(_PACKED))} of netCDF, which are not applied. Export it "
     "again with physical values."
 )
-WINDOW_ROWS = 2**15
-"""Rows that are read at once."""
-
-Array = np.ndarray[Any, Any]
+WINDOW_ROWS = 2**17
+"""Rows that are read at once: for each time npTDMS reads all that a segment has of a channel."""
 
 
-class Matrix:
-    """An array of HDF5, with the axes of MATLAB reversed. Axes of length 1 are ignored.
+@dataclass(frozen=True)
+class Vector:
+    """The values of a signal; `base` identifies their times, where the file has them.
 
-    Of a matrix with more columns than a table has, such as 4 x n, the rows are the signals.
+    Neither MATLAB nor HDF5 has titles and units, but structs of recorders do.
     """
 
-    def __init__(self, values: Any, title: str = "", unit: str = "") -> None:
-        """Take an array of numpy or a dataset of h5py, and its name and unit if the file has them.
+    rows: int
+    read: Callable[[slice], Any]
+    title: str = ""
+    unit: str = ""
+    base: str = ""
 
-        Neither MATLAB nor HDF5 has units, but structs of recorders do.
-        """
-        self._values, self.title, self.unit = values, title, unit
-        self.shape = tuple(size for size in reversed(values.shape) if size != 1)
 
-    @property
-    def is_wide(self) -> bool:
-        """True if the signals are the rows."""
-        return len(self.shape) == 2 and self.shape[1] > _MAX_COLUMNS >= self.shape[0]
+def _vectors_of(path: str, values: Any, title: str, unit: str) -> dict[str, Vector]:
+    """Return the signals of an array of HDF5, with the axes of MATLAB reversed, by name."""
+    axes = [axis for axis, size in enumerate(values.shape) if size != 1]
+    sizes = [values.shape[axis] for axis in axes]
+    if 0 in sizes:
+        return {}
+    if len(axes) == 1:
+        return {path: Vector(sizes[0], partial(_take, values, {}, axes[0]), title, unit)}
+    if len(axes) != 2 or min(sizes) > _MAX_SIGNALS:
+        return {}
+    is_wide = sizes[0] > _MAX_SIGNALS
+    long, across = (0, 1) if is_wide else (1, 0)
+    name = path + ("({},:)" if is_wide else "(:,{})")
+    return {
+        name.format(number + 1): Vector(
+            sizes[long], partial(_take, values, {axes[across]: number}, axes[long]), title, unit
+        )
+        for number in range(sizes[across])
+    }
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Values of a signal, and signals. Arrays with more axes are no signals."""
-        if len(self.shape) == 1:
-            return self.shape[0], 1
-        if len(self.shape) != 2:
-            return 0, 0
-        return (self.shape[1], self.shape[0]) if self.is_wide else (self.shape[0], self.shape[1])
 
-    def names(self, path: str) -> list[str]:
-        """Return the names of the signals."""
-        _, signals = self.size
-        if signals == 1:
-            return [path]
-        places = "({},:)" if self.is_wide else "(:,{})"
-        return [path + places.format(number) for number in range(1, signals + 1)]
-
-    def read(self, signal: int, start: int, end: int) -> Array:
-        """Return some values of a signal."""
-        places = [slice(start, end), signal] if self.is_wide else [signal, slice(start, end)]
-        indices = iter(places[-len(self.shape) :])
-        place = tuple(0 if size == 1 else next(indices) for size in self._values.shape)
-        return np.asarray(self._values[place])
+def _take(values: Any, fixed: Mapping[int, int], axis: int, rows: slice) -> Any:
+    return values[tuple(rows if n == axis else fixed.get(n, 0) for n in range(values.ndim))]
 
 
 class Vectors(Source):
     """The vectors of an open file. Time is one of them."""
 
-    def __init__(
-        self, matrices: Mapping[str, Matrix], budget: Budget, refused: Mapping[str, str]
-    ) -> None:
-        """Take its matrices by path, and why others are not read."""
-        self._file, self._matrices, self._refused = budget.file, matrices, refused
+    def __init__(self, file: Path, vectors: Mapping[str, Any], refused: Mapping[str, str]) -> None:
+        """Take its vectors by name, and why others are not read."""
+        self._file, self._vectors, self._refused = file, vectors, refused
 
     def channels(self) -> list[Channel]:
-        """Return all vectors, and the columns of matrices."""
-        channels = []
-        for path, matrix in self._matrices.items():
-            rows, columns = matrix.size
-            if rows > 1 and columns <= _MAX_COLUMNS:
-                channels += [
-                    Channel(name, matrix.unit, f"{rows} rows", matrix.title)
-                    for name in matrix.names(path)
-                ]
-        return channels
+        """Return all vectors."""
+        return [
+            Channel(name, vector.unit, vector.base or f"{vector.rows} rows", vector.title)
+            for name, vector in self._vectors.items()
+        ]
 
     def unreadable(self) -> list[str]:
         """Return why parts of the file are not read."""
         return [f"{path!r} {why}" for path, why in self._refused.items()]
 
-    def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
-        """Return a matrix, and which of its columns is meant. Raises `InputError`."""
-        matrix_of_name = self._matrices.get(column)
-        if matrix_of_name is not None:
-            if matrix_of_name.size[1] != 1:
-                axes = " x ".join(map(str, matrix_of_name.shape)) or "1"
-                raise InputError(
-                    f"{quote_name(self._file)}: channel {column!r} has {axes} values, not one a "
-                    f"row. Map one of its signals, such as {matrix_of_name.names(column)[:1]}."
-                )
-            return "", (matrix_of_name, 0)
-        match = _COLUMN.fullmatch(column)
-        matrix = self._matrices.get(match[1]) if match else None
-        if match and matrix and column in matrix.names(match[1]):
-            return "", (matrix, int(match[2] or match[3]) - 1)
+    def find(self, column: str) -> tuple[str, Any]:
+        """Return the time base of a vector, and the vector. Raises `InputError`."""
+        if column in self._vectors:
+            return self._vectors[column].base, self._vectors[column]
         for path, why in self._refused.items():
             if f"{column}.".startswith(f"{path}."):
                 raise InputError(f"{quote_name(self._file)}: {column!r} {why}")
-        raise missing_column(self._file, column, [channel.name for channel in self.channels()])
+        raise missing_column(self._file, column, [*self._vectors])
 
-    def read(self, _base: str, places: dict[str, tuple[Matrix, int]]) -> Iterator[pl.DataFrame]:
+    def read(self, _base: str, vectors: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield all rows, some at once. Raises `InputError` if columns differ in length."""
-        first, (matrix, _) = next(iter(places.items()))
-        rows, _ = matrix.size
-        for name, (matrix, _) in places.items():
-            if (length := matrix.size[0]) != rows:
+        first, rows = next((name, vector.rows) for name, vector in vectors.items())
+        for name, vector in vectors.items():
+            if vector.rows != rows:
                 raise InputError(
-                    f"{quote_name(self._file)}: {name!r} has {length:,} values and {first!r} has "
-                    f'{rows:,}. Give the signal the time that goes with it: time = "…".'
+                    f"{quote_name(self._file)}: {name!r} has {vector.rows:,} values and {first!r} "
+                    f'has {rows:,}. Give the signal the time that goes with it: time = "…".'
                 )
         for start in range(0, max(rows, 1), WINDOW_ROWS):
-            end = min(start + WINDOW_ROWS, rows)
+            window = slice(start, min(start + WINDOW_ROWS, rows))
             yield pl.DataFrame(
-                as_column(self._file, name, matrix.read(column, start, end)).alias(name)
-                for name, (matrix, column) in places.items()
+                as_column(self._file, name, np.asarray(vector.read(window))).alias(name)
+                for name, vector in vectors.items()
             )
+
+
+class _Content:
+    """The vectors of a file by name, and why others are not read."""
+
+    def __init__(self) -> None:
+        self.vectors: dict[str, Vector] = {}
+        self.refused: dict[str, str] = {}
+
+    def add_array(self, path: str, values: Any, title: str = "", unit: str = "") -> None:
+        """Add the signals of an array."""
+        signals = _vectors_of(path, values, title, unit)
+        self.vectors |= signals
+        if not signals and math.prod(values.shape) > 1:
+            shape = " x ".join(map(str, reversed(values.shape)))
+            self.refused[path] = f"has {shape} values, not one a row. Save its signals as vectors."
+
+    def add_struct(self, variables: Mapping[str, Any], above: str = "") -> None:
+        """Add the arrays of numbers or text in a struct, by path, and the objects in it."""
+        texts = {str(key).lower(): text for key, text in variables.items() if type(text) is str}
+        title, unit = texts.get("name", ""), texts.get("unit", texts.get("units", ""))
+        for name, value in variables.items():
+            path = f"{above}{name}"
+            if isinstance(value, dict):
+                self.add_struct(value, f"{path}.")
+            elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbU":
+                self.add_array(path, value.T, title, unit)
+            elif isinstance(value, list) or getattr(value, "dtype", None) == np.object_:
+                structs = [item for item in np.ravel(value) if isinstance(item, dict)]
+                for number, item in enumerate(structs, 1):
+                    self.add_struct(item, f"{path}({number}).")
+            elif type(value).__name__ == "MatlabOpaque" or name == "None":
+                self.refused[path] = _OBJECT.format("object")
 
 
 @contextmanager
 def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
     with budget.file.open("rb") as stream:
-        content = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
-    variables = {name: value for name, value in content.items() if not name.startswith("__")}
-    if "__function_workspace__" in content:
+        file = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
+    variables = {name: value for name, value in file.items() if not name.startswith("__")}
+    if "__function_workspace__" in file:
         variables["None"] = None
-    matrices, refused = dict[str, Matrix](), dict[str, str]()
-    _add_arrays(variables, "", matrices, refused)
-    yield Vectors(matrices, budget, refused)
-
-
-def _add_arrays(
-    variables: Mapping[str, Any],
-    above: str,
-    matrices: dict[str, Matrix],
-    refused: dict[str, str],
-) -> None:
-    """Add the matrices of numbers or text in a struct, by path, and the objects in it."""
-    texts = {str(key).lower(): value for key, value in variables.items() if isinstance(value, str)}
-    title, unit = texts.get("name", ""), texts.get("unit", texts.get("units", ""))
-    for name, value in variables.items():
-        path = f"{above}{name}"
-        if isinstance(value, dict):
-            _add_arrays(value, f"{path}.", matrices, refused)
-        elif isinstance(value, np.ndarray) and value.ndim and value.dtype.kind in "iufbU":
-            matrices[path] = Matrix(value.T, title, unit)
-        elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype.kind == "O"):
-            structs = [item for item in np.ravel(value) if isinstance(item, dict)]
-            for number, item in enumerate(structs, 1):
-                _add_arrays(item, f"{path}({number}).", matrices, refused)
-        elif type(value).__name__ == "MatlabOpaque" or name == "None":
-            refused[path] = _OBJECT.format("object")
+    content = _Content()
+    content.add_struct(variables)
+    yield Vectors(budget.file, content.vectors, content.refused)
 
 
 @contextmanager
@@ -196,65 +184,48 @@ def open_mat73(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
     before anything else, its size among it: the library opens those files for it. Links are
     not followed.
     """
-    file = budget.file
-    h5py = load_library(file, "h5py")
-    with h5py.File(file, "r") as root:
-        matrices: dict[str, Matrix] = {}
-        refused: dict[str, str] = {}
+    h5py = load_library(budget.file, "h5py")
+    content = _Content()
 
-        def visit(path: str, item: Any) -> None:
-            if not isinstance(item, h5py.Dataset) or path.startswith("#"):
-                return
-            require_inside(path, item)
-            name, kind = path.replace("/", "."), _matlab_class(item.attrs)
-            if _PACKED & set(item.attrs):
-                refused[name] = _COUNTS
-            elif h5py.check_ref_dtype(item.dtype) is h5py.Reference:
-                add_elements(path, item, is_cell=kind == "cell")
-            elif "MATLAB_object_decode" in item.attrs or kind in _OBJECTS:
-                refused[name] = _OBJECT.format(kind)
-            elif item.shape and item.dtype.kind in "iufb" and _is_plain(item.attrs):
-                matrices[name] = Matrix(item)
-
-        def require_inside(path: str, item: Any) -> None:
-            layout = item.id.get_create_plist()
-            if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
-                raise InputError(
-                    f"{quote_name(file)}: the values of {path!r} are in other files. Export it "
-                    "again with all values in one file."
-                )
-
-        def add_elements(path: str, item: Any, *, is_cell: bool) -> None:
-            """Add the elements of a cell, or a field of an array of structs."""
-            above, _, field = path.replace("/", ".").rpartition(".")
+    def add(name: str, item: Any) -> None:
+        """Add a dataset, or those that it refers to: elements of a cell, or fields of structs."""
+        if not isinstance(item, h5py.Dataset):
+            return
+        layout = item.id.get_create_plist()
+        if layout.get_external_count() or layout.get_layout() == h5py.h5d.VIRTUAL:
+            raise InputError(
+                f"{quote_name(budget.file)}: the values of {name!r} are in other files. Export it "
+                "again with all values in one file."
+            )
+        kind = item.attrs.get("MATLAB_class", b"double")
+        kind = kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
+        if _PACKED & set(item.attrs):
+            content.refused[name] = _COUNTS
+        elif h5py.check_ref_dtype(item.dtype) is h5py.Reference:
+            above, _, field = name.rpartition(".")
+            pattern = f"{name}{{{{{{}}}}}}" if kind == "cell" else f"{above}({{}}).{field}"
             for number, reference in enumerate(item[()].ravel()[:MAX_COLUMNS], 1):
-                element = root[reference] if reference else None
-                if not isinstance(element, h5py.Dataset):
-                    continue
-                name = f"{above}({number}).{field}"
-                if is_cell:
-                    name = f"{path.replace('/', '.')}{{{number}}}"
-                require_inside(name, element)
-                if element.shape and element.dtype.kind in "iufb" and _is_plain(element.attrs):
-                    matrices[name] = Matrix(element)
+                if reference:
+                    add(pattern.format(number), root[reference])
+        elif "MATLAB_object_decode" in item.attrs or kind in _OBJECTS:
+            content.refused[name] = _OBJECT.format(kind)
+        elif "MATLAB_empty" in item.attrs or not _NUMBERS.fullmatch(kind):
+            return
+        elif item.shape and item.dtype.kind in "iufb":
+            content.add_array(name, item)
 
-        def note(path: str, link: Any) -> None:
-            if not isinstance(link, h5py.HardLink):
-                refused[path.replace("/", ".")] = _LINK
+    def visit(path: str, item: Any) -> None:
+        if not path.startswith("#"):  # where MATLAB keeps what references lead to
+            add(path.replace("/", "."), item)
 
+    def note_link(path: str, link: Any) -> None:
+        if not isinstance(link, h5py.HardLink):
+            content.refused[path.replace("/", ".")] = _LINK
+
+    with h5py.File(budget.file, "r") as root:
         root.visititems(visit)
-        root.visititems_links(note)
-        yield Vectors(matrices, budget, refused)
+        root.visititems_links(note_link)
+        yield Vectors(budget.file, content.vectors, content.refused)
 
 
 _OBJECTS = {"table", "timetable", "timeseries", "datetime", "duration", "categorical", "string"}
-
-
-def _matlab_class(attributes: Any) -> str:
-    kind = attributes.get("MATLAB_class", "double")
-    return kind.decode("latin-1") if isinstance(kind, bytes) else str(kind)
-
-
-def _is_plain(attributes: Any) -> bool:
-    """Return True if a dataset contains values, not the references or sizes of an object."""
-    return bool(_NUMBERS.fullmatch(_matlab_class(attributes))) and "MATLAB_empty" not in attributes

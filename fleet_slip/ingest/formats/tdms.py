@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from logging import CRITICAL
 from typing import Any
 
@@ -17,17 +18,14 @@ import polars as pl
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.formats.file_formats import FileFormats
-from fleet_slip.ingest.formats.matlab import Matrix, Vectors
+from fleet_slip.ingest.formats.matlab import Vector, Vectors
 from fleet_slip.ingest.formats.source import (
     EARLIEST_S,
     OWN_TIME,
     Budget,
-    Channel,
     load_library,
 )
 
-READ_AHEAD = 2**17
-"""Values that are read at once: for each time npTDMS reads all that a segment has of a channel."""
 _SCALE = re.compile(r"NI_Scale\[\d+\]_Scale_Type")
 _APPLIED = {
     "Polynomial", "Linear", "RTD", "Strain", "Table", "Thermistor", "Thermocouple", "Add",
@@ -35,50 +33,34 @@ _APPLIED = {
 }  # fmt: skip
 
 
-class _Vector(Matrix):
-    """The values of a channel; `base` identifies their times, empty if there are none."""
+@dataclass(frozen=True)
+class _Wave(Vector):
+    """The values of a channel, and when the first one was taken, if `step_s` is positive."""
 
-    def __init__(self, channel: Any) -> None:
-        self.title = ""
-        self._channel, self._first, self._ahead = channel, 0, np.zeros(0)
-        properties, self.shape = channel.properties, (len(channel),)
-        self.unit, self.step_s = (
-            str(properties.get("unit_string", "")),
-            float(properties.get("wf_increment", 0)),
-        )
-        began_s = np.datetime64(properties.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
-        offset_s = float(properties.get("wf_start_offset", 0))
-        self.start_s = offset_s + (began_s if began_s > EARLIEST_S else 0.0)
-        times = f"{self.start_s!r} s and each {self.step_s!r} s, {len(channel)} times"
-        self.base = times if self.step_s > 0 else ""
+    start_s: float = 0.0
+    step_s: float = 0.0
 
-    def read(self, _column: int, start: int, end: int) -> np.ndarray[Any, Any]:
-        """Return some values, scaled."""
-        if not self._first <= start <= end <= self._first + len(self._ahead):
-            until = max(start + READ_AHEAD, end)
-            self._first, self._ahead = start, np.asarray(self._channel[start:until])
-        return self._ahead[start - self._first : end - self._first]
+
+def _wave(channel: Any) -> _Wave:
+    properties, rows = channel.properties, len(channel)
+    began_s = np.datetime64(properties.get("wf_start_time", 0), "us").astype(np.int64) / 1e6
+    start_s = float(properties.get("wf_start_offset", 0))
+    start_s += began_s if began_s > EARLIEST_S else 0.0
+    step_s = float(properties.get("wf_increment", 0))
+    times = f"{start_s!r} s and each {step_s!r} s, {rows} times" if step_s > 0 else ""
+    unit = str(properties.get("unit_string", ""))
+    return _Wave(rows, channel.__getitem__, "", unit, times, start_s, step_s)
 
 
 class TdmsSource(Vectors):
     """The waveforms of a file."""
 
     has_clock = True
-    _matrices: dict[str, _Vector]
 
-    def channels(self) -> list[Channel]:
-        """Return the waveforms, with their units."""
-        return [Channel(name, vector.unit, vector.base) for name, vector in self._matrices.items()]
-
-    def find(self, column: str) -> tuple[str, tuple[Matrix, int]]:
-        """Return the time base and the position of a column. Raises `InputError`."""
-        _, place = super().find(column)
-        return self._matrices[column].base, place
-
-    def read(self, base: str, places: dict[str, Any]) -> Iterator[pl.DataFrame]:
+    def read(self, base: str, waves: dict[str, Any]) -> Iterator[pl.DataFrame]:
         """Yield all rows, with their times."""
-        wave, row = self._matrices[next(iter(places))], 0
-        for rows in super().read(base, places):
+        wave, row = next(iter(waves.values())), 0
+        for rows in super().read(base, waves):
             times_s = wave.start_s + wave.step_s * np.arange(row, row + rows.height)
             row += rows.height
             yield rows.with_columns(pl.Series(OWN_TIME, times_s, dtype=pl.Float64))
@@ -118,11 +100,11 @@ def open_tdms(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
         vectors = {
             channel.name
             if several[channel.name] < 2
-            else f"{channel.name}@{channel.group_name}": _Vector(channel)
+            else f"{channel.name}@{channel.group_name}": _wave(channel)
             for channel in channels
         }
-        waves = {name: channel for name, channel in vectors.items() if channel.base}
-        yield TdmsSource(waves, budget, {}) if waves else Vectors(vectors, budget, {})
+        waves = {name: wave for name, wave in vectors.items() if wave.base}
+        yield TdmsSource(file, waves, {}) if waves else Vectors(file, vectors, {})
 
 
 def _require_scales(budget: Budget, properties: Any) -> None:
