@@ -183,16 +183,6 @@ def test_a_notebook_shows_what_commands_print(smoke_root: Path) -> None:
     assert "<script>" not in selection._repr_html_() + page
 
 
-def test_an_answer_is_the_text_that_its_command_prints(smoke_root: Path) -> None:
-    fleet = fleet_slip.open(smoke_root)
-    answers = {
-        "quality": fleet.maintenance.quality(),
-        "diagnose smoke": fleet.cohort().diagnose("smoke"),
-    }
-    for words, answer in answers.items():
-        assert str(answer) == run_on(smoke_root, *words.split()).stdout.rstrip()
-
-
 def test_a_users_lines_are_typed(fleet: Fleet) -> None:
     assert_type(fleet_slip.open("data"), Fleet)
     cohort = assert_type(fleet.cohort("adhesion > 0.9"), FleetCohort)

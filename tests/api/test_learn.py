@@ -174,12 +174,3 @@ def test_what_a_mapping_leaves_open_is_named(changed: dict[str, object], said: s
         context=CATALOG.signals,
     )
     assert any(text.startswith(said) for text in assumptions_of(mapping))
-
-
-def test_what_it_says_is_not_assumed() -> None:
-    sure = {"wheel_fl": {"column": "v", "unit": "km/h", "radius_m": 0.3}}
-    mapping = Mapping.model_validate(
-        {"name": "m", "time": TIME, "drive": DRIVE, "signals": {"ax": SIGNALS["ax"], **sure}},
-        context=CATALOG.signals,
-    )
-    assert assumptions_of(mapping) == ()

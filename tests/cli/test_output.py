@@ -15,7 +15,6 @@ from rich.text import Text
 from fleet_slip.cli.app import app
 from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import AlarmError
-from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.rendering import TextTable
 from tests.support.commands import RunCommand, run_on
 
@@ -216,32 +215,6 @@ def test_a_pipe_is_sent_texts_as_they_are(
     query = "SELECT chr(27) || '[2J' AS name"
     app(["--root", str(smoke_root), "sql", query, "--csv"], standalone_mode=False)
     assert b'"\x1b[2J"' in capsysbinary.readouterr().out
-
-
-def test_an_evaluation_is_a_screen(shown: Shown) -> None:
-    standing = {"scenario": "nominal", "winner": "ekf", "winner_rmse_deg": 0.1, "rmse_deg": 0.2}
-    ranking = {
-        "estimator": "ours@1",
-        "least_coverage": 0.99,
-        "close_ratio": 1.25,
-        "drives": 1,
-        "won": 0,
-        "close": 0,
-        "standings": [{**standing, "ratio": 2.0, "same_as": None}],
-    }
-    result = {"rmse_deg": 0.2, "coverage": 0.35}
-    scenario = {
-        "name": "nominal",
-        "truth": {"sideslip_std_deg": 0.7},
-        "results": {"ours@1": result},
-    }
-    content = {"estimators": {"ours@1": {}}, "ranking": ranking, "scenarios": [scenario]}
-    evaluation = Evaluation(content)
-    text = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts()))).split())
-    assert "nominal ekf 0.100 0.200 2.00" in text
-    assert "Every drive and estimator: --all" in text
-    whole = " ".join(" ".join(shown(lambda: print_parts(evaluation.parts(True)))).split())
-    assert "nominal 0.70 0.200 (35%)" in whole
 
 
 @pytest.mark.parametrize("command", ["select", "show smoke"])

@@ -231,18 +231,6 @@ def test_a_set_is_not_asked_of_drives_that_no_gram_row_names(
     assert "no drive matches" not in refused.stderr
 
 
-def test_of_hundreds_of_inputs_a_message_names_families_and_how_many_more(
-    run_command: RunCommand, root_to_fail_in: Path
-) -> None:
-    asked = ("select", "--features", "gated", "--model", "beta")
-    refused = run_command(*asked, root=root_to_fail_in)
-    assert "beta is not an input" in refused.stderr
-    assert " ay_mean," in refused.stderr
-    assert "ay_mean_16," not in refused.stderr
-    assert "more (fleet-slip features)" in " ".join(refused.stderr.split())
-    assert len(refused.stderr) < 800
-
-
 def test_single_drives_have_errors_by_rows_with_a_warning(
     run_command: RunCommand, smoke_root: Path
 ) -> None:
