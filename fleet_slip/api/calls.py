@@ -7,7 +7,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 from fleet_slip.base import Progress, Steps, no_progress, require_extra
 from fleet_slip.storage.folder import Folder
@@ -28,28 +28,18 @@ Dask scheduler such as `tcp://10.0.0.1:8786`, or an executor.
 """
 
 
-class HasWarehouse(Protocol):
-    """A part of the API, which belongs to the warehouse of one data root."""
-
-    @property
-    def warehouse(self) -> "Warehouse":
-        """The tables of the data root."""
-        ...
-
-
-S = TypeVar("S", bound=HasWarehouse)
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def record_call(method: Callable[Concatenate[S, P], R]) -> Callable[Concatenate[S, P], R]:
+def record_call(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
     """Record each call of a method in the view `runs`, unless a run is under way already.
 
     A dry run changes nothing and is not recorded.
     """
 
     @functools.wraps(method)
-    def call(self: S, /, *arguments: P.args, **options: P.kwargs) -> R:
+    def call(self: Any, /, *arguments: P.args, **options: P.kwargs) -> R:
         if current_run_id() is not None or options.get("dry_run"):
             return method(self, *arguments, **options)
         words = _command_line(arguments, options)

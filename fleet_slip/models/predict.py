@@ -10,7 +10,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -196,34 +195,28 @@ def predict(
     numbers = _numbers(manifest, opened)
     rows = len(next(iter(counts.values())))
     ticks = _ticks(opened, rows) if plan.windows else np.arange(rows)
-    drives = _rows_of_each_drive(opened, rows) if plan.windows else [slice(0, rows)]
+    drives = _rows_of_each_drive(opened, rows) if plan.windows else [np.arange(rows)]
     drive = counts_of(pa.table({"tick": ticks, **counts}), plan, {})
     angle = np.empty(rows)
     for at in drives if rows else ():
-        first = at.start if isinstance(at, slice) else at[0]
         parameters = {
             name: count
             for name, (values, grain) in numbers.items()
-            if np.isfinite(values[first])
-            and (count := round_number(Fraction(float(values[first])), grain)) is not None
+            if np.isfinite(values[at[0]])
+            and (count := round_number(Fraction(float(values[at[0]])), grain)) is not None
         }
-        attributes = {name: values[first].as_py() for name, values in facts.items()}
+        attributes = {name: values[at[0]].as_py() for name, values in facts.items()}
         angle[at] = predictor(drive.segment(at, attributes, parameters))
     return opened.wrap(pa.array(angle, from_pandas=True), manifest.label.column)
 
 
-def _rows_of_each_drive(frame: Frame, rows: int) -> list[slice] | list[IntArray]:
-    """Return the rows of each drive: a slice of each, if the rows of every drive lie together."""
+def _rows_of_each_drive(frame: Frame, rows: int) -> list[IntArray]:
+    """Return the numbers of the rows of each drive."""
     if "drive_id" not in frame.names:
-        return [slice(0, rows)]
-    runs = pc.run_end_encode(_column(frame, "drive_id").cast(pa.large_string()))
-    ends = [0, *runs.run_ends.to_pylist()]
-    drives = runs.values.dictionary_encode().indices.fill_null(-1).to_numpy(zero_copy_only=False)
-    distinct = np.unique(drives)
-    if len(distinct) == len(drives):
-        return [slice(*bounds) for bounds in pairwise(ends)]
-    of_row = np.repeat(drives, np.diff(ends))
-    return [np.flatnonzero(of_row == drive) for drive in distinct]
+        return [np.arange(rows)]
+    indices = pc.fill_null(_column(frame, "drive_id").dictionary_encode().indices, -1)
+    _, drives, sizes = np.unique(indices, return_inverse=True, return_counts=True)
+    return np.split(np.argsort(drives, kind="stable"), np.cumsum(sizes)[:-1])
 
 
 def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:

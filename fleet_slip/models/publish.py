@@ -41,7 +41,6 @@ from fleet_slip.models.training_checks import (
     require_sound_course,
     require_sound_drives,
 )
-from fleet_slip.regression.folds import CrossValidation
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
@@ -90,9 +89,10 @@ def recipe_for(
     registry: Registry, name: str, request: SelectionRequest, cohort: str | None = None
 ) -> Recipe:
     """Return how to train a model as before, but for given options. Raises `QuestionError`."""
-    version = _newest(registry, name)
-    if version is None:
+    numbers = registry.versions(name) if name in registry.names() else []
+    if not numbers:
         return Recipe(request, cohort or TRAINING_DRIVES)
+    version = registry.champion(name) or registry.load(name, numbers[-1])
     options = _options(request)
     if options.keys() & _MODEL_OPTIONS:
         old_cohort, verb = with_all_drives(version.manifest.trained_on.cohort), "not as"
@@ -112,14 +112,6 @@ def _options(request: SelectionRequest) -> dict[str, Any]:
     """Return the options of a request that differ from the default."""
     default = asdict(SelectionRequest())
     return {name: value for name, value in asdict(request).items() if value != default[name]}
-
-
-def _newest(registry: Registry, name: str) -> ModelVersion | None:
-    """Return the champion of a model, else its newest version, else None."""
-    if name not in registry.names():
-        return None
-    numbers = registry.versions(name)
-    return registry.champion(name) or (registry.load(name, numbers[-1]) if numbers else None)
 
 
 def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
@@ -219,7 +211,7 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     catalog = selection.cohort.catalog
     signals = catalog.signals
     winner = selection.winner.model
-    label = signals[signals.label]
+    figures, label = winner.pooled, signals[signals.label]
     needed = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
     definitions = catalog.definitions(selection.cohort.feature_set)
@@ -235,7 +227,17 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             _term(catalog, signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
-        cross_validation=_cross_validated(winner, selection),
+        cross_validation=CrossValidated(
+            folds_by=selection.compared.folds.by,
+            folds=len(winner.folds),
+            correlation=figures.correlation,
+            correlation_standard_error=winner.standard_error,
+            rmse_deg=figures.rmse_deg,
+            error_mean_deg=figures.error_mean_deg,
+            error_std_deg=figures.error_std_deg,
+            condition_number=winner.condition_number,
+            label_noise_deg=selection.label_noise_deg,
+        ),
         trained_on=TrainedOn(
             cohort=selection.cohort.predicate.text,
             feature_set=catalog.identity(selection.cohort.feature_set),
@@ -367,22 +369,6 @@ def _term(
         ),
         coefficient=float(coefficient),
         coefficient_exact=coefficient,
-    )
-
-
-def _cross_validated(winner: CrossValidation, selection: Selection) -> CrossValidated:
-    """Return the figures of a winner as a manifest stores them."""
-    figures = winner.pooled
-    return CrossValidated(
-        folds_by=selection.compared.folds.by,
-        folds=len(winner.folds),
-        correlation=figures.correlation,
-        correlation_standard_error=winner.standard_error,
-        rmse_deg=figures.rmse_deg,
-        error_mean_deg=figures.error_mean_deg,
-        error_std_deg=figures.error_std_deg,
-        condition_number=winner.condition_number,
-        label_noise_deg=selection.label_noise_deg,
     )
 
 
