@@ -437,7 +437,6 @@ class Fleet:
         through: date | str | None = None,
         name: str | None = None,
         models: str | None = None,
-        tolerance: str | None = None,
         workers: Workers = None,
         progress: ShowStep | None = None,
     ) -> "RunReport":
@@ -454,8 +453,6 @@ class Fleet:
             Name of the model. Default: the campaign's.
         models
             A model list of `configs/models`, or a TOML file. Default: `estimator`.
-        tolerance
-            As in `FleetCohort.select`.
         progress
             Called with the name of the step, the rows done so far and the rows in total.
 
@@ -472,14 +469,13 @@ class Fleet:
         """
         from fleet_slip.api.pipelines import RunReport, Training
         from fleet_slip.models.manifest import require_model_name
-        from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
+        from fleet_slip.models.request import DEFAULT_MODELS
         from fleet_slip.simulation.campaign import load_campaign
 
         start = time.monotonic()
         if isinstance(campaign, str):
             campaign = load_campaign(campaign, self.warehouse.configs)
         model_name = require_model_name(name or campaign.name)
-        parse_tolerance(tolerance)  # before anything is written
         predicate = f"campaign = '{campaign.name}'"
         with self._exclusive("run", campaign.name):
             with open_workers(self.root, workers) as executor:
@@ -490,7 +486,7 @@ class Fleet:
                     workers=executor,
                     progress=step_progress(progress, f"simulate {campaign.name}"),
                 )
-                training = Training(model_name, predicate, models or DEFAULT_MODELS, tolerance)
+                training = Training(model_name, predicate, models or DEFAULT_MODELS)
                 grams = training.gram(self, executor, progress)
             selection, publication, refusal = training.publish(self, replace_marked=True)
         return RunReport(
@@ -589,7 +585,6 @@ class Fleet:
         *,
         cohort: str = TRAINING_DRIVES,
         models: str | None = None,
-        tolerance: str | None = None,
         candidate: bool = False,
         retention: str | None = None,
         night: date | str | None = None,
@@ -616,8 +611,6 @@ class Fleet:
             SQL predicate on the view `drives`: the drives that train the model.
         models
             A model list of `configs/models`, or a TOML file. Default: `estimator`.
-        tolerance
-            As in `FleetCohort.select`.
         candidate
             Publish the winner as a candidate even if it is not worse.
         retention
@@ -635,22 +628,21 @@ class Fleet:
         Raises
         ------
         UsageError
-            If the name, the tolerance or the date is invalid.
+            If the name or the date is invalid.
         StorageError
             If the night cannot be recorded.
         """
         from fleet_slip.api.pipelines import NightlyPipeline, Training
         from fleet_slip.models.manifest import require_model_name
-        from fleet_slip.models.request import DEFAULT_MODELS, parse_tolerance
+        from fleet_slip.models.request import DEFAULT_MODELS
 
-        parse_tolerance(tolerance)
         require_model_name(name)
         with self._exclusive("nightly", name):
             return NightlyPipeline(
                 fleet=self,
                 inbox=Path(inbox),
                 mapping=mapping,
-                training=Training(name, cohort, models or DEFAULT_MODELS, tolerance),
+                training=Training(name, cohort, models or DEFAULT_MODELS),
                 candidate=candidate,
                 retention=retention,
                 night=date_of(night, "night") or date.today(),

@@ -51,12 +51,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Training:
-    """How a pipeline trains a model: its name, cohort, model list, tolerance and label."""
+    """How a pipeline trains a model: its name, cohort, model list and label."""
 
     name: str
     cohort: str
     models: str
-    tolerance: str | None = None
     label: "Label | None" = None
     vehicle: "VehicleMeasures | None" = None
     """Measured data of the car: the model is combined with a filter in it."""
@@ -107,7 +106,7 @@ class Training:
         if champion is None or champion.reference in marked_models(fleet.warehouse):
             return None
         manifest = champion.manifest
-        if not is_current(manifest, fleet.warehouse, self.cohort, self.models, self.tolerance):
+        if not is_current(manifest, fleet.warehouse, self.cohort, self.models):
             return None
         combination = manifest.combination
         if self.vehicle and (combination is None or combination.measures != self.vehicle):
@@ -116,7 +115,7 @@ class Training:
 
     def select(self, fleet: "Fleet") -> "Selection":
         """Compare the models of the list on the cohort, whose drives are checked already."""
-        request = SelectionRequest(models=self.models, tolerance=self.tolerance, label=self.label)
+        request = SelectionRequest(models=self.models, label=self.label)
         cohort = fleet.cohort(self.cohort, include_faulty=True)
         return cohort.select(request, nested=True)
 

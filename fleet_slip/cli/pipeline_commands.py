@@ -84,7 +84,6 @@ def run(
     through: opt.Through = None,
     name: Annotated[str | None, Option(help="Name of the model. Default: the campaign's.")] = None,
     models: opt.ModelList = None,
-    tolerance: opt.Tolerance = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     everything: opt.All = False,
@@ -106,7 +105,6 @@ def run(
             through=last_day(through),
             name=name,
             models=models,
-            tolerance=tolerance,
             workers=cluster or threads,
             progress=show,
         )
@@ -171,7 +169,6 @@ def nightly(
     model: Annotated[str, Option(help="Name of the model.")],
     cohort: opt.Cohort = TRAINING_DRIVES,
     models: opt.ModelList = None,
-    tolerance: opt.Tolerance = None,
     candidate: Annotated[
         bool, Option("--candidate", help="Publish as a candidate, even if it is not worse.")
     ] = False,
@@ -208,7 +205,6 @@ def nightly(
             model,
             cohort=cohort,
             models=models,
-            tolerance=tolerance,
             candidate=candidate,
             retention=retention,
             night=date,

@@ -150,9 +150,7 @@ def _request_of_list(version: ModelVersion) -> SelectionRequest:
     return SelectionRequest(models=name)
 
 
-def is_current(
-    manifest: Manifest, warehouse: Warehouse, cohort: str, models: str, tolerance: str | None
-) -> bool:
+def is_current(manifest: Manifest, warehouse: Warehouse, cohort: str, models: str) -> bool:
     """Return True if a selection from a model list would give this manifest again.
 
     It depends on table versions, cohort, list and program. Raises `ConfigError` for the list.
@@ -174,7 +172,7 @@ def is_current(
         warehouse.logs.snapshot().version or 0,  # none, where cars send Gram rows alone
         warehouse.grams.snapshot().version,
         models,
-        checksum_of_list(model_list, tolerance),
+        checksum_of_list(model_list),
         package_version("fleet-slip"),
     )
 

@@ -506,13 +506,13 @@ def _search_of(catalog: Catalog, request: SelectionRequest, feature_set: str) ->
     return Search.model_validate(content)
 
 
-def checksum_of_list(model_list: ModelList, tolerance: str | None = None) -> str:
+def checksum_of_list(model_list: ModelList) -> str:
     """Return the checksum of a compared list, changed by options other than the default."""
     default = {"label": None, "line": None, "tolerance": None, "intercept": True}
     compared = model_list.model_copy(update=default).sha256
     options: dict[str, Any] = {}
-    if (tolerance := tolerance or model_list.tolerance) is not None:
-        options["worth"] = tolerance
+    if model_list.tolerance is not None:
+        options["worth"] = model_list.tolerance
     if not model_list.intercept:
         options["intercept"] = False
     return sha256_of(canonical_json({"compared": compared, **options})) if options else compared
