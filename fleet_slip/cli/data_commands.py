@@ -1,6 +1,7 @@
 """Commands for data and columns: simulate, ingest, mapping, gram, features."""
 
 import logging
+import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -219,6 +220,9 @@ def suggest(
         Path | None, Option(help="File to write the draft to, instead of stdout.")
     ] = None,
     can: Annotated[Path | None, Option(help="Database of a CAN trace: DBC, KCD or SYM.")] = None,
+    plot: Annotated[
+        Path | None, Option(help="Page to write, .html: the mapped signals in SI units.")
+    ] = None,
     json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
@@ -253,8 +257,12 @@ def suggest(
         row = "{channel}|{unit}|{signal}|{rate_hz:.4g}|{least:.4g}|{most:.4g}|{missing:.1%}"
         title = f"{file}: {len(channels)} channels"
         print_parts([TextTable(title, header, channels, row, text_columns=3)])
+    if plot is not None:
+        from fleet_slip.ingest.signal_page import write_signal_page
+
+        write_text(plot, write_signal_page(catalog, draft), ": the mapped signals")
     if output is not None:
-        write_text(output, text, ": a draft of a mapping")
+        write_text(output, _ask_for_open(draft, text), ": a draft of a mapping")
     elif not json:
         print_text("\n" + text)
 
@@ -268,6 +276,27 @@ def list_mappings(context: Context, json: opt.Json = False) -> None:
     configs = fleet_of(context).warehouse.configs
     files = {name: str(configs.find("mappings", name)) for name in configs.names("mappings")}
     print_table(files, json, TextTable("", "mapping|file", files.items(), text_columns=2))
+
+
+def _ask_for_open(draft: "Draft", text: str) -> str:
+    """Ask for the open keys of a draft on a terminal; return the draft with the answers."""
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return text
+
+    from fleet_slip.ingest.draft import answer_key, open_keys
+
+    say("Some keys of the draft are open. An empty answer leaves a key open.")
+    for key, units in open_keys(draft, text).items():
+        choices = f" in {' or '.join(units)}" if units else ""
+        try:
+            answer = typer.prompt(f"{key}{choices}", default="", show_default=False, err=True)
+        except typer.Abort as error:
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+            say("")
+            break  # the input has ended
+        text = answer_key(text, key, answer.strip())
+    return text
 
 
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":

@@ -232,7 +232,7 @@ def show(
 @recorded
 def promote(
     context: Context,
-    reference: Annotated[str, Argument(help="NAME@VERSION.")],
+    reference: Annotated[str, Argument(help="NAME@VERSION.", autocompletion=opt.complete_model)],
     alias: opt.Alias = "champion",
 ) -> None:
     """Point an alias, by default champion, at a version.

@@ -3,11 +3,13 @@
 import functools
 import sys
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import TYPE_CHECKING, Annotated, Literal, ParamSpec, cast
 
 from typer import Argument, Context, Option
 
+import fleet_slip
+from fleet_slip.errors import FleetSlipError
 from fleet_slip.storage.runs import Run, recording
 
 if TYPE_CHECKING:
@@ -53,6 +55,20 @@ def _lineage(
     return emit_lineage(target, warehouse, current_run, options)
 
 
+def complete_model(context: Context, incomplete: str) -> list[str]:
+    """Return names of models for the completion of a shell, and versions of a complete name."""
+    options = context.parent.params if context.parent else {}
+    name, at, _ = incomplete.partition("@")
+    with suppress(FleetSlipError):
+        registry = fleet_slip.open(options.get("root"), options.get("config")).models.registry
+        references = registry.names()
+        if at:
+            versions = [*map(str, registry.versions(name)), *registry.history(name).aliases()]
+            references = [f"{name}@{version}" for version in versions]
+        return [reference for reference in references if reference.startswith(incomplete)]
+    return []
+
+
 Json = Annotated[bool, Option("--json", help="Print machine-readable JSON on stdout.")]
 All = Annotated[bool, Option("--all", help="Print all rows and columns.")]
 
@@ -73,13 +89,18 @@ Model = Annotated[
     str | None,
     Argument(
         metavar="MODEL",
+        autocompletion=complete_model,
         help="NAME, NAME@VERSION or NAME@ALIAS. Default: the only published model.",
     ),
 ]
-ModelName = Annotated[str, Argument(help="Name of the model.")]
+ModelName = Annotated[str, Argument(help="Name of the model.", autocompletion=complete_model)]
 Alias = Annotated[str, Option(help="Alias.")]
 Version = Annotated[
-    str, Argument(help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.")
+    str,
+    Argument(
+        help="NAME, NAME@VERSION or NAME@ALIAS; NAME alone is its champion.",
+        autocompletion=complete_model,
+    ),
 ]
 
 Cohort = Annotated[str, Option(help="SQL predicate on the view drives.")]

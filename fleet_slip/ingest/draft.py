@@ -17,7 +17,7 @@ from fleet_slip.base import quote_name
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import TimeBase
+from fleet_slip.ingest.columns import CHOOSE, WHEEL_PREFIX, TimeBase
 from fleet_slip.ingest.file_groups import FileGroup
 from fleet_slip.ingest.guess import (
     Guess,
@@ -251,3 +251,33 @@ def _value(value: object) -> str:
         text = ", ".join(f"{key} = {_value(item)}" for key, item in value.items())
         return f"{{ {text} }}"
     return json.dumps(value, ensure_ascii=False)
+
+
+# Questions for the open keys of a draft.
+
+
+def open_keys(draft: Draft, text: str) -> dict[str, list[str]]:
+    """Return the keys that a draft leaves open, with the usual values of units."""
+    keys = [key for key in ("day", "vehicle_id", "vehicle_model") if f"\n# {key} = " in text]
+    units = {
+        name: [str(reading["unit"]) for reading in guess.readings]
+        for name, guess in draft.guesses.items()
+        if guess.readings
+    }
+    return {**{key: [] for key in keys}, **units}
+
+
+def answer_key(text: str, key: str, answer: str) -> str:
+    """Return a draft with the value of an open key, unchanged for an empty answer."""
+    if not answer:
+        return text
+    if key in {"day", "vehicle_id", "vehicle_model"}:
+        value = answer if key == "day" else _value(answer)
+        return re.sub(rf"(?m)^# {key} = .*$", lambda _: f"{key} = {value}", text, count=1)
+    is_velocity = key.startswith(WHEEL_PREFIX) and answer in {"km/h", "m/s"}
+    more = f", radius_m = {RADIUS_M}" if is_velocity else ""
+    line = re.compile(rf'(?m)^({key} = .*unit = )"{CHOOSE}"')
+    if line.search(text):
+        return line.sub(lambda match: f"{match[1]}{_value(answer)}{more}", text, count=1)
+    more = more.replace(", radius_m", f"\n{key}.radius_m")
+    return text.replace(f'{key}.unit = "{CHOOSE}"', f"{key}.unit = {_value(answer)}{more}")

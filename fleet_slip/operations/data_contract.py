@@ -3,10 +3,11 @@
 The standard is at https://bitol-io.github.io/open-data-contract-standard/v3.1.0.
 """
 
-import json
 from collections.abc import Mapping
 from importlib.metadata import version as package_version
 from typing import TYPE_CHECKING, Any
+
+import yaml
 
 from fleet_slip.views import open_views
 
@@ -41,9 +42,7 @@ _MINIMUM_ZERO = frozenset(
 
 
 def data_contract(warehouse: "Warehouse") -> str:
-    """Return the contract of the views `log`, `drives`, `grams` and `models` as JSON.
-
-    JSON is YAML, the format of the standard.
+    """Return the contract of the views `log`, `drives`, `grams` and `models` as YAML.
 
     Raises `StorageError` if there is no data root.
     """
@@ -82,7 +81,7 @@ def data_contract(warehouse: "Warehouse") -> str:
         },
         "schema": schema,
     }
-    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+    return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100))
 
 
 def _property(

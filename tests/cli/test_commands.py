@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import os
 import shlex
 import shutil
 from hashlib import sha256
@@ -402,3 +403,26 @@ def test_another_root_stands_in_them(
         "run", "--campaign", "smoke", "--models", "table1", root=tmp_path / "my data"
     )
     assert f"--root '{tmp_path / 'my data'}' sql" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        ("show s", "smoke"),
+        ("pin ", "smoke"),
+        ("promote smoke@", "smoke@1 smoke@champion"),
+        ("diff smoke@1 smoke@c", "smoke@champion"),
+        ("publish x", ""),
+    ],
+)
+def test_a_shell_completes_models_and_versions(
+    smoke_root: Path, words: str, completed: str
+) -> None:
+    line = f"fleet-slip --root {smoke_root} {words}"
+    env = {
+        "_FLEET_SLIP_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(line.count(" ")),
+    }
+    done = run_here([COMMAND], env={**os.environ, **env})
+    assert done.stdout.split() == completed.split(), done

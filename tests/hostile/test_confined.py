@@ -138,6 +138,24 @@ def test_what_a_reader_does_is_its_files_fault(
     assert why in failure(fake_reader(harm), own_clock())
 
 
+@pytest.mark.parametrize(
+    "files",
+    [
+        "[tempfile.TemporaryFile() for _ in range(8)]",
+        "[open(os.path.join(tempfile.gettempdir(), str(n)), 'wb') for n in range(8)]",
+    ],
+    ids=["deleted", "present"],
+)
+@pytest.mark.timeout(60)
+def test_temporary_files_are_bounded_together(
+    fake_reader: Any, monkeypatch: pytest.MonkeyPatch, files: str
+) -> None:
+    monkeypatch.setattr(budget, "FREE_BYTES", 2**22)
+    monkeypatch.setattr(budget, "FREE_S", 30)
+    harm = f"files = {files}\nfor file in files: file.write(bytes(2**20)), file.flush()\n"
+    assert "in a temporary file" in failure(fake_reader(f"{harm}time.sleep(100)"), own_clock())
+
+
 def test_what_a_reader_says_is_looked_at(fake_reader: Any) -> None:
     for said in (
         'struct.pack("<QQ", 2**40, 0)',

@@ -13,10 +13,11 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
-from fleet_slip.ingest.draft import draft_mapping, write_draft
+from fleet_slip.ingest.draft import answer_key, draft_mapping, open_keys, write_draft
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.ingest.measured_log import IngestCounts, open_measured
 from fleet_slip.ingest.profile import profile_file
+from fleet_slip.ingest.signal_page import in_si, thinned
 from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.ingest.vocabulary import unit_called
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
@@ -355,3 +356,41 @@ def test_a_draft_fits_a_terminal_of_80_columns(tmp_path: Path) -> None:
     ] == []
     draft = tomllib.loads(text)
     assert draft["signals"]["ay"] == {"column": name, "unit": "m/s^2"}
+
+
+def test_the_mapped_signals_are_drawn_in_si_units(tmp_path: Path) -> None:
+    columns = {"t_s": np.arange(9000) / 100, "ay [g]": np.sin(np.arange(9000) / 99)}
+    pl.DataFrame({**columns, "gz": columns["ay [g]"]}).write_csv(tmp_path / "log.csv")
+    draft = draft_mapping(SIGNALS, tmp_path / "log.csv", profile_file(tmp_path / "log.csv"))
+    np.testing.assert_allclose(
+        in_si(SIGNALS, "ay", draft.guesses["ay"]), 9.80665 * columns["ay [g]"], rtol=1e-6
+    )
+    time_s, values = thinned(columns["ay [g]"], 100.0)
+    assert time_s.size <= 2100 and np.ptp(values) == np.ptp(columns["ay [g]"])
+    page, log = tmp_path / "page.html", str(tmp_path / "log.csv")
+    call(tmp_path / "root", "mapping", "suggest", log, "--plot", str(page))
+    text = page.read_text()
+    assert "ay of ay [g], m/s^2" in text and "yaw_rate (doubtful) of gz" in text
+
+
+def test_answers_fill_in_what_a_draft_leaves_open(tmp_path: Path) -> None:
+    long_name = "bus_one_message_of_the_control_unit_for_stability.wheel_fl"
+    wheels = {f"wheel_{corner}": 60 for corner in ("fr", "rl", "rr")}
+    table = {"t_s": np.arange(100) / 100, "ay": np.sin(np.arange(100))}
+    table |= dict.fromkeys((long_name, *wheels), 60.0 + table["ay"])
+    file = tmp_path / "log.csv"
+    pl.DataFrame(table).write_csv(file)
+    draft = draft_mapping(SIGNALS, file, profile_file(file))
+    text = write_draft(draft, "log")
+    answers = {"day": "2024-06-03", "vehicle_id": "A7", "vehicle_model": 's"1', "ay": "g"}
+    assert {"day", "vehicle_id", "vehicle_model", "ay", "wheel_fl"} <= open_keys(draft, text).keys()
+    for key in open_keys(draft, text):
+        text = answer_key(text, key, answers.get(key, "km/h"))
+    content = tomllib.loads(text)
+    assert content["drive"]["vehicle_model"] == 's"1'
+    assert content["signals"]["ay"]["unit"] == "g"
+    for wheel in ("wheel_fl", "wheel_rr"):
+        assert content["signals"][wheel]["radius_m"] == RADIUS_M
+    (tmp_path / "log.toml").write_text(text)
+    assert load_mapping(str(tmp_path / "log.toml"), CATALOG).drive.vehicle_id == "A7"
+    assert answer_key(text, "ay", "") == text

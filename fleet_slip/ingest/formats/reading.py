@@ -12,6 +12,7 @@ import pickle
 import select
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import time
@@ -147,6 +148,8 @@ _ENVIRONMENT = {
 """Else libraries reserve memory for threads that a reader does not need. Clocks without a zone are
 in UTC, so that the result does not depend on the zone of this machine."""
 _INHERITED = ("LD_LIBRARY_PATH",)
+_POLL_S = 0.1
+"""Interval in s at which the sum of a reader's temporary files is measured."""
 _MAX_TEXT_BYTES = 2**26
 _ONE_AT_A_TIME = Lock()
 
@@ -200,9 +203,10 @@ def _fork_reader(name: str, budget: Budget) -> tuple[socket.socket, int]:
 class ConfinedSource(Source):
     """A file read by another process, whose answers are checked."""
 
-    def __init__(self, channel: socket.socket, budget: Budget) -> None:
-        """Take the reader's socket and the file's limits."""
+    def __init__(self, channel: socket.socket, budget: Budget, folder: Path, handle: int) -> None:
+        """Take the reader's socket, the file's limits, the reader's folder and its handle."""
         self._channel, self._budget = channel, budget
+        self._folder, self._handle = folder, handle
         self.has_clock = bool(self._receive()[0])
 
     def channels(self) -> list[Channel]:
@@ -240,6 +244,7 @@ class ConfinedSource(Source):
     def _receive(self) -> tuple[Any, bytearray]:
         """Receive an answer and rows. Raises `InputError`."""
         until_s = time.monotonic() + self._budget.seconds
+        self._require_disk()
         text, size = SIZES.unpack(self._take(SIZES.size, until_s))
         if text > _MAX_TEXT_BYTES or size > self._budget.memory:
             raise self._budget.crashed()
@@ -265,17 +270,46 @@ class ConfinedSource(Source):
         taken = bytearray(size)
         remaining = memoryview(taken)
         while remaining:
-            self._channel.settimeout(max(until_s - time.monotonic(), 1e-3))
+            remaining_s = until_s - time.monotonic()
+            self._channel.settimeout(min(max(remaining_s, 1e-3), _POLL_S))
             try:
                 received = self._channel.recv_into(remaining)
             except TimeoutError:
-                raise self._budget.over_time() from None
+                if remaining_s < _POLL_S:
+                    raise self._budget.over_time() from None
+                self._require_disk()
+                continue
             except OSError:
                 received = 0
             if not received:
                 raise self._budget.crashed()
             remaining = remaining[received:]
         return taken
+
+    def _require_disk(self) -> None:
+        """Raise `InputError` if the reader's temporary files are larger together than one may be.
+
+        A file that it has deleted and holds open counts too.
+        """
+        if _written_bytes(self._folder, self._handle) > self._budget.unfolded:
+            raise self._budget.over_memory()
+
+
+def _written_bytes(folder: Path, handle: int) -> int:
+    """Return the disk space of the files in a reader's folder, and of those that it holds open."""
+    device, files = folder.stat().st_dev, list(folder.rglob("*"))
+    with suppress(OSError, StopIteration):  # the reader may have ended
+        lines = Path(f"/proc/self/fdinfo/{handle}").read_text(encoding="ascii").splitlines()
+        reader = next(line.split()[1] for line in lines if line.startswith("Pid:"))
+        files += Path(f"/proc/{reader}/fd").iterdir()
+    sizes: dict[int, int] = {}
+    for file in files:
+        with suppress(OSError):
+            status = file.stat()
+            is_held = file.parent.name == "fd" and status.st_nlink
+            if status.st_dev == device and stat.S_ISREG(status.st_mode) and not is_held:
+                sizes[status.st_ino] = 512 * status.st_blocks
+    return sum(sizes.values())
 
 
 @contextmanager
@@ -285,7 +319,7 @@ def open_confined(name: str, budget: Budget, formats: FileFormats) -> Iterator[S
         channel, handle = _fork_reader(name, budget)
         try:
             channel.sendall(pickle.dumps(Job(name, budget, formats, str(Path.cwd()), folder)))
-            yield ConfinedSource(channel, budget)
+            yield ConfinedSource(channel, budget, Path(folder), handle)
         finally:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(handle, signal.SIGKILL)
