@@ -1,6 +1,5 @@
 """Campaigns, scenarios, tracks and cars: what is wrong in a file is named, what is in it counts."""
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
@@ -13,9 +12,8 @@ import pytest
 
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import SHIPPED_CONFIGS, Configs
-from fleet_slip.simulation.campaign import Campaign, load_campaign
-from fleet_slip.simulation.drive_plans import DriveDraw, GridPlan
-from fleet_slip.simulation.roads import load_track, random_generator
+from fleet_slip.simulation.campaign import load_campaign
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 from fleet_slip.vehicle.parameters import load_vehicle
 
@@ -164,15 +162,6 @@ def test_open_tracks_have_no_laps(tmp_path: Path) -> None:
         load_campaign(str(file), SHIPPED_CONFIGS)
 
 
-OF_SMOKE = SHIPPED_CONFIGS.find("campaigns", "smoke").read_text(encoding="utf-8")
-
-
-def load_text(folder: Path, text: str) -> Campaign:
-    file = folder / "campaign.toml"
-    file.write_text(text)
-    return load_campaign(str(file), SHIPPED_CONFIGS)
-
-
 @pytest.mark.parametrize("name", ["smoke", "fleet"])
 def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str) -> None:
     campaign = load_campaign(name, SHIPPED_CONFIGS)
@@ -189,64 +178,6 @@ def test_batches_hold_each_drive_once_in_order_and_about_as_many_rows(name: str)
         assert max(rows) - min(rows) <= 2 * longest
 
 
-def test_drive_names_can_be_read() -> None:
-    drive = load_campaign("smoke", SHIPPED_CONFIGS).drives(date(2024, 5, 2))[3]
-    assert (drive.drive_id, drive.vehicle_id) == ("smoke-2024-05-02-0003", "smoke-0000")
-    assert drive.source == "simulated"
-
-
-def test_grid_takes_every_combination_once_before_any_twice() -> None:
-    plan = load_campaign("waterford", SHIPPED_CONFIGS).plan
-    assert isinstance(plan, GridPlan)
-    sensors = load_campaign("waterford", SHIPPED_CONFIGS).sensors
-    count = len(plan.lateral_mps2) * len(plan.speed_factor)
-    none = random_generator(0)
-    taken = [plan.assignment(DriveDraw(n, sensors, none, none)) for n in range(2 * count)]
-    times = Counter((a.limits.lateral_mps2, a.speed_factor) for a in taken[:count])
-    assert len(times) == count
-    assert set(times.values()) == {1}
-    assert taken[count:] == taken[:count]
-
-
-def test_each_day_of_a_grid_covers_the_range_of_speeds() -> None:
-    campaign = load_campaign("waterford", SHIPPED_CONFIGS)
-    assert isinstance(campaign.plan, GridPlan)
-    lowest, highest = min(campaign.plan.speed_factor), max(campaign.plan.speed_factor)
-    for day in campaign.days():
-        factors = sorted(drive.speed_factor for drive in campaign.drives(day))
-        ends = [lowest, *factors, highest]
-        assert max(b - a for a, b in pairwise(ends)) < (highest - lowest) / 4
-
-
-def test_cars_of_a_grid_are_its_vehicles_and_masses(tmp_path: Path) -> None:
-    text = OF_SMOKE.replace("[1320.0]", "[1000.0, 1320.0, 1740.0]")
-    campaign = load_text(tmp_path, text.replace("number_of_days = 2", "number_of_days = 6"))
-    drives = [d for day in campaign.days() for d in campaign.drives(day)]
-    masses = {(d.vehicle_id, d.vehicle.body.sprung_mass_kg) for d in drives}
-    assert masses == {("smoke-0000", 1000.0), ("smoke-0001", 1320.0), ("smoke-0002", 1740.0)}
-
-
-def test_cars_of_a_fleet_differ_and_keep_their_properties() -> None:
-    campaign = load_campaign("fleet", SHIPPED_CONFIGS)
-    drives = [d for day in campaign.days() for d in campaign.drives(day)]
-    cars = {(d.vehicle_id, d.vehicle, d.sensors) for d in drives}
-    assert len(cars) == len({d.vehicle_id for d in drives}) == 300
-    assert len({d.vehicle for d in drives}) == 300
-    assert len({d.sensors for d in drives}) == 300
-    assert len({d.vehicle.name for d in drives}) > 1
-    assert len({d.track.name for d in drives}) > 1
-    assert len({d.adhesion for d in drives}) == len(drives)
-    for drive in drives:
-        assert drive.limits.lateral_mps2 <= 0.61 * drive.adhesion * 9.81
-
-
-def test_random_generators_differ_by_seed_and_by_every_part_of_their_name() -> None:
-    names = [("a", "b"), ("ab",), ("b", "a"), ("a", "b", "c")]
-    drawn = [random_generator(seed, *name).random() for seed in (1, 2) for name in names]
-    assert len(set(drawn)) == 2 * len(names)
-    assert random_generator(1, "a", "b").random() == drawn[0]
-
-
 @pytest.mark.parametrize("day", [date(2024, 4, 30), date(2024, 5, 3)])
 def test_a_day_outside_the_campaign_is_refused(day: date) -> None:
     with pytest.raises(ConfigError, match="lasts from 2024-05-01 to 2024-05-02"):
@@ -259,18 +190,6 @@ def test_the_scenarios_of_the_paper_come_first_in_the_order_of_its_figures() -> 
     assert papers[: len(figures)] == figures
     assert figures[0].startswith("Figures 1")
     assert figures[-1].startswith("Figure 8")
-
-
-def test_a_scenario_differs_from_its_base_only_in_what_it_says() -> None:
-    base, noisy = (
-        load_scenario("nominal", SHIPPED_CONFIGS),
-        load_scenario("noise_doubled", SHIPPED_CONFIGS),
-    )
-    assert noisy.sensors.ax_bias_mps2 == 0.3
-    assert noisy.sensors.wheel_speed_std_rad_s == base.sensors.wheel_speed_std_rad_s
-    assert noisy.sensors.gps == base.sensors.gps
-    own = {"name", "description", "paper", "base", "drive", "sensors"}
-    assert noisy.model_dump(exclude=own) == base.model_dump(exclude=own)
 
 
 def test_failures_are_added_to_the_drive_of_the_base() -> None:

@@ -1,6 +1,5 @@
 """Imperfections in campaigns and scenarios: drawn as asked for, refused where they cannot be."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,31 +8,13 @@ from pydantic import ValidationError
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.imperfections import NONE, ImperfectionRanges, Range, RoadImperfections
+from fleet_slip.simulation.imperfections import ImperfectionRanges, Range, RoadImperfections
 from fleet_slip.simulation.roads import load_track, surface
-from fleet_slip.simulation.scenario import load_scenario
-from fleet_slip.simulation.simulate import simulate_logs
 from fleet_slip.vehicle.driver import handling
 from fleet_slip.vehicle.parameters import load_vehicle
-from tests.support.catalog import SIGNALS
 
 FLEET = SHIPPED_CONFIGS.find("campaigns", "fleet").read_text(encoding="utf-8")
 SEDAN = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
-
-
-def test_ranges_are_drawn_within_their_bounds_in_the_order_of_their_class() -> None:
-    asked = {"toe_front_deg": Range(min=-0.2, max=0.1), "steering_lash_deg": Range(min=1, max=4)}
-    one = ImperfectionRanges(car=asked)
-    other = ImperfectionRanges(car=dict(reversed(asked.items())))
-    draws = [r.draw(*map(np.random.default_rng, (1, 2))) for r in (one, other)]
-    assert draws[0] == draws[1]
-    many = [one.draw(np.random.default_rng(i), np.random.default_rng(0)).car for i in range(300)]
-    for name, bounds in asked.items():
-        values = [getattr(car, name) for car in many]
-        assert bounds.min <= min(values) < max(values) <= bounds.max
-        middle, width = (bounds.min + bounds.max) / 2, bounds.max - bounds.min
-        assert np.mean(values) == pytest.approx(middle, abs=width / 10)
-    assert {car.toe_rear_deg for car in many} == {0.0}
 
 
 @pytest.mark.parametrize(
@@ -69,25 +50,6 @@ def test_a_car_keeps_its_imperfections_and_a_drive_has_its_own_road(tmp_path: Pa
         campaign.batches(campaign.days()[0])[0].digest
         != load_campaign("fleet", SHIPPED_CONFIGS).batches(campaign.days()[0])[0].digest
     )
-
-
-def test_imperfections_change_nothing_else_that_is_drawn(tmp_path: Path) -> None:
-    file = tmp_path / "campaign.toml"
-    ranges = "[plan.imperfections.car]\nsteering_lash_deg = { min = 1.0, max = 4.0 }\n"
-    file.write_text(FLEET.replace("[plan.load]", f"{ranges}[plan.load]"))
-    day = load_campaign("fleet", SHIPPED_CONFIGS).days()[0]
-    for one, other in zip(
-        load_campaign("fleet", SHIPPED_CONFIGS).drives(day),
-        load_campaign(str(file), SHIPPED_CONFIGS).drives(day),
-        strict=True,
-    ):
-        assert (one.vehicle, one.sensors, one.limits, one.speed_factor) == (
-            other.vehicle,
-            other.sensors,
-            other.limits,
-            other.speed_factor,
-        )
-        assert one.flaws == NONE
 
 
 def test_load_in_the_boot_moves_the_centre_of_gravity_as_statics_asks() -> None:
@@ -147,21 +109,6 @@ def test_adhesion_differs_along_the_road_and_across_it() -> None:
     _, _, left, right, _ = roughness(adhesion_std=0.05, adhesion_split_std=0.1)
     assert np.std((left + right) / 2) == pytest.approx(0.05 * np.sqrt(2 / 3), rel=0.3)
     assert np.std(left - right) == pytest.approx(0.1 * np.sqrt(2 / 3), rel=0.3)
-
-
-@pytest.mark.parametrize("name", ["imperfect", "imperfect_car", "imperfect_sensors"])
-def test_load_scenarios_with_imperfections_are_driven_and_measured(name: str) -> None:
-    (spec,) = load_scenario(name, SHIPPED_CONFIGS).batch().drives
-    (usual,) = load_scenario("nominal", SHIPPED_CONFIGS).batch().drives
-    (log, plain) = simulate_logs(SIGNALS, [replace(spec, laps=0.2), replace(usual, laps=0.2)])
-    assert log.lost_control_s is None
-    assert log.measurement.saturated == 0
-    assert log.rows == pytest.approx(plain.rows, rel=0.05)
-    rows = min(log.rows, plain.rows)
-    for signal in ("ay", "steering_wheel", "wheel_rl", "steer_fl"):
-        one, other = (drive.measurement.counts[signal][:rows] for drive in (log, plain))
-        assert np.corrcoef(one, other)[0, 1] > 0.9, signal
-        assert not np.array_equal(one, other), signal
 
 
 def test_the_realistic_fleet_s_cars_understeer_as_cars_do() -> None:

@@ -1,6 +1,5 @@
 """Sensors: noise, counts as a CAN bus has them, and imperfections against closed forms."""
 
-from decimal import Decimal
 from fractions import Fraction
 
 import numpy as np
@@ -67,16 +66,6 @@ def test_noise_has_the_stated_bias_and_standard_deviation() -> None:
         assert np.std(error) == pytest.approx(expected, rel=0.01), name
 
 
-def test_noise_is_white_and_independent_between_signals() -> None:
-    measured = measure(constant_truth(), SENSORS, generator())
-    noise = np.stack([measured.counts[name] for name in SENSORS.bias_and_std]).astype(float)
-    limit = 5 / np.sqrt(TICKS)
-    between = np.corrcoef(noise) - np.eye(len(noise))
-    assert np.abs(between).max() < limit
-    for row in noise:
-        assert abs(np.corrcoef(row[:-1], row[1:])[0, 1]) < limit
-
-
 def test_gps_has_its_own_rate_noise_and_outages() -> None:
     truth = constant_truth()
     measured = measure(truth, SENSORS, generator())
@@ -105,13 +94,6 @@ def test_values_out_of_range_saturate_and_are_counted() -> None:
     assert measured.counts["vx"][[0, 5]].tolist() == [-32000, 32000]
     # vx is clipped twice, and once more where GPS, with a fix at tick 0, measures it.
     assert measured.saturated == 4 + 2 + 1
-
-
-def test_halves_round_to_even() -> None:
-    signal = SIGNALS["wheel_fl"].model_copy(update={"scale": Decimal("0.25")})
-    counts, clipped = quantise(np.array([0.125, 0.375, 0.625, -0.125, -0.375]), signal)
-    assert counts.tolist() == [0, 2, 2, 0, -2]
-    assert clipped == 0
 
 
 @given(
@@ -151,14 +133,6 @@ def seen(
 ) -> dict[str, FloatArray]:
     flaws = Imperfections(car=car, sensors=SensorImperfections.model_validate(sensors))
     return Distortion(flaws, np.random.default_rng(1), np.random.default_rng(2)).apply(of)
-
-
-def test_sensors_without_imperfections_see_the_truth() -> None:
-    of = truth(ay_mps2=3.0, leaning_ay_mps2=3.0, yaw_rate_rad_s=0.15, sideslip_rad=0.01)
-    found = seen(of)
-    for name, values in of.items():
-        np.testing.assert_array_equal(found[name], values, err_msg=name)
-    np.testing.assert_array_equal(found["gps_vx_mps"], of["vx_mps"])
 
 
 def test_a_leaning_body_adds_its_share_of_the_weight() -> None:
@@ -285,14 +259,6 @@ def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
         assert np.mean(found) == pytest.approx(np.exp(-tau_s / 2.0), abs=0.05)
     assert abs(np.corrcoef(errors[0], errors[1])[0, 1]) < 0.15
     assert np.abs(np.diff(errors)).max() < 0.2  # no jump from one sample to the next
-
-
-@pytest.mark.parametrize("cuts", [(1, 9, 1, 10, 11, 7, 300), (339,), (10, 10, 319)])
-def test_lasting_errors_do_not_depend_on_blocks(cuts: tuple[int, ...]) -> None:
-    whole = GaussMarkov(3, 10.0, np.random.default_rng(6)).next(400)
-    pieces = GaussMarkov(3, 10.0, np.random.default_rng(6))
-    parts = np.concatenate([pieces.next(ticks) for ticks in cuts], axis=1)
-    np.testing.assert_array_equal(parts, whole[:, : sum(cuts)])
 
 
 def quantise(physical: FloatArray, signal: Signal) -> tuple[NDArray[np.int16], int]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.special import fresnel
 
-from fleet_slip.errors import ConfigError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import (
     CLASSES,
@@ -70,12 +69,6 @@ def test_segments_are_those_of_the_source(name: str, file: str) -> None:
     ]
 
 
-def test_circle_is_a_circle() -> None:
-    line = load_track("skid_pad", SHIPPED_CONFIGS).centre_line(0.7)
-    assert np.allclose(np.hypot(line.x_m, line.y_m - 50.0), 50.0, rtol=0, atol=1e-11)
-    assert line.y_m.max() > 99.9, "positive curvature bends left"
-
-
 def test_clothoid_is_the_fresnel_integral() -> None:
     length, end = 300.0, 0.02
     line = make_track((length, 0.0, end)).centre_line(10.0)
@@ -95,14 +88,6 @@ def test_heading_integrates_curvature() -> None:
         kinks = ends[(ends > a) & (ends < b)]
         integral = quad(track.curvature, a, b, points=kinks if len(kinks) else None)[0]
         assert integral == pytest.approx(change, abs=1e-12)
-
-
-def test_grid_of_a_closed_track_leaves_out_its_end() -> None:
-    station, spacing = load_track("skid_pad", SHIPPED_CONFIGS).grid(1.0)
-    assert len(station) == 314
-    assert station[-1] + spacing == pytest.approx(314.159265)
-    station, spacing = load_track("straight", SHIPPED_CONFIGS).grid(1.0)
-    assert (len(station), spacing, station[-1]) == (1001, 1.0, 1000.0)
 
 
 ROADS = st.tuples(st.sampled_from(sorted(CLASSES)), st.integers(0, 10**9 - 1))
@@ -130,21 +115,6 @@ def test_a_name_is_a_class_and_a_seed() -> None:
         != load_track("country_18", SHIPPED_CONFIGS).segments
     )
     assert load_track("hill_17", SHIPPED_CONFIGS).name == "hill_17"
-
-
-@pytest.mark.parametrize("name", ["country", "country_", "field_3", "country_-1", "country_1e3"])
-def test_another_name_is_none(name: str) -> None:
-    with pytest.raises(ConfigError):
-        load_track(name, SHIPPED_CONFIGS)
-
-
-@given(ROADS)
-@settings(max_examples=20, deadline=None)
-def test_who_neither_cuts_nor_wanders_follows_the_road(named: tuple[str, int]) -> None:
-    road = draw_road(*named)
-    line = driven_line(road, 0.0, 0.0, 30.0, random_generator(1))
-    station = np.linspace(0.0, road.length_m, len(line.segments) + 1)
-    np.testing.assert_allclose(line.curvature(station), road.curvature(station), atol=1e-9)
 
 
 @given(ROADS, st.floats(1.0, 8.0))

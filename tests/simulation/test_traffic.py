@@ -14,7 +14,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from fleet_slip.errors import ConfigError, RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import traffic
-from fleet_slip.simulation.campaign import Batch, Campaign, DriveSpec, load_campaign
+from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.imperfections import Uniform
 from fleet_slip.simulation.roads import SLOWEST_MPS, SpeedProfile
 from fleet_slip.simulation.simulate import simulate_batch, simulate_logs
@@ -109,13 +109,6 @@ def test_the_car_follows_it_on_four_tyres(spec: DriveSpec) -> None:
     assert log.metadata["track"] == spec.track.name
 
 
-def test_lanes_are_changed_on_the_highway_and_turns_taken_at_the_roundabout() -> None:
-    highway, roundabout = (planned(one) for one in drives(["highway", "roundabout"], 60.0))
-    bends = np.sign(np.round(highway.track.curvature(highway.station_m), 4))
-    assert {-1.0, 1.0} <= set(bends)
-    assert np.abs(roundabout.track.curvature(roundabout.station_m)).max() > 1 / 25
-
-
 def test_what_highway_env_changes_of_all_cars_changes_no_drive() -> None:
     """Its intersection sets figures of `IDMVehicle` itself."""
     traffic.require_known_traffic("intersection")
@@ -169,11 +162,3 @@ def test_traffic_of_another_kind_is_refused(
     assert done.exit_code == RefusedError.exit_code
     assert "on its road 'roundabout' differs" in done.stderr
     assert not list((tmp_path / "data").rglob("*.parquet"))
-
-
-def test_every_road_and_car_is_in_the_campaign() -> None:
-    campaign: Campaign = load_campaign("traffic", SHIPPED_CONFIGS)
-    specs = [spec for day in campaign.days() for spec in campaign.drives(day)]
-    assert {spec.track.name for spec in specs} == set(SITES)
-    assert len({spec.vehicle_id for spec in specs}) == 4
-    assert len({spec.vehicle.name for spec in specs}) == 4

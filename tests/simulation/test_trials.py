@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pytest
 from numpy.typing import NDArray
 
@@ -16,8 +15,7 @@ from fleet_slip.evaluation.test_drives import blind_scenarios
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation import simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
-from fleet_slip.simulation.drive_plans import TrialPlan
-from fleet_slip.simulation.roads import CLASSES, SLOWEST_MPS, Manoeuvre, load_track, road_with
+from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, load_track, road_with
 from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.simulation.simulate import DriveLog, simulate_batch, simulate_logs, tabulate
@@ -41,18 +39,6 @@ def drives() -> tuple[DriveSpec, ...]:
 def straight(speed_mps: float = 20.0, *, closed: bool = False) -> Road:
     entries = 600 if closed else 601
     return Road(1.0, np.zeros(entries), np.full(entries, speed_mps), 600.0, closed)
-
-
-def test_one_car_is_tested_and_others_take_turns(drives: tuple[DriveSpec, ...]) -> None:
-    plan = load_campaign("proving_ground", SHIPPED_CONFIGS).plan
-    assert isinstance(plan, TrialPlan)
-    tested = [d for d in drives if d.vehicle_id == "proving_ground-0000"]
-    assert len(tested) == len(drives) * (plan.other_every - 1) // plan.other_every
-    assert {d.vehicle.name for d in tested} == {"d_class_sedan"}
-    names = {d.vehicle_id: d.vehicle.name for d in drives}
-    others = {car: name for car, name in names.items() if car != tested[0].vehicle_id}
-    assert len(others) == plan.other_cars
-    assert len(set(others.values())) == 4
 
 
 def test_no_drive_of_a_scenario_is_driven(drives: tuple[DriveSpec, ...]) -> None:
@@ -99,36 +85,6 @@ def test_a_car_drives_the_lateral_acceleration_of_a_slalom() -> None:
     assert np.abs(plain.ay_mps2).max() < 0.01
     assert 1.6 < np.abs(swung.ay_mps2).max() < 2.8
     assert swung.lost_control_tick is None
-
-
-@pytest.fixture(scope="module")
-def on_roads() -> tuple[DriveSpec, ...]:
-    campaign = load_campaign("proving_roads", SHIPPED_CONFIGS)
-    return campaign.drives(campaign.first_day)
-
-
-def test_every_class_of_road_is_driven_at_its_speeds(on_roads: tuple[DriveSpec, ...]) -> None:
-    by_class = {
-        name: [d for d in on_roads if d.track.name.startswith(f"{name}_")] for name in CLASSES
-    }
-    for name, some in by_class.items():
-        top_mps = CLASSES[name].top_speed_mps
-        assert 0.6 * top_mps < max(d.limits.top_speed_mps for d in some) <= top_mps
-        lines = {d.track.segments for d in some if d.track.name == some[0].track.name}
-        assert len(lines) > 1, "each driver takes a line of his own"
-    assert max(d.limits.top_speed_mps for d in by_class["motorway"]) > 42
-    assert min(d.adhesion for d in on_roads) < 0.2
-    assert all(d.flaws.road.superelevation_percent > 0 for d in on_roads)
-
-
-def test_load_and_wear_are_of_the_drive_and_all_else_of_the_car(
-    on_roads: tuple[DriveSpec, ...],
-) -> None:
-    tested = [d for d in on_roads if d.vehicle_id == "proving_roads-0000"]
-    rear_m = [d.vehicle.body.rear_axle_m for d in tested]
-    assert min(rear_m) < SEDAN.body.rear_axle_m - 0.2
-    assert len({d.vehicle.tyre.rolling_radius_m for d in tested}) > len(tested) / 2
-    assert {d.flaws.car for d in tested} == {tested[0].flaws.car}
 
 
 def test_no_road_of_the_plan_is_a_blind_one() -> None:
@@ -184,30 +140,6 @@ def test_table_has_the_schema_of_the_logs_with_strings_as_dictionaries() -> None
     table.validate(full=True)
 
 
-def test_drive_columns_say_what_was_driven() -> None:
-    spec = short_batch().drives[1]
-    row = synthetic_table(synthetic_truth(3), synthetic_truth(2), lost_control_s=0.01).to_pylist()[
-        -1
-    ]
-    expected = {
-        "drive_id": spec.drive_id,
-        "vehicle_id": "smoke-0000",
-        "vehicle_model": "d_class_sedan",
-        "source": "simulated",
-        "campaign": "smoke",
-        "track": "waterford_hills",
-        "mass_kg": 1320.0,
-        "adhesion": 1.0,
-        "speed_factor": spec.speed_factor,
-        "duration_s": 0.01,
-        "rows": 2,
-        "lost_control_s": 0.01,
-        "saturated": 0,
-    }
-    assert {name: row[name] for name in expected} == expected
-    assert [*expected] == [n for n in SIGNALS.drive if n not in SIGNALS.optional]
-
-
 def test_only_gps_between_fixes_is_null() -> None:
     table = synthetic_table(synthetic_truth(30), synthetic_truth(20))
     for name in set(SIGNALS.signals) - set(SIGNALS.extras):
@@ -243,14 +175,6 @@ def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
         assert here.equals(there)
     unified = pa.concat_tables(one_by_one).unify_dictionaries().combine_chunks()
     assert unified.equals(simulate_batch(SIGNALS, whole))
-
-
-def test_drives_last_as_long_as_expected() -> None:
-    batch = short_batch(laps=0.3)
-    rows = pc.value_counts(simulate_batch(SIGNALS, batch)["drive_id"].cast(pa.string())).to_pylist()
-    for spec, count in zip(batch.drives, rows, strict=True):
-        assert count["values"] == spec.drive_id
-        assert count["counts"] == pytest.approx(spec.expected_rows, rel=0.05)
 
 
 def on_skid_pad(drive: DriveSpec, lateral_mps2: float) -> DriveSpec:

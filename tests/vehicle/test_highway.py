@@ -11,7 +11,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.highway import FourWheelVehicle, LinearTyreVehicle, highway_twin
-from fleet_slip.vehicle.parameters import Controls, State, load_vehicle
+from fleet_slip.vehicle.parameters import State, load_vehicle
 from tests.support.rolling import SEDAN, Run, rolling
 
 gymnasium.register_envs(highway_env)
@@ -77,16 +77,6 @@ def test_velocity_includes_sliding() -> None:
     np.testing.assert_allclose((car.position - before) / 0.002, velocity, atol=0.02)
 
 
-def test_positive_steering_turns_towards_growing_y() -> None:
-    car = FourWheelVehicle(None, [0.0, 0.0], speed=15.0)
-    car.act({"steering": 0.05, "acceleration": 0.0})
-    for _ in range(10):
-        car.step(0.1)
-    assert car.position[1] > 0
-    assert car.heading > 0
-    assert car.motion.yaw_rate > 0
-
-
 def test_it_drives_among_others_on_a_road() -> None:
     road = Road(
         RoadNetwork.straight_road_network(3),
@@ -144,11 +134,3 @@ def test_a_coarse_step_of_the_environment_is_as_good_as_a_fine_one() -> None:
         for _ in range(calls):
             car.step(dt)
     np.testing.assert_allclose(cars[0].state, cars[1].state, atol=2e-3)
-
-
-def test_hard_braking_keeps_the_demands_of_the_action() -> None:
-    car = FourWheelVehicle(None, [0.0, 0.0], speed=30.0, adhesion=0.3)
-    car.act({"steering": 0.0, "acceleration": -9.0})
-    car.step(1.0)
-    assert car.controls == Controls(0.0, -9.0)
-    assert 0.2 * 9.81 < 30.0 - car.speed < 0.36 * 9.81

@@ -213,21 +213,3 @@ def test_a_slippery_side_shifts_no_line_but_the_slip() -> None:
     road = circle(80.0, 20.0)
     usual, split = drive(road), drive(circle(80.0, 20.0, grip_right=0.7))
     assert end(split.sideslip_rad) < end(usual.sideslip_rad) - np.radians(0.1)
-
-
-def test_imperfect_drives_do_not_depend_on_their_neighbours() -> None:
-    flaws = [CarImperfections(relaxation_length_m=0.1 * i) for i in range(6)]
-    drives = [LaneDrive(SEDAN, circle(60.0 + i, 12.0), 1.0, 1.0, f) for i, f in enumerate(flaws)]
-    together = simulate_drives(drives)
-    for i, lane_drive in enumerate(drives):
-        (alone,) = simulate_drives([lane_drive])
-        np.testing.assert_array_equal(alone.sideslip_rad, together[i].sideslip_rad)
-
-
-def test_the_body_s_motion_is_recorded_for_its_sensors() -> None:
-    flaws = CarImperfections(relaxation_length_m=0.3)
-    found = drive(circle(70.0, 15.0), flaws)
-    rate = np.gradient(found.yaw_rate_rad_s, 0.01)
-    apart = (found.yaw_acceleration_rad_s2 - rate)[20:]
-    assert np.sqrt(np.mean(apart**2)) < 0.1 * np.std(rate) + 0.01
-    assert end(found.leaning_ay_mps2) == pytest.approx(end(found.ay_mps2), abs=0.01)

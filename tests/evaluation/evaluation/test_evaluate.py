@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.text import Text
 
 import fleet_slip
 from fleet_slip.arrays import FloatArray
-from fleet_slip.cli.output import print_parts
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.evaluation_document import _ranking_table, store_evaluation
+from fleet_slip.evaluation.evaluation_document import store_evaluation
 from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
 from fleet_slip.evaluation.filters import (
     FILTERS,
@@ -311,18 +309,3 @@ def test_wins_and_close_losses_are_counted_apart() -> None:
     found = rank(runs, "ours", excluded=())
     assert (found["won"], found["close"]) == (2, 1), "a tie is won, 1.2 is close and 1.3 is not"
     assert [one["won"] for one in found["standings"]] == [True, True, False, False]
-
-
-@pytest.mark.parametrize("columns", [80, 100, 160])
-def test_the_table_keeps_its_numbers_whole(
-    columns: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
-    monkeypatch.setenv("COLUMNS", str(columns))
-    print_parts([_ranking_table(rank([run(ours=0.3, ekf_class_tuned=0.2)], "ours", excluded=()))])
-    printed = Text.from_ansi(capsys.readouterr().out).plain
-    assert "ours/3 is model 3 of Table I" in " ".join(printed.split())
-    table = printed[printed.index("scenario") :]
-    assert max(map(len, table.splitlines())) <= columns
-    for figure in ("ekf_class_tuned", "0.300", "0.200", "1.50"):
-        assert figure in table

@@ -167,17 +167,3 @@ def test_the_page_is_dark_for_those_who_prefer_it(reported: Reported, tmp_path: 
     assert shown.pixels("surface", dark=True) > shown.picture[..., 0].size / 2
     assert shown.pixels("model_4", dark=True) > 300
     assert shown.pixels("model_4") < 30
-
-
-def test_on_a_phone_drawings_scroll_within_the_page(reported: Reported, tmp_path: Path) -> None:
-    frame = tmp_path / "phone.html"
-    frame.write_text(
-        f'<body style="margin: 0"><iframe src="{reported.page.as_uri()}" '
-        f'style="width: 390px; height: 8000px; border: 0"></iframe>'
-    )
-    shown = show(frame, tmp_path, width=500, height=8000)
-    phone = Shown(shown.picture[:, :390], shown.console)
-    assert phone.console == []
-    assert phone.pixels("model_4") > 30
-    beside = shown.picture[:, 390:]
-    assert (beside == 255).all()

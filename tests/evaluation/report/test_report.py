@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,8 +40,6 @@ from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.commands import Finished, RunCommand, done_on, run
 from tests.support.measured import ingest_own
 from tests.support.reported import Reported, call
-
-MINUS = "\N{MINUS SIGN}"
 
 
 class Page(HTMLParser):
@@ -223,19 +220,6 @@ def test_a_report_requires_an_evaluation(
     done = run_command("report", "smoke")
     assert done.exit_code == 5
     assert "fleet-slip evaluate smoke@1" in done.stderr
-
-
-def test_the_page_states_that_the_model_is_of_measured_drives_of_other_cars(
-    data: ReportData,
-) -> None:
-    selection = data.trained.selection
-    at = selection.cohort.drives.column_names.index("source")
-    sources = pa.array(["measured"] * selection.cohort.drive_count)
-    drives = selection.cohort.drives.set_column(at, "source", sources)
-    cohort = replace(selection.cohort, drives=drives)
-    trained = replace(data.trained, selection=replace(selection, cohort=cohort))
-    page = render(replace(data, trained=trained), ())
-    assert "the model was trained on measured drives of other cars" in page
 
 
 @given(
