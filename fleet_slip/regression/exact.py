@@ -197,27 +197,6 @@ def sqrt(value: Fraction) -> float:
     return round_once(compute)
 
 
-def signed_ratio(product: Fraction | int, squares: Fraction | int) -> float:
-    """Return `product / sqrt(squares)`, correctly rounded: a correlation of exact sums.
-
-    Parameters
-    ----------
-    product : Fraction or int
-        Sum of products of two variables.
-    squares : Fraction or int
-        Product of their two sums of squares.
-
-    Returns
-    -------
-    float
-        0 if `squares` is not positive.
-    """
-    if squares <= 0:
-        return 0.0
-    magnitude = sqrt(Fraction(product) ** 2 / squares)
-    return -magnitude if product < 0 else magnitude
-
-
 _EIGENVALUE_PRECISION = 256
 """Bits. Each factor of two in the condition number takes one of them."""
 

@@ -83,10 +83,8 @@ class Gram:
         Raises
         ------
         ValueError
-            For another shape or for numbers that are not integers.
+            For numbers that are not integers.
         """
-        if counts.ndim != 2 or counts.shape[1] != len(signals):
-            raise ValueError(f"counts of shape {counts.shape} do not have {len(signals)} columns")
         if counts.dtype.kind not in "iuO":
             raise ValueError(f"counts must be integers, not {counts.dtype}")
         largest = max(-int(counts.min()), int(counts.max())) if counts.size else 0
@@ -296,10 +294,8 @@ class GramTable:
     def __post_init__(self) -> None:
         drives, k = len(self.n), len(self.signals)
         if self.sums.shape != (drives, k) or self.products.shape != (drives, packed_size(k)):
-            raise ValueError(
-                f"{drives} drives of {k} signals do not have sums of shape {self.sums.shape} and "
-                f"products of shape {self.products.shape}"
-            )
+            shapes = f"sums of shape {self.sums.shape}, products of shape {self.products.shape}"
+            raise ValueError(f"{drives} drives of {k} signals do not have {shapes}")
         kinds = {self.n.dtype, self.sums.dtype, self.products.dtype}
         if not kinds <= {np.dtype(np.int64), np.dtype(object)}:
             raise ValueError("a GramTable holds int64, or integers of Python")
@@ -339,10 +335,6 @@ class GramTable:
         -------
         list of Gram, length count
         """
-        if groups.shape != self.n.shape:
-            raise ValueError(f"{len(self)} drives need as many groups, not {groups.shape}")
-        if len(groups) and not 0 <= groups.min() <= groups.max() < count:
-            raise ValueError(f"groups must lie in 0..{count - 1}")
         order = np.argsort(groups, kind="stable")
         stops = np.cumsum(np.bincount(groups, minlength=count))
         return [self.take(rows).total() for rows in np.split(order, stops[:-1])]

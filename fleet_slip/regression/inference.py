@@ -383,7 +383,13 @@ class Evidence:
         ----------
         Kish, Survey Sampling, 1965.
         """
-        full, variance = fits[-1], _variance(fits[-1])
+        full, variance = fits[-1], noise_variance(fits[-1])
+        if variance == 0:
+            raise DataError(
+                f"{full.model.label} is an exact linear combination of "
+                f"{', '.join(full.model.signals)}: there is no noise to compare models by. Leave "
+                "out the signal that contains the label."
+            )
         gains, rows = [a.rss - b.rss for a, b in pairwise(fits)], full.gram.n
         if drives is None or len(drives) < 2:
             contributions = tuple(float(gain / variance) for gain in gains)
@@ -442,17 +448,6 @@ class Evidence:
         """
         size = np.arange(self.inputs + 1)
         return tuple((self.excess() + 2 * size - self.inputs).tolist())
-
-
-def _variance(full: Fit) -> Fraction:
-    variance = noise_variance(full)
-    if variance == 0:
-        raise DataError(
-            f"{full.model.label} is an exact linear combination of "
-            f"{', '.join(full.model.signals)}: there is no noise to compare models by. "
-            "Leave out the signal that contains the label."
-        )
-    return variance
 
 
 # Shrinkage: estimates for the members of a group, each moved towards the group's mean.

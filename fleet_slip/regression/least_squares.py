@@ -251,7 +251,7 @@ def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction]) -> str:
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:
-    """Return the correlations of all signals, each rounded once.
+    """Return the correlations of all signals.
 
     Parameters
     ----------
@@ -263,12 +263,10 @@ def correlation_matrix(gram: Gram) -> FloatArray:
     float array, shape (k, k)
         Zero for a constant signal.
     """
-    centred = gram.centered_products()
-    correlations = np.zeros((len(centred), len(centred)))
-    for i, row in enumerate(centred):
-        for j in range(i + 1):
-            correlation = exact.signed_ratio(row[j], row[i] * centred[j][j])
-            correlations[i, j] = correlations[j, i] = correlation
+    products = np.array(gram.centered_products(), dtype=np.float64)
+    lengths = np.sqrt(products.diagonal())
+    lengths[lengths == 0] = 1.0
+    correlations: FloatArray = products / np.outer(lengths, lengths)
     return correlations
 
 

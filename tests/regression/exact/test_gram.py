@@ -90,7 +90,7 @@ def test_mistakes_are_named() -> None:
         _ = gram - larger
     with pytest.raises(ValueError, match="integers"):
         Gram.from_counts(SIGNALS, np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="columns"):
+    with pytest.raises(ValueError, match="3 signals need 3 sums"):
         Gram.from_counts(SIGNALS, np.zeros((2, 2), dtype=np.int16))
 
 
@@ -140,9 +140,6 @@ def test_a_table_checks_its_shapes() -> None:
         GramTable(("a",), n, np.ones((2, 2), dtype=np.int64), np.ones((2, 1), dtype=np.int64))
     with pytest.raises(ValueError, match="int64"):
         GramTable(("a",), n, np.ones((2, 1)), np.ones((2, 1), dtype=np.int64))  # type: ignore[arg-type]
-    table = GramTable(("a",), n, np.ones((2, 1), dtype=np.int64), np.ones((2, 1), dtype=np.int64))
-    with pytest.raises(ValueError, match="groups"):
-        table.totals(np.array([0, 2]), 2)
 
 
 @pytest.mark.parametrize(
