@@ -3,7 +3,6 @@
 import inspect
 import pkgutil
 import re
-import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -208,29 +207,3 @@ def test_the_program_is_not_older_than_its_changelog_says() -> None:
     version = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]["version"]
     assert all(parts(version) >= parts(one) for one in released())
     assert HEADINGS[0] == "Unreleased" or version == released()[0]
-
-
-def git(folder: Path, *words: str) -> str:
-    done = subprocess.run(
-        ["git", "-C", str(folder), *words], capture_output=True, text=True, check=False
-    )
-    return done.stdout
-
-
-def tags_that_nothing_tells_of(folder: Path) -> set[str]:
-    """Return the tags of a repository that are no version of the changelog; none without git."""
-    tags = git(folder, "tag", "--list", "v*").split()
-    return {tag.removeprefix("v") for tag in tags} - set(released())
-
-
-def test_every_tag_is_a_version_of_the_changelog() -> None:
-    assert tags_that_nothing_tells_of(HERE) == set()
-
-
-def test_a_tag_that_the_changelog_does_not_know_is_noticed(tmp_path: Path) -> None:
-    author = ("-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
-    git(tmp_path, "init", "--quiet")
-    git(tmp_path, *author, "commit", "--quiet", "--allow-empty", "--message", "A release")
-    for version in (*released(), "99.0.0"):
-        git(tmp_path, "tag", f"v{version}")
-    assert tags_that_nothing_tells_of(tmp_path) == {"99.0.0"}

@@ -156,15 +156,6 @@ def test_the_line_is_fitted_again_where_a_drive_of_it_is_gone(fleet: Fleet) -> N
     assert fitted.drives == line.drives - 1
 
 
-def test_whoever_opens_the_root_later_finds_the_line(fleet: Fleet, own_set: Path) -> None:
-    for number in range(2):
-        later = fleet_slip.open(str(fleet.root), own_set)
-        if number == 0:
-            later.cohort().diagnose("tiny")
-        else:
-            later.evaluation.score("tiny")
-
-
 def test_a_drive_too_long_for_its_slope_is_refused(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,7 @@
 """`--prior`: simulated drives join the training; `--half-life`: old drives count less."""
 
-from datetime import date
+from collections.abc import Callable
+from datetime import date, timedelta
 from fractions import Fraction
 from pathlib import Path
 
@@ -9,11 +10,12 @@ import pytest
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
+from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.evaluation import measured_evaluation as module
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.measured_evaluation import identified_prior
-from fleet_slip.grams.cohort import age_weights, load_cohort
+from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.prior import simulate_prior
 from fleet_slip.models.request import SelectionPlan, SelectionRequest, load_model_list
@@ -202,28 +204,6 @@ def test_in_an_evaluation_the_car_of_a_prior_is_identified_anew(
     assert len(set(simulated)) == len(simulated) == content["parts"]
 
 
-def test_old_drives_count_less(tmp_path: Path) -> None:
-    """By rows: each of a drive of today sixteen times, of one a half-life ago eight times."""
-    random = np.random.default_rng(1)
-    warehouse, rows = Warehouse(LocalFolder(tmp_path / "data")), []
-    for number, day in enumerate((date(2026, 5, 1), date(2026, 5, 11), date(2026, 5, 21))):
-        ay, yaw_rate = random.integers(-3000, 3000, (2, 100))
-        label = np.rint((0.05 + 0.01 * number) * ay - 0.02 * yaw_rate + random.normal(0, 10, 100))
-        counts = {"ay": ay, "yaw_rate": yaw_rate, "sideslip": label}
-        counts = {name: one.astype(np.int16) for name, one in counts.items()}
-        land(warehouse, f"d{number}", log_rows(f"d{number}", counts), day=day)
-        stacked = np.column_stack([ay, yaw_rate, np.ones(100), label])
-        rows.append(np.repeat(stacked, 4 * 2**number, axis=0))
-    update_grams(warehouse)
-    found = fleet_slip.open(tmp_path / "data").cohort().select(model="ay,yaw_rate", half_life=10)
-    every = np.concatenate(rows)
-    slopes = np.linalg.lstsq(every[:, :3], every[:, 3], rcond=None)[0]
-    assert [*found.winner.model.counts.weights.values()] == pytest.approx(slopes[:2])
-    assert found.trained_rows == 175
-    refused = run_on(tmp_path / "data", "select", "--model", "ay,yaw_rate", "--half-life", "0")
-    assert refused.exit_code == 2 and "half_life" in refused.stderr
-
-
 def test_a_prior_in_which_every_car_is_lost_is_refused(
     own: Path, few: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -231,11 +211,6 @@ def test_a_prior_in_which_every_car_is_lost_is_refused(
     done = run_on(own, "select", "--model", INPUTS, "--prior", few)
     assert done.exit_code == 5
     assert "prior few: the driver lost control in all drives" in done.stderr
-
-
-def test_weights_halve_with_age() -> None:
-    days = [date(2026, 1, 31), date(2026, 1, 21), date(2026, 1, 11), date(2025, 1, 1)]
-    assert age_weights(days, 10).tolist() == [16, 8, 4, 0]
 
 
 def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
@@ -248,34 +223,77 @@ def test_a_usual_choice_with_other_weights_is_of_the_usual_list() -> None:
 
 TWO = "ay,yaw_rate"
 LIAR = "it's me"
+Label = Callable[[int, FloatArray], FloatArray]
+
+
+def land_drives(
+    root: Path, number: int, seed: int, label: Label, *, is_daily: bool = False
+) -> list[np.ndarray]:
+    """Land drives of a hundred rows, ten days apart if daily; return ay, yaw rate and label."""
+    random, result = np.random.default_rng(seed), []
+    warehouse = Warehouse(LocalFolder(root))
+    for drive in range(number):
+        ay, yaw_rate = random.integers(-3000, 3000, (2, 100))
+        truth = 0.05 * ay - 0.02 * yaw_rate
+        columns = [ay, yaw_rate, np.rint(label(drive, truth) + random.normal(0, 10, 100))]
+        counts = dict(zip(("ay", "yaw_rate", "sideslip"), columns, strict=True))
+        rows = log_rows(
+            f"d{drive:02d}",
+            {name: one.astype(np.int16) for name, one in counts.items()},
+            vehicle_id=LIAR if drive == 6 else f"car-{drive:02d}",
+        )
+        day = date(2026, 5, 1) + timedelta(days=10 * drive if is_daily else 0)
+        land(warehouse, f"d{drive}", rows, day=day)
+        result.append(np.column_stack(columns).astype(np.int64))
+    update_grams(warehouse)
+    return result
 
 
 @pytest.fixture
 def fleet(tmp_path: Path) -> Fleet:
     """Twenty-five cars, one of which has the sign of its label reversed."""
-    random = np.random.default_rng(2)
-    warehouse = Warehouse(LocalFolder(tmp_path / "data"))
-    drives = []
-    for car in range(25):
-        ay, yaw_rate = random.integers(-3000, 3000, (2, 100))
-        label = np.rint(0.05 * ay - 0.02 * yaw_rate + random.normal(0, 10, 100)) + car % 3
-        name = LIAR if car == 6 else f"car-{car:02d}"
-        counts = {
-            "ay": ay.astype(np.int16),
-            "yaw_rate": yaw_rate.astype(np.int16),
-            "sideslip": (-label if car == 6 else label).astype(np.int16),
-        }
-        drives.append(log_rows(f"d{car:02d}", counts, vehicle_id=name))
-    land(warehouse, "all", *drives)
-    update_grams(warehouse)
+    land_drives(
+        tmp_path / "data", 25, 2, lambda drive, truth: (-1 if drive == 6 else 1) * truth + drive % 3
+    )
     return fleet_slip.open(tmp_path / "data")
+
+
+def test_old_drives_count_less(tmp_path: Path) -> None:
+    """By rows: each of a drive of today sixteen times, of one a half-life ago eight times."""
+    drives = land_drives(
+        tmp_path / "data", 3, 1, lambda drive, truth: (1 + 0.2 * drive) * truth, is_daily=True
+    )
+    found = fleet_slip.open(tmp_path / "data").cohort().select(model=TWO, half_life=10)
+    every = np.concatenate([np.repeat(d, 4 * 2**i, axis=0) for i, d in enumerate(drives)])
+    inputs = np.column_stack([every[:, :2], np.ones(len(every))])
+    slopes = np.linalg.lstsq(inputs, every[:, 2], rcond=None)[0]
+    assert [*found.winner.model.counts.weights.values()] == pytest.approx(slopes[:2])
+    assert found.trained_rows == 175
+    refused = run_on(tmp_path / "data", "select", "--model", TWO, "--half-life", "0")
+    assert refused.exit_code == 2 and "half_life" in refused.stderr
+
+
+def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> None:
+    """By rows: each of the usual drives sixteen times, the noisy one as often as it counts."""
+    noise = np.random.default_rng(4).normal(0, 60, 100)
+    drives = land_drives(
+        tmp_path / "data", 12, 4, lambda drive, truth: truth + (noise if drive == 5 else 0)
+    )
+    found = fleet_slip.open(tmp_path / "data").cohort().select(model=TWO, robust=True)
+    assert list(found.weighted) == ["d05"] and 0 < found.weighted["d05"].weight < 1
+    part = round(16 * found.weighted["d05"].weight)
+    assert found.trained_rows == (1100 * 16 + 100 * part) // 16
+    repeated = [np.repeat(one, part if i == 5 else 16, axis=0) for i, one in enumerate(drives)]
+    slopes = fit(gram_of(np.concatenate(repeated)), ["x1", "x2"], "y").model.weights
+    assert [*found.winner.model.counts.weights.values()] == [*slopes.values()]
 
 
 def test_the_liar_counts_for_nothing_and_the_model_is_that_of_the_others(fleet: Fleet) -> None:
     robust = fleet.cohort().select(order=TWO, robust=True)
     assert list(robust.weighted) == ["d06"]
     assert robust.weighted["d06"].times > 10 and robust.weighted["d06"].weight == 0
-    others = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO)
+    others = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO, robust=True)
+    assert others.weighted == {}
     assert robust.winner.model.model == others.winner.model.model
     plain = fleet.cohort().select(order=TWO)
     assert plain.winner.model.pooled.rmse_deg > 2 * robust.winner.model.pooled.rmse_deg
@@ -302,39 +320,3 @@ def test_the_command_names_it_and_the_version_keeps_how(
     assert (manifest.trained_on.drives, manifest.trained_on.rows) == (24, 2400)
     again = run_command("publish", "safe", "--json")
     assert not again.json["new"], "it is trained as it was"
-
-
-def test_honest_drives_keep_their_weight(fleet: Fleet) -> None:
-    honest = fleet.cohort("vehicle_id <> 'it''s me'").select(order=TWO, robust=True)
-    assert honest.weighted == {}
-    few = fleet.cohort("drive_id < 'd05'").select(order=TWO, robust=True)
-    assert few.weighted == {}
-
-
-def test_a_drive_that_counts_partly_is_a_part_of_its_rows(tmp_path: Path) -> None:
-    """By rows: each of the usual drives sixteen times, the noisy one as often as it counts."""
-    random = np.random.default_rng(4)
-    warehouse, drives, rows = Warehouse(LocalFolder(tmp_path / "data")), [], []
-    for number in range(12):
-        ay, yaw_rate = random.integers(-3000, 3000, (2, 100))
-        noise = random.normal(0, 60 if number == 5 else 10, 100)
-        label = np.rint(0.05 * ay - 0.02 * yaw_rate + noise)
-        counts = {"ay": ay, "yaw_rate": yaw_rate, "sideslip": label}
-        rows.append(np.stack([*counts.values()], axis=1).astype(np.int64))
-        whole = {name: one.astype(np.int16) for name, one in counts.items()}
-        drives.append(log_rows(f"d{number:02d}", whole, vehicle_id="a"))
-    land(warehouse, "all", *drives)
-    update_grams(warehouse)
-    found = fleet_slip.open(tmp_path / "data").cohort().select(model=TWO, robust=True)
-    assert list(found.weighted) == ["d05"] and 0 < found.weighted["d05"].weight < 1
-    part = round(16 * found.weighted["d05"].weight)
-    assert found.trained_rows == (1100 * 16 + 100 * part) // 16
-    repeated = np.concatenate(
-        [np.repeat(one, part if i == 5 else 16, axis=0) for i, one in enumerate(rows)]
-    )
-    slopes = fit(gram_of(repeated), ["x1", "x2"], "y").model.coefficients
-    units = [
-        CATALOG.input_scales["sideslip"] / CATALOG.input_scales[name] for name in ("ay", "yaw_rate")
-    ]
-    expected = tuple(slope * unit for slope, unit in zip(slopes, units, strict=True))
-    assert found.winner.model.model.coefficients == expected

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
 from fleet_slip.models.manifest import MAX_DIGITS, ExactFraction, TrainedDrives
 from fleet_slip.models.registry import CHAMPION, AliasHistory, Registry
-from fleet_slip.storage.documents import Document, DocumentFolder
+from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.local import LocalFolder
 from tests.support.catalog import CATALOG
 from tests.support.commands import PATIENCE_S
@@ -174,30 +174,6 @@ def test_two_who_go_back_at_once_go_back_two_versions(
     assert registry.history("sideslip").pointed_at(CHAMPION) == 1
     with pytest.raises(RefusedError, match="never pointed at another version"):
         registry.rollback("sideslip", CHAMPION)
-
-
-def test_a_version_and_the_champion_are_found_without_reading_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    registry = Registry(LocalFolder(tmp_path), CATALOG)
-    for number in range(1, 21):
-        publish(registry, manifest(Fraction(number)))
-    read: list[int] = []
-
-    def counted(folder: DocumentFolder, number: int) -> Document:
-        read.append(number)
-        return original(folder, number)
-
-    original = DocumentFolder.read
-    monkeypatch.setattr(DocumentFolder, "read", counted)
-    champion = registry.champion("sideslip")
-    assert champion is not None
-    assert registry.history("sideslip").published_at(champion.version) is not None
-    assert registry.load("sideslip", 7).version == 7
-    assert read == [20, 20, 20, 7]
-    read.clear()
-    assert registry.as_table().num_rows == 20
-    assert len(read) <= 3 * 20
 
 
 FRACTIONS: TypeAdapter[Fraction] = TypeAdapter(ExactFraction)

@@ -12,7 +12,7 @@ from fleet_slip.evaluation import held_out as held_out_module
 from fleet_slip.evaluation import measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import QUARTERS, LabelledDrive, Segments
+from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations
 from fleet_slip.models.manifest import LINE_ALONE
@@ -122,22 +122,6 @@ def test_measures_of_a_mapping_train_with_a_filter_and_change_no_drive(tmp_path:
     assert mappings[0].canonical_json() == mappings[1].canonical_json()
     assert mappings[1].vehicle is not None
     assert mappings[1].vehicle.rear_axle_m == 1.67
-
-
-def test_inner_groups_never_contain_what_is_held_out() -> None:
-    class Drive:
-        def __init__(self, name: str) -> None:
-            self.name, self.trip, self.kind = name, name, "kind"
-
-    drives = [Drive(f"drive {number}") for number in range(6)]
-    held_out: Segments = frozenset(("drive 0", quarter) for quarter in range(QUARTERS))
-    groups, kinds = held_out_module.inner_groups(drives, held_out)  # type: ignore[arg-type]
-    assert kinds == [], "all are of one kind"
-    assert len(groups) == held_out_module.MAX_GROUPS
-    assert not any(group & held_out for group in groups)
-    assert len(frozenset().union(*groups)) == 5 * QUARTERS
-    quarters, _ = held_out_module.inner_groups(drives[:1], frozenset([("drive 0", 3)]))  # type: ignore[arg-type]
-    assert quarters == [frozenset([("drive 0", quarter)]) for quarter in range(3)]
 
 
 def test_every_estimate_of_a_group_comes_from_fits_without_it(

@@ -15,7 +15,6 @@ from fleet_slip.regression.combination import (
     PairedEstimates,
     choose_combination,
     fit_combination,
-    hat_functions,
 )
 
 
@@ -47,13 +46,6 @@ def test_weights_by_hand() -> None:
     assert result.std_rad[0] == pytest.approx(math.sqrt(5))
 
 
-def test_each_group_has_the_same_weight() -> None:
-    line, label = np.array([1.0, 1.0, 1.0, 1.0]), np.array([1.0, 1.0, 1.0, 0.0])
-    group = np.array([0.0, 0.0, 0.0, 1.0])
-    share = fit_combination(pairs_of(line, np.zeros(4), label, group), "constant").line_share[0]
-    assert share == pytest.approx(0.5)  # the line is right in one group, the filter in the other
-
-
 def test_extreme_weights_are_clipped_before_they_are_shrunk() -> None:
     line, label = np.ones(2), np.full(2, 100.0)
     share = fit_combination(pairs_of(line, np.zeros(2), label, np.zeros(2)), "constant").line_share
@@ -72,10 +64,6 @@ def test_shares_are_linear_between_knots() -> None:
     combined = EstimateCombination("filter", (0.0, 1.0, 1.0, 0.0), (9.0,) * 4, KNOTS_MPS2)
     lateral = np.array([0.0, 1.5, 3.0, 7.5, 20.0])
     assert combined(np.ones(5), np.zeros(5), lateral).tolist() == [0.0, 0.5, 1.0, 0.5, 0.0]
-
-
-def test_hats_add_up_to_one() -> None:
-    np.testing.assert_allclose(hat_functions(np.linspace(0, 12, 100)).sum(axis=0), 1)
 
 
 def test_equal_shares_at_all_knots_without_information_by_acceleration() -> None:

@@ -216,12 +216,6 @@ def test_small_steps_do_not_lead_downhill(drives: Warehouse) -> None:
     assert registry.rollback("beta", "champion") == 2
 
 
-def test_what_was_forced_is_where_it_begins_anew(drives: Warehouse) -> None:
-    publish_from(drives)
-    publish_from(drives, signals="ay", force=True)
-    assert registry_of(drives).history("beta").best_of("champion") == 2
-
-
 @pytest.mark.parametrize(
     ("floor", "problem"),
     [

@@ -140,17 +140,6 @@ def test_criteria_are_prices_on_contributions() -> None:
     np.testing.assert_allclose(evidence.distances(), [58.5, 10.5, 3.5, 2.5, 4])
 
 
-def test_evidence_over_drives_is_of_fewer_rows() -> None:
-    drives = random_drives(6, drives=20, noise=200)
-    gram = gram_of(np.concatenate(drives))
-    moments = DriveMoments.from_table(table_of([gram_of(counts) for counts in drives]))
-    fits = nested_fits(gram, names(4)[:-1], "y")
-    evidence = Evidence.measure(fits, moments)
-    assert evidence.kind == "drives"
-    assert 6 <= evidence.rows <= gram.n
-    assert evidence.rows == pytest.approx(gram.n / evidence.design_effect)
-
-
 def test_independent_rows_have_about_as_many_effective_rows() -> None:
     rng = np.random.default_rng(9)
     drives = [np.rint(rng.normal(size=(30, 4)) * 500).astype(int) for _ in range(300)]

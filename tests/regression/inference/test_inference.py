@@ -1,7 +1,5 @@
 """Standard errors, Chow test and variance inflation against dense formulas and closed forms."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import scipy.stats
@@ -214,19 +212,6 @@ def test_a_unit_and_an_origin_change_nothing_else(
     assert other.values == pytest.approx(unit * one.values + origin, abs=1e-6)
     assert other.errors == pytest.approx(unit * one.errors, rel=1e-3, abs=1e-6)
     assert other.spread == pytest.approx(unit * one.spread, rel=1e-3, abs=1e-5)
-
-
-@given(NUMBERS, VARIANCES)
-def test_members_come_nearer_to_the_mean_the_more_so_the_less_they_know(
-    values: FloatArray, variances: FloatArray
-) -> None:
-    found = pool(values, variances)
-    assert found is not None
-    left = np.abs(found.values - found.mean)
-    assert (left <= np.abs(values - found.mean) + 1e-12).all()
-    apart = np.abs(values - found.mean) > 1e-6
-    kept = (left[apart] / np.abs(values - found.mean)[apart])[np.argsort(variances[apart])]
-    assert all(more >= less - 1e-9 for more, less in pairwise(kept))
 
 
 def test_of_too_few_members_nothing_is_drawn() -> None:
