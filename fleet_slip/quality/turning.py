@@ -58,6 +58,8 @@ def check_moments(
     table: "GramTable", signals: SignalCatalog, min_correlation: float
 ) -> dict[int, Fault]:
     """Return the drives whose signals contradict one another or stand still, with the fault."""
+    if not len(table):
+        return {}
     moments = MeanMoments.from_table(table).in_si(signals)
     faults = find_swapped_steering(moments)
     if len(_witnesses(moments).signals) >= MIN_WITNESSES:
