@@ -77,7 +77,7 @@ class RejectedRows:
     counts
         Their number by field and reason.
     first
-        The one with the least number.
+        The first one.
     """
 
     def __init__(self) -> None:
@@ -91,10 +91,9 @@ class RejectedRows:
         """Count rows and keep them. Raises `InputError` if the disk is full."""
         if not rows.height:
             return
+        self.first = self.first or rows.row(0, named=True)
         for signal, reason, number in rows.group_by("signal", "reason").len().iter_rows():
             self.counts[signal or "", reason] += number
-        first = rows.row(rows["row"].arg_min() or 0, named=True)
-        self.first = min(self.first or first, first, key=lambda row: row["row"])
         self._rows.append(rows)
         if sum(frame.height for frame in self._rows) >= REFUSED_ROWS:
             content = BytesIO()
@@ -207,67 +206,64 @@ class MeasuredLog:
 
     def _require_sane_drives(self) -> None:
         """Raise `InputError` where drives are too many or too long for so few rows."""
-        counts, name = self.counts, self.mapping.name
+        counts, problem = self.counts, ""
         if counts.drives > MAX_DRIVES and counts.rows_kept < SHORT_ROWS * counts.drives:
-            raise InputError(
-                f"{quote_name(self.file)}: it splits into more than {MAX_DRIVES:,} drives of "
-                f"{counts.rows_kept / counts.drives:.0f} rows on average. Check time, split_gap_s "
-                f"and the drive's column in the mapping {name!r}."
-            )
+            rows = counts.rows_kept / counts.drives
+            problem = f"it splits into {counts.drives:,} drives of {rows:.0f} rows on average"
         if counts.ticks > MAX_TICKS and counts.ticks > MAX_TICKS_PER_ROW * counts.rows_kept:
+            problem = f"{counts.rows_kept:,} rows span {counts.ticks:,} ticks of 100 Hz"
+        if problem:
             raise InputError(
-                f"{quote_name(self.file)}: {counts.rows_kept:,} rows span {counts.ticks:,} ticks "
-                "of "
-                f"100 Hz. Check the unit of time and split_gap_s in the mapping {name!r}."
+                f"{quote_name(self.file)}: {problem}. Check the unit of time, split_gap_s and the "
+                f"drive's column in the mapping {self.mapping.name!r}."
             )
 
     def _require_usable(self) -> None:
         """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
-        counts, file, name = self.counts, quote_name(self.file), self.mapping.name
+        counts, mapping, problem = self.counts, self.mapping, ""
         if not counts.rows_kept and (first := self._rejected.first):
-            several = Counter(counts.quarantined)
-            reasons = ", ".join(f"{n:,} {reason}" for reason, n in several.most_common())
+            reasons = Counter(counts.quarantined)
+            texts = ", ".join(f"{n:,} {reason}" for reason, n in reasons.most_common())
             example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
-            raise InputError(
-                f"{file}: none of {pluralize(several.total(), 'row')} is usable ({reasons}; "
-                f"first: {example}). Check columns, units and time in mapping {name!r}."
+            problem = (
+                f"none of {pluralize(reasons.total(), 'row')} is usable ({texts}; first: "
+                f"{example}). Check columns, units and time"
             )
-        if not counts.ticks:
-            raise InputError(
-                f"{file}: no row is on a tick of 100 Hz, and longest_gap_s = "
-                f"{self.mapping.time.longest_gap_s:g} prevents interpolation. Raise it in the "
-                f"mapping {name!r} if the signals change slowly enough."
+        elif not counts.ticks:
+            gap_s = mapping.time.longest_gap_s
+            problem = (
+                f"no row is on a tick of 100 Hz, and longest_gap_s = {gap_s:g} prevents "
+                "interpolation. Raise it, if the signals change slowly enough,"
             )
-        for signal, source in self.mapping.signals.items():
-            if self._samples[signal] and not self._values[signal]:
-                raise InputError(
-                    f"{file}: {signal} has {pluralize(self._samples[signal], 'value')} in "
-                    f"{source.column!r}, and none is on a tick of 100 Hz: they are further apart "
-                    f"than longest_gap_s. Give the signal in the mapping {name!r} a longest_gap_s "
-                    "of its own, or interpolate = false."
+        else:
+            lost = [name for name in self._samples if not self._values[name]]
+            for signal in lost[:1]:
+                problem = (
+                    f"{signal} has {pluralize(self._samples[signal], 'value')} in "
+                    f"{mapping.signals[signal].column!r}, and none is on a tick of 100 Hz: they "
+                    "are further apart than longest_gap_s. Give the signal a longest_gap_s of its "
+                    "own, or interpolate = false,"
                 )
+        if problem:
+            raise InputError(f"{quote_name(self.file)}: {problem} in the mapping {mapping.name!r}.")
 
     def quarantine(self) -> Iterator[pa.Table]:
         """Yield rejected rows as those of the table `quarantine`, once all drives were taken."""
-        stated = self.mapping.drive.vehicle_id
+        stated, stored = self.mapping.drive.vehicle_id, quarantine_schema()
         vehicle = stated if isinstance(stated, str) else None
         metadata = enumerate(self.checker.keys.metadata)
         groups = [(g, drive_id(self.prefix, g), m.get("vehicle_id", vehicle)) for g, m in metadata]
         schema = {"group": pl.Int32, "drive_id": pl.String, "vehicle_id": pl.String}
         names = pl.DataFrame(groups, schema, orient="row")
         for rows in self._rejected.frames():
-            ordered = rows.sort("row", maintain_order=True)
-            named = ordered.join(names, on="group", how="left", maintain_order="left")
-            frame = named.select(
-                pl.lit(self.name).alias("file"),
-                "row",
-                "drive_id",
-                pl.col("vehicle_id").fill_null(pl.lit(vehicle, pl.String)),
-                "reason",
-                "signal",
-                "value",
+            named = rows.sort("row", maintain_order=True).join(
+                names, on="group", how="left", maintain_order="left"
             )
-            yield frame.to_arrow().cast(quarantine_schema())
+            frame = named.with_columns(
+                pl.lit(self.name).alias("file"),
+                pl.col("vehicle_id").fill_null(pl.lit(vehicle, pl.String)),
+            )
+            yield frame.select(stored.names).to_arrow().cast(stored)
 
     def suspicions(self) -> tuple[Fault, ...]:
         """Return the faults of the file as a whole. Call it after `drives` has ended."""
@@ -403,37 +399,29 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
     if mapping.time.own_clock or not unmapped:
         return
     used = {name for names in mapping.time_bases().values() for name in names}
+    check = CHECKS["unused column of cars or trips"]
     with file_errors(file), open_log(file, mapping.formats) as source:
         names = [channel.name for channel in source.channels()]
+        free = [name for name in names if name not in used and names.count(name) == 1]
         for key, words in unmapped.items():
-            for name in names:
-                if name in used or names.count(name) > 1 or not is_called(words, name):
-                    continue
-                values, runs = _values_and_runs(batch[name] for batch in source.batches([name]))
-                if values > CHECKS["unused column of cars or trips"].high and (
-                    key == "vehicle_id" or runs > values or values > drives
-                ):
+            for name in (name for name in free if is_called(words, name)):
+                count = _count_names(batch[name] for batch in source.batches([name]))
+                if count > check.high and (key == "vehicle_id" or count > drives):
                     where = f"column = {json.dumps(name, ensure_ascii=False)}"
                     where = f"{key} = {{ {where} }}" if key != "column" else where
-                    yield CHECKS["unused column of cars or trips"].fault(
-                        name, count=values, where=where
-                    )
+                    yield check.fault(name, count=count, where=where)
 
 
-def _values_and_runs(pieces: Iterable[pl.Series]) -> tuple[int, int]:
-    """Return how many names a column has, and how often one begins; none if it is a quantity."""
-    values, rows, runs, before = set[str](), 0, 0, None
+def _count_names(pieces: Iterable[pl.Series]) -> int:
+    """Return how many names a column has; 0 if it is a quantity."""
+    values, rows = set[str](), 0
     for piece in pieces:
-        texts = piece.cast(pl.String).str.strip_chars()
-        present = texts.filter(texts.is_not_null() & (texts != ""))
-        values.update(present.unique())
+        texts = piece.cast(pl.String).str.strip_chars().replace("", None).drop_nulls()
+        values.update(texts.unique())
+        rows += len(texts)
         if len(values) > MAX_NAMES:
-            return 0, 0
-        if len(present):
-            rows += len(present)
-            runs += int((present != present.shift()).sum()) + (present[0] != before)
-            before = present[-1]
-    return (0, 0) if len(values) > rows // MIN_ROWS_PER_NAME else (len(values), runs)
+            return 0
+    return 0 if len(values) > rows // MIN_ROWS_PER_NAME else len(values)
 
 
 def _overlaps(under_way: list[tuple[float, float]]) -> int:

@@ -287,7 +287,7 @@ def test_what_is_absurd_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     columns = good_columns(300)
     columns["run"] = [i // 3 for i in range(300)]
     monkeypatch.setattr(measured_log, "MAX_DRIVES", 99)
-    with pytest.raises(InputError, match="splits into more than 99 drives of 3 rows on average"):
+    with pytest.raises(InputError, match="splits into 100 drives of 3 rows on average"):
         read_columns(tmp_path, columns, a_mapping(drive={"column": "run"}))
     monkeypatch.setattr(checked_columns, "MAX_KEYS", 99)
     with pytest.raises(InputError, match="more than 99 combinations"):
