@@ -1,5 +1,6 @@
 """Each target of the long fuzz run, briefly, with choices that hypothesis steers and shrinks."""
 
+import random
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -8,7 +9,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fleet_slip.errors import FleetSlipError
-from tests.support.fuzz.mutate import ByteRandom
 from tests.support.fuzz.targets import TARGETS
 
 EXAMPLES = {"csv": 60, "parquet": 60, "config": 100, "sql": 60, "manifest": 40}
@@ -33,11 +33,11 @@ def test_whatever_comes_is_answered_or_refused(name: str, examples: int, sandbox
     target, _ = TARGETS[name]
 
     @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck))
-    @given(st.binary(min_size=64, max_size=4096))
-    def attack(data: bytes) -> None:
+    @given(st.randoms(use_true_random=False))
+    def attack(rng: random.Random) -> None:
         with TemporaryDirectory(dir=sandbox) as folder:
             try:
-                target(ByteRandom(data), Path(folder))
+                target(rng, Path(folder))
             except FleetSlipError as error:
                 assert str(error).isprintable()
 

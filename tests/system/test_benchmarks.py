@@ -53,7 +53,7 @@ RUN_BY = {
 }
 """What a test of its own runs, with sizes that are not tiny."""
 
-ELSEWHERE = {"fuzz.guided": "atheris", "weka": "WEKA and a JVM"}
+ELSEWHERE = {"weka": "WEKA and a JVM"}
 """What is not run here, and what it needs."""
 
 PARTS = {"__main__", "peer_ways", "usage"}
@@ -146,7 +146,7 @@ def programs() -> set[str]:
         for path in BENCHMARKS.glob("*.py")
         if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
     }
-    return (modules | {"fuzz", "fuzz.guided", "rivals"}) - PARTS
+    return (modules | {"fuzz", "rivals"}) - PARTS
 
 
 def named_in(page: Path) -> set[str]:

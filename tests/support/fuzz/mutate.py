@@ -75,26 +75,6 @@ NESTED = "@nested"
 _NESTED_TEXT = "[" * 5000 + "]" * 5000
 
 
-class ByteRandom(random.Random):
-    """A generator whose choices are read from bytes, so that a fuzzer can steer and shrink them."""
-
-    def __init__(self, data: bytes) -> None:
-        super().__init__(0)
-        self._data = data
-        self._at = 0
-
-    def getrandbits(self, k: int, /) -> int:
-        """Return k bits of the data; zeros after its end."""
-        size = (k + 7) // 8
-        taken = self._data[self._at : self._at + size].ljust(size, b"\0")
-        self._at += size
-        return int.from_bytes(taken, "little") >> (8 * size - k)
-
-    def random(self) -> float:
-        """Return a number in [0, 1)."""
-        return self.getrandbits(16) / 2**16
-
-
 def mutate_bytes(rng: random.Random, data: bytes, edges: int = 0) -> bytes:
     """Damage bytes in a few places; `edges` prefers so many bytes at both ends."""
     changed = bytearray(data)

@@ -27,7 +27,6 @@ from fleet_slip.errors import FleetSlipError
 from fleet_slip.grams.cohort import FoldKey, load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest.mapping import Mapping, load_mapping
-from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.request import SelectionRequest, load_model_list
 from fleet_slip.models.score import score
@@ -133,30 +132,6 @@ def names(rng: random.Random, place: Path) -> None:
     load_cohort(warehouse, predicate)
     request = SelectionRequest(order="ax", group_by=rng.choice(FOLD_KEYS))
     run_selection(warehouse, request, predicate)
-
-
-def references(rng: random.Random, place: Path) -> None:
-    """Name models, aliases, configs and signals that do not exist."""
-    warehouse = Warehouse(LocalFolder(template(place)))
-    registry = Registry(warehouse.root, CATALOG)
-    word = rng.choice([*WORDS, f"{MODEL}@{rng.choice(WORDS)}", f"{rng.choice(WORDS)}@1"])
-    match rng.randrange(7):
-        case 0:
-            registry.resolve(word)
-        case 1:
-            require_model_name(word)
-        case 2:
-            SHIPPED_CONFIGS.find(rng.choice(["campaigns", "models", "tracks"]), word)
-        case 3:
-            registry.promote(MODEL, 1, word)
-        case 4:
-            registry.rollback(word, word)
-        case 5:
-            run_selection(warehouse, SelectionRequest(order=f"ax,{word}", folds=2))
-        case _:
-            run_selection(
-                warehouse, SelectionRequest(models=word, features=rng.choice([word, None]))
-            )
 
 
 # Configurations
@@ -356,55 +331,34 @@ _HOSTILE = (
 )
 
 
-def _query(rng: random.Random, depth: int) -> str:
+_PARTS = (
+    *_TABLES,
+    *_COLUMNS,
+    *_HOSTILE,
+    *("1", "'a'", "NULL", "1e308", "DATE '2024-05-01'", "range(3)", "log, drives"),
+    *("sum(ax)", "CASE WHEN ax IS NULL THEN ay END", "[tick]", "CAST(day AS VARCHAR)"),
+    *("count(*) FILTER (ax > ay)", "row_number() OVER (ORDER BY tick)"),
+)
+
+
+def _query(rng: random.Random, depth: int = 2) -> str:
     """Return SQL that is valid more often than not."""
-    if rng.random() < 0.03:
-        return rng.choice(_HOSTILE)
-    start = rng.choice(
-        ["SELECT"] * 8 + ["EXPLAIN SELECT", "EXPLAIN ANALYZE SELECT", "SUMMARIZE SELECT"]
-    )
-    start = start if depth > 2 else "SELECT"
-    text = f"{start} {_expression(rng, depth)} AS a FROM {_source(rng, depth)}"
-    if rng.random() < 0.3:
-        text = f"WITH w AS ({_query(rng, depth - 1) if depth else 'SELECT 1'}) {text}"
-    if rng.random() < 0.3:
-        text += f" WHERE {_expression(rng, depth)} = {_expression(rng, depth)}"
-    if rng.random() < 0.3:
-        text += rng.choice([" ORDER BY ALL", " GROUP BY ALL", " LIMIT 3", " UNION ALL SELECT 1"])
-    return text
 
+    def part(parts: tuple[str, ...]) -> str:
+        return rng.choice(parts if rng.random() < 0.8 else _PARTS)
 
-def _source(rng: random.Random, depth: int) -> str:
-    if depth and rng.random() < 0.3:
-        return f"({_query(rng, depth - 1)}) AS s"
-    return rng.choice([*_TABLES * 3, "range(3)", "w", "log, drives", *_HOSTILE])
-
-
-def _expression(rng: random.Random, depth: int) -> str:
-    if not depth or rng.random() < 0.4:
-        return rng.choice(
-            [*_COLUMNS, "1", "'a'", "NULL", "1e308", "DATE '2024-05-01'", *_HOSTILE[-2:]]
-        )
-    one, two = _expression(rng, depth - 1), _expression(rng, depth - 1)
-    forms = (
-        f"sum({one})",
-        f"({one} + {two})",
-        f"CASE WHEN {one} IS NULL THEN {two} END",
-        f"CAST({one} AS VARCHAR)",
-        f"[{one}]",
-        f"count(*) FILTER ({one} > {two})",
-        f"EXISTS ({_query(rng, depth - 1)})",
-        f"list_transform([{one}], lambda v: v)",
-        f"row_number() OVER (ORDER BY {one})",
-    )
-    return rng.choice(forms)
+    source = f"({_query(rng, depth - 1)}) AS s" if depth and rng.random() < 0.4 else part(_TABLES)
+    verb = rng.choice([*["SELECT"] * 8, "EXPLAIN SELECT", "SUMMARIZE SELECT"])
+    where = f" WHERE {part(_COLUMNS)} = {part(_COLUMNS)}"
+    end = rng.choice(["", where, " LIMIT 3", " UNION ALL SELECT 1"])
+    return f"{verb if depth == 2 else 'SELECT'} {part(_COLUMNS)} AS a FROM {source}{end}"
 
 
 def sql(rng: random.Random, place: Path) -> None:
     """Ask what may be a query, as a query and as a cohort's condition."""
     root = _template(str(place.parent))
     before = _sizes(root)
-    text = _query(rng, 3)
+    text = _query(rng)
     if rng.random() < 0.1:
         text = mutate_bytes(rng, text.encode()).decode("utf-8", "surrogateescape")
     try:
@@ -439,7 +393,6 @@ TARGETS: dict[str, tuple[Target, int]] = {
     "config": (config, 20),
     "sql": (sql, 12),
     "manifest": (manifest, 10),
-    "references": (references, 3),
     "data_file": (data_file, 2),
     "delta_log": (delta_log, 2),
     "names": (names, 1),
