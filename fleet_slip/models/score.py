@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.base import pluralize, quote_argument
+from fleet_slip.base import pluralize
 from fleet_slip.calibration.car_calibration import calibrate
-from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import hash_names
@@ -67,8 +67,6 @@ class Score(Answer):
     """Drives that are left out for faulty sensors, as a sentence."""
     model: str = ""
     cohort: str = ""
-    measured_cohort: str = ""
-    """Cohort for `evaluate`, if the training drives are measured."""
 
     def parts(self) -> Iterator[Part]:
         """Return the figures, and the drives and rows that are left out."""
@@ -84,20 +82,14 @@ class Score(Answer):
             ),
         )
         yield from remark_skipped_rows(self.rows_without, self.rows + self.rows_without)
-        yield from self._trained()
-
-    def _trained(self) -> Iterator[Remark]:
-        """Yield how many drives trained the model: there its error is a training error."""
         if self.drives_left_out:
             count = pluralize(self.drives_left_out, "drive")
             yield Remark(f"left out: {count} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
-            measured = self.measured_cohort
-            options = f" --cohort {quote_argument(measured)}" if measured else ""
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
                 f"{pluralize(self.drives, 'drive')}: its error there is a training error. On "
-                f"held-out drives: fleet-slip evaluate {self.model}{options}"
+                f"held-out drives: fleet-slip evaluate {self.model} (measured ones: --cohort)"
             )
 
 
@@ -223,15 +215,11 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Scor
 
 @dataclass(frozen=True)
 class TrainingOverlap:
-    """Numbers of drives of a cohort and of training drives in it; predicate of the unseen ones.
-
-    `measured` is true if a training drive is measured.
-    """
+    """Numbers of drives of a cohort and of training drives in it; predicate of the unseen ones."""
 
     drives: int
     trained: int
     unseen: Predicate
-    measured: bool
 
 
 def find_training_overlap(
@@ -242,15 +230,13 @@ def find_training_overlap(
     cohort = cohort_of_rows(signals, predicate)
     view = "log" if cohort.columns - set(drive_columns(signals)) else "drives"
     logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
-    query = f"SELECT DISTINCT drive_id, source FROM {view} WHERE {logged} ORDER BY 1"
+    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, guarded_query(database, cohort):
-        drives = database.sql(query).to_arrow_table()
-    names = drives["drive_id"]
+        names = database.sql(query).to_arrow_table()["drive_id"]
     is_trained = registry.trained_drives(manifest).among(hash_names(names))
     trained = int(is_trained.sum())
-    measured = MEASURED in drives["source"].filter(pa.array(is_trained)).to_pylist()
     if trained in (0, len(names)):
-        return TrainingOverlap(len(names), trained, cohort, measured)
+        return TrainingOverlap(len(names), trained, cohort)
     unseen = ", ".join(map(sql_text, names.filter(pa.array(~is_trained)).to_pylist()))
     predicate = Predicate(cohort.text, f"({cohort.sql} AND drive_id IN ({unseen}))")
-    return TrainingOverlap(len(names), trained, predicate, measured)
+    return TrainingOverlap(len(names), trained, predicate)

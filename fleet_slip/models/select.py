@@ -7,7 +7,6 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
-from functools import cache
 
 import numpy as np
 
@@ -394,12 +393,9 @@ def find_complete_cases(
     have all signals than 1 - `MAX_LOST_SHARE` of the drives of the most common.
     """
 
-    @cache
-    def count_drives(tables: tuple[int, ...]) -> int:
-        return folds.count_drives(tables) if tables else 0
-
     def drives_with(signals: Collection[str]) -> int:
-        return count_drives(folds.tables_with([*signals, label]))
+        tables = folds.tables_with([*signals, label])
+        return folds.count_drives(tables) if tables else 0
 
     entries = [(candidate.name, frozenset(candidate.signals)) for candidate in candidates]
     entries += [(name, frozenset([name])) for name in columns]
@@ -415,28 +411,20 @@ def find_complete_cases(
             common |= signals
             comparable.add(i)
         elif i < len(candidates):
-            rare = [
-                signal for signal in sorted(signals) if drives_with([signal]) < total
-            ] or sorted(signals)
-            lost = f"{total - remaining:,} of {pluralize(total, 'drive')}"
-            skipped[name] = _missing_signals(folds, label, signals) or (
-                f"not comparable: {lost} lack {', '.join(rare)}, and only a tenth may be left out"
+            names = sorted(signals)
+            rare = [signal for signal in names if drives_with([signal]) < total] or names
+            skipped[name] = (
+                f"not comparable: {total - remaining:,} of {pluralize(total, 'drive')} lack "
+                f"{', '.join(rare)}, and only a tenth may be left out"
             )
+            if absent := [signal for signal in names if not drives_with([signal])]:
+                skipped[name] = f"these drives lack {', '.join(absent)}."
     chosen = sorted(comparable)
     return ComparedRows(
         folds.with_signals([*common, label]),
         tuple(candidates[i] for i in chosen if i < len(candidates)),
         tuple(entries[i][0] for i in chosen if i >= len(candidates)),
     )
-
-
-def _missing_signals(folds: CohortFolds, label: str, signals: Collection[str]) -> str | None:
-    """Return why no fold has rows with the signals; None if folds have."""
-    try:
-        folds.complete_cases(sorted(signals), label, sparse=True)
-    except DataError as error:
-        return str(error)
-    return None
 
 
 def _cross_validate(
