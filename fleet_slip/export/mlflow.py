@@ -78,13 +78,9 @@ def require_answer(uri: str, reference: str, timeout_s: float = ANSWER_S) -> Non
     except HTTPError:
         return
     except (OSError, HTTPException) as error:  # URLError among them
-        reason = getattr(error, "reason", error)
-        if isinstance(reason, SSLError):
-            return
-        text = "no answer" if isinstance(reason, TimeoutError) else str(reason)
-        raise _rejected(
-            reference, f"nothing answers at {uri} within {timeout_s:g} s ({text})."
-        ) from None
+        if not isinstance(getattr(error, "reason", error), SSLError):
+            reason = f"nothing answers at {uri} within {timeout_s:g} s ({error})."
+            raise _rejected(reference, reason) from None
 
 
 def _rejected(reference: str, reason: str) -> StorageError:
@@ -208,11 +204,8 @@ def _columns(program: Program) -> dict[str, str]:
 def _signature(mlflow: Any, program: Program) -> Any:
     types = mlflow.types
     inputs = [types.ColSpec(kind, name) for name, kind in _columns(program).items()]
-    if program.rings:
-        inputs += [
-            types.ColSpec("string", "drive_id", required=False),
-            types.ColSpec("long", "tick", required=False),
-        ]
+    for name, kind in {"drive_id": "string", "tick": "long"}.items() if program.rings else ():
+        inputs.append(types.ColSpec(kind, name, required=False))
     angle = types.Schema([types.ColSpec("double", program.angle.column)])
     return mlflow.models.ModelSignature(inputs=types.Schema(inputs), outputs=angle)
 

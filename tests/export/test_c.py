@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.c import MAX_UNSIGNED
 from fleet_slip.export.stepping import Estimator, angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
@@ -209,15 +208,6 @@ def test_the_source_has_no_floating_point_and_no_calls_of_a_library() -> None:
     assert text.count("#include <") == 2
 
 
-def test_quotients_take_64_bits_only_where_they_need_them() -> None:
-    text = export_texts(ModelVersion(1, model_of({"mean_3": SMALL}), "0" * 64, CATALOG), None, "c")[
-        "sideslip_sideslip.c"
-    ]
-    assert "nearest_32" in text
-    assert "nearest_64" not in text
-    assert MAX_UNSIGNED > 2 * 3 * 32767 * 16 + 3
-
-
 NAMES = ("mean_3", "sum_4", "heavy")
 MODEL = model_of(dict.fromkeys(NAMES, Fraction(1, 10**4)), Fraction(-1, 700), "any")
 KINDS = {"SWORD": "int16_t", "SLONG": "int32_t", "ULONG": "uint32_t", "UBYTE": "bool"}
@@ -255,22 +245,18 @@ def text(tmp_path: Path) -> str:
     )
     program = MAIN.replace("DECLARED", declared[1]).replace("CHECKED", checked)
     (tmp_path / "main.c").write_text(program)
+    compile_c(tmp_path, ("main.c", "sideslip_any.c"), "-g")
     return found
 
 
-@needs_cc
-def test_a_program_with_the_variables_has_each_symbol_in_its_type(
-    text: str, tmp_path: Path
-) -> None:
+def test_a_program_with_the_variables_has_each_symbol_in_its_type(text: str) -> None:
     assert text.count("/begin MEASUREMENT") == 2 * 2 + 2
-    compile_c(tmp_path, ("main.c", "sideslip_any.c"))
 
 
 @pytest.mark.tools("a2ltool")
 def test_another_program_reads_it_and_finds_each_address_in_what_was_linked(
     text: str, tmp_path: Path
 ) -> None:
-    compile_c(tmp_path, ("main.c", "sideslip_any.c"), "-g")
     words = ["a2ltool", "sideslip_any.a2l", "--strict", "--check", "--elffile", "program"]
     words += ["--update", "ADDRESSES", "--update-mode", "STRICT", "--output", "found.a2l"]
     done = subprocess.run(

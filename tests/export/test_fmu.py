@@ -10,7 +10,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.errors import ConfigError
-from fleet_slip.export import fmu
+from fleet_slip.export import files as export
 from fleet_slip.export.files import export_files
 from fleet_slip.export.stepping import angles_by_kernel, compile_program
 from fleet_slip.models.registry import ModelVersion
@@ -85,14 +85,14 @@ def test_it_says_what_it_is_of_and_is_the_same_again(archive: bytes, version: Mo
     with zipfile.ZipFile(BytesIO(archive)) as file:
         table = file.read("resources/checks.csv").decode()
         text = file.read("modelDescription.xml").decode()
-    assert fmu.fmu(version, compile_program(CATALOG, version.manifest), table) == archive
+    assert export.fmu_archive(version, compile_program(CATALOG, version.manifest), table) == archive
     assert "every_kind@1, SHA-256 01230123" in text
     assert '<Unit name="m/s^2"><BaseUnit m="1" s="-2"/></Unit>' in text
     assert table.startswith("drive_id,tick,")
 
 
 def test_without_a_compiler_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fmu, "COMPILER", "no-such-compiler")
+    monkeypatch.setattr(export, "COMPILER", "no-such-compiler")
     version = version_of("signals")
     with pytest.raises(ConfigError, match="the C compiler no-such-compiler"):
         export_files(version, None, "fmu")

@@ -1,6 +1,5 @@
 """Exports of models with names at the ends of what names may be, and of drives without rows."""
 
-import json
 import subprocess
 import zipfile
 from collections.abc import Mapping
@@ -17,12 +16,11 @@ import pytest
 from cantools.database.can.database import Database
 
 from fleet_slip.errors import InputError
-from fleet_slip.export import fmu
+from fleet_slip.export import files as export
 from fleet_slip.export.files import export_files
 from fleet_slip.export.mlflow import LoggedVersion
 from fleet_slip.export.templating import distinct
 from fleet_slip.models.registry import ModelVersion
-from tests.export import plain
 from tests.export.compiled import compile_c, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite
 from tests.export.models import LONGEST, MODELS, TEXTS, hostile_version, model_of
@@ -59,7 +57,7 @@ def test_c_with_the_longest_names_passes_its_self_test(tmp_path: Path) -> None:
 
 def test_fmus_have_a_parameter_for_each_fact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without the binary: what is compiled is that of other models, in test_fmu."""
-    monkeypatch.setattr(fmu, "_compile", lambda sources: repr([*sources]).encode())
+    monkeypatch.setattr(export, "_compile", lambda sources: repr([*sources]).encode())
     for content in exported("fmu").values():
         if not content.startswith(b"PK"):
             continue
@@ -79,15 +77,6 @@ def test_a_dbc_file_is_read_and_names_no_signal_twice() -> None:
     names = [signal.name for message in bus.messages for signal in message.signals]
     assert len({*names}) == len(names)
     assert all(len(name) <= 32 for name in names)
-
-
-def test_the_json_document_gives_the_angles_of_its_checks() -> None:
-    document = json.loads(exported("json")[f"{LONGEST}-1.json"])
-    assert [one["equals"] for one in document["program"]["facts"]] == [*TEXTS]
-    for check in document["checks"]:
-        given = (check["facts"], check["numbers"], check["samples"])
-        assert plain.angles(document["program"], *given) == check["angles"]
-    assert len({angle for check in document["checks"] for angle in check["angles"]}) > 50
 
 
 def test_onnx_takes_no_car_at_all() -> None:

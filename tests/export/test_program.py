@@ -12,7 +12,6 @@ import pytest
 import fleet_slip
 from fleet_slip.base import canonical_json, sha256_of
 from fleet_slip.catalog.definitions import Combination, Definition
-from fleet_slip.columns.lowering import most_values
 from fleet_slip.errors import InputError, QuestionError, UsageError
 from fleet_slip.export.files import program_content
 from fleet_slip.export.stepping import Estimator, compile_program, make_checks
@@ -88,15 +87,6 @@ def test_what_needs_more_than_63_bits_has_no_program(
         for check in make_checks(SIGNALS, manifest, program):
             samples = list(check.samples)
             assert plain.angles(program_content(program), [], [], samples) == list(check.angles)
-
-
-def test_a_running_mean_ends_before_its_sum_overflows() -> None:
-    widest = Definition(
-        of="fast", sql="ay", of_bits=20, over="running_mean", ratio=Fraction(2**14), bits=20
-    )
-    twice, most = 2 * (2**19 - 1) * 2**14, most_values(widest)
-    assert (twice + 1) * most < 2**63 <= (twice + 1) * (most + 1)
-    assert most > 2**28
 
 
 def test_a_feature_defined_in_two_ways_is_refused() -> None:
