@@ -41,7 +41,6 @@ _WEAK = 0.5
 """Weight of an ambiguous word; that of an unambiguous one is 1."""
 _UNIT_FITS = 4.0
 _SIGN_WORDS = {"vz", "vorzeichen", "sign", "signum", "sgn"}
-_ALIKE = 0.02
 
 Keys: TypeAlias = Mapping[str, Any]
 """Of a signal in a mapping."""
@@ -109,7 +108,7 @@ def guess_signals(catalog: SignalCatalog, profiles: tuple[Profile, ...]) -> dict
         if signal not in guesses:
             guesses[signal], best[signal] = guess, score
             taken.add(name)
-        elif score == best[signal] and not _same_values(guess, guesses[signal]):
+        elif score == best[signal]:
             first = guesses[signal]
             guesses[signal] = replace(first, rivals=(*first.rivals, guess))
     guesses = _satellites(guesses)
@@ -132,15 +131,6 @@ def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, G
             continue
         fits = 0.0 if guess.readings else _UNIT_FITS
         yield score + fits, replace(guess, is_weak=weak)
-
-
-def _same_values(first: Guess, second: Guess) -> bool:
-    a, b = first.profile.values, second.profile.values
-    if a.size != b.size:
-        return False
-    both = np.isfinite(a) & np.isfinite(b)
-    spread = float(np.std(b[both])) if both.any() else 0.0
-    return bool(both.any() and np.std(a[both] - b[both]) <= _ALIKE * max(spread, 1e-9))
 
 
 def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:

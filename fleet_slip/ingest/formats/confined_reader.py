@@ -38,6 +38,8 @@ from fleet_slip.errors import FleetSlipError, is_lack_of_memory
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget, Source, unreadable
 
+HDF5 = b"\x89HDF\r\n\x1a\n"
+
 
 class Format(NamedTuple):
     """A binary format: first bytes and suffixes of its files, its module, and its packages."""
@@ -49,21 +51,17 @@ class Format(NamedTuple):
     packages: tuple[str, ...]
 
 
-_MDF = ("asammdf",)
 FORMATS = {
-    "mdf": Format("an MDF file", (b"MDF     ", b"UnFinMF "), (".mf4", ".mdf"), "mdf", _MDF),
-    "mdf_bus": Format("bus logging", (), (), "mdf", (*_MDF, "cantools")),
+    "mdf": Format("an MDF file", (b"MDF     ", b"UnFinMF "), (".mf4", ".mdf"), "mdf", ("asammdf",)),
+    "mdf_bus": Format("bus logging", (), (), "mdf", ("asammdf", "cantools")),
     "mcap": Format("an MCAP file", (b"\x89MCAP0\r\n",), (".mcap",), "mcap", ("mcap_ros2.decoder",)),
     "tdms": Format("a TDMS file", (b"TDSm",), (".tdms", ".tdms_index"), "tdms", ("nptdms",)),
     "mat": Format(
-        "a MATLAB file of version 5", (b"MATLAB 5.0 MAT-file",), (), "matlab", ("scipy.io",)
-    ),
-    "mat73": Format(
         "a MATLAB file of version 5 or 7.3",
-        (b"\x89HDF\r\n\x1a\n",),
+        (b"MATLAB 5.0 MAT-file", HDF5),
         (".mat", ".h5", ".hdf5"),
         "matlab",
-        ("h5py",),
+        ("scipy.io", "h5py"),
     ),
     "can_trace": Format("a BLF file", (b"LOGG",), (".blf",), "can", ("can", "cantools")),
 }

@@ -165,8 +165,13 @@ class _Content:
 
 @contextmanager
 def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
-    """Open a MATLAB file of version 5 to 7, which is then in memory. Raises `InputError`."""
+    """Open a MATLAB file. Raises `InputError`. One of version 5 to 7 is then in memory."""
     with budget.file.open("rb") as stream:
+        if not stream.read(10).startswith(b"MATLAB 5.0"):
+            with _open_hdf5(budget) as vectors:
+                yield vectors
+            return
+        stream.seek(0)
         file = load_library(budget.file, "scipy.io").loadmat(stream, simplify_cells=True)
     variables = {name: value for name, value in file.items() if not name.startswith("__")}
     if "__function_workspace__" in file:
@@ -177,7 +182,7 @@ def open_mat(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
 
 
 @contextmanager
-def open_mat73(budget: Budget, _formats: FileFormats) -> Iterator[Vectors]:
+def _open_hdf5(budget: Budget) -> Iterator[Vectors]:
     """Open a MATLAB file of version 7.3, or any HDF5 file. Raises `InputError`.
 
     HDF5 can take the values of a dataset out of any other file. That is asked of each dataset

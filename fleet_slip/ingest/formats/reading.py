@@ -30,7 +30,7 @@ import pyarrow as pa
 from fleet_slip import errors
 from fleet_slip.base import quote_name
 from fleet_slip.errors import FleetSlipError, InputError
-from fleet_slip.ingest.formats.confined_reader import FORMATS, SIZES, Format, Job
+from fleet_slip.ingest.formats.confined_reader import FORMATS, HDF5, SIZES, Format, Job
 from fleet_slip.ingest.formats.csv import CsvSource
 from fleet_slip.ingest.formats.file_formats import CsvFormat, FileFormats
 from fleet_slip.ingest.formats.source import Budget, Channel, Source, unreadable
@@ -45,7 +45,7 @@ SUFFIXES = (
 """How the names of logs end."""
 BEGINNINGS = (MAGIC, *(start for kind in FORMATS.values() for start in kind.begins))
 """First bytes of binary logs, whatever their suffix: INCA calls MDF files `.dat`."""
-[_HDF5], _HDF5_AT = FORMATS["mat73"].begins, 512
+_HDF5_AT = 512
 """A MATLAB file of version 7.3 becomes HDF5 there: MATLAB's own header is before it."""
 _ARCHIVES = {b"PK\x03\x04": "unzip", b"7z\xbc\xaf": "7z x", b"Rar!": "unrar x"}
 
@@ -86,12 +86,12 @@ def open_source(file: Path, formats: FileFormats) -> AbstractContextManager[Sour
     """
     budget = Budget.for_file(file)
     with file.open("rb") as stream:
-        start = stream.read(_HDF5_AT + len(_HDF5))
+        start = stream.read(_HDF5_AT + len(HDF5))
     for magic, program in _ARCHIVES.items():
         if start.startswith(magic):
             raise InputError(f"{quote_name(file)}: it is an archive. Unpack it with {program}.")
     suffix = file.suffix.lower()
-    begun = start[_HDF5_AT:] if start.endswith(_HDF5) else start
+    begun = start[_HDF5_AT:] if start.endswith(HDF5) else start
     name = next(
         (name for name, file_format in FORMATS.items() if begun.startswith(file_format.begins)), ""
     )
