@@ -24,11 +24,13 @@ import socket
 import struct
 import sysconfig
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from dataclasses import astuple, dataclass
 from functools import partial
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -216,44 +218,12 @@ _EVERYTHING_HERE = (1 << 13) - 1
 _OURS = (str(Path(__file__).parents[2]),)
 _TIME_ZONES = ("/etc/localtime", "/usr/share/zoneinfo")
 
-_MACHINES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
-"""How the kernel calls a machine, and which of the numbers below are its own."""
-_FORBIDDEN = (
-    # socket, socketpair, connect, bind, listen
-    (41, 198), (53, 199), (42, 203), (49, 200), (50, 201),
-    # fork, vfork, execve, execveat, ptrace, process_vm_readv, process_vm_writev
-    (57, None), (58, None), (59, 221), (322, 281), (101, 117), (310, 270), (311, 271),
-    # kill, tkill, tgkill, rt_sigqueueinfo, rt_tgsigqueueinfo, pidfd_send_signal, pidfd_getfd
-    (62, 129), (200, 130), (234, 131), (129, 138), (297, 240), (424, 424), (438, 438),
-    # io_uring_setup, bpf, perf_event_open, userfaultfd, keyctl, add_key, request_key
-    (425, 425), (321, 280), (298, 241), (323, 282), (250, 219), (248, 217), (249, 218),
-    # mount, unshare, setns, open_by_handle_at, setpriority, sched_setaffinity
-    (165, 40), (272, 97), (308, 268), (304, 265), (141, 140), (203, 122),
-    # chown, fchown, lchown, fchownat, setxattr, lsetxattr, fsetxattr
-    (92, None), (93, 55), (94, None), (260, 54), (188, 5), (189, 6), (190, 7),
-    # utime, utimes, futimesat, utimensat, shmget, msgget, semget
-    (132, None), (235, None), (261, None), (280, 88), (29, 194), (68, 186), (64, 190),
-    # shmat, shmctl, semop, semtimedop, semctl, msgsnd, msgrcv, msgctl, mq_open, mq_unlink
-    (30, 196), (31, 195), (65, 193), (220, 192), (66, 191), (69, 189), (70, 188), (71, 187),
-    (240, 180), (241, 181),
-    # sched_setscheduler, sched_setparam, sched_setattr, ioprio_set, setpgid
-    (144, 119), (142, 118), (314, 274), (251, 30), (109, 154),
-    # pidfd_open, process_madvise, process_mrelease, move_pages, migrate_pages, kcmp
-    (434, 434), (440, 440), (448, 448), (279, 239), (256, 238), (312, 272),
-    # memfd_create, memfd_secret
-    (319, 279), (447, 447),
-)  # fmt: skip
-"""System calls by their numbers on x86_64 and aarch64."""
-_PRLIMIT = (302, 261)
-"""Allowed for the process itself, which is 0."""
-_FORBIDDEN_COMMANDS = (
-    ((72, 25), (8, 10, 15)),  # fcntl: F_SETOWN, F_SETSIG, F_SETOWN_EX
-    ((16, 29), (0x5412, 0x8901, 0x8902)),  # ioctl: TIOCSTI, FIOSETOWN, SIOCSPGRP
-)
+_COMMANDS = {
+    "fcntl": (8, 10, 15),  # F_SETOWN, F_SETSIG, F_SETOWN_EX
+    "ioctl": (0x5412, 0x8901, 0x8902),  # TIOCSTI, FIOSETOWN, SIOCSPGRP
+}
 """By system call the second arguments that let the kernel signal, or type for, other processes."""
-_PASSED_BY = ((90, None), (91, 52), (268, 53), (452, 452))
-"""Calls that succeed without effect, since copying a file calls them: chmod and others."""
-_CLONE, _CLONE3, _CLONE_THREAD = (56, 220), 435, 0x10000
+_CLONE3, _CLONE_THREAD = 435, 0x10000
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000, 0x80000000
 _PERM, _NOSYS = 1, 38
@@ -318,31 +288,29 @@ def _readable() -> Iterator[tuple[str, int]]:
 
 def _forbid_calls() -> None:
     """Let the kernel refuse system calls that no reader makes (seccomp)."""
-    if platform.machine() not in _MACHINES:
+    text = (files(__package__) / "system_calls.toml").read_text(encoding="utf-8")
+    calls = tomllib.loads(text).get(platform.machine())
+    if calls is None:
         return
-    machine, place = _MACHINES[platform.machine()]
     steps = [
-        (_LOAD, 0, 0, 4), (_EQUAL, 1, 0, machine), (_RETURN, 0, 0, _KILL),
+        (_LOAD, 0, 0, 4), (_EQUAL, 1, 0, calls["audit"]), (_RETURN, 0, 0, _KILL),
         (_LOAD, 0, 0, 0),
         (_EQUAL, 0, 1, _CLONE3), (_RETURN, 0, 0, _REFUSE | _NOSYS),  # then libc takes clone
-        (_EQUAL, 0, 4, _CLONE[place]),
+        (_EQUAL, 0, 4, calls["clone"]),
         (_LOAD, 0, 0, 16), (_ANY_BIT, 1, 0, _CLONE_THREAD), (_RETURN, 0, 0, _REFUSE | _PERM),
         (_RETURN, 0, 0, _ALLOW),
         (_AT_LEAST, 0, 1, 0x40000000), (_RETURN, 0, 0, _KILL),  # numbers of 32-bit programs
-    ]  # fmt: skip
-    steps += [
-        (_EQUAL, 0, 4, _PRLIMIT[place]),
+        (_EQUAL, 0, 4, calls["prlimit"]),  # of the process itself, which is 0
         (_LOAD, 0, 0, 16), (_EQUAL, 1, 0, 0), (_RETURN, 0, 0, _REFUSE | _PERM),
         (_RETURN, 0, 0, _ALLOW),
     ]  # fmt: skip
-    for calls, commands in _FORBIDDEN_COMMANDS:
-        steps += [(_EQUAL, 0, 2 + 2 * len(commands), calls[place]), (_LOAD, 0, 0, 24)]
+    for name, commands in _COMMANDS.items():
+        steps += [(_EQUAL, 0, 2 + 2 * len(commands), calls[name]), (_LOAD, 0, 0, 24)]
         for command in commands:
             steps += [(_EQUAL, 0, 1, command), (_RETURN, 0, 0, _REFUSE | _PERM)]
         steps.append((_RETURN, 0, 0, _ALLOW))
-    for numbers in (*_FORBIDDEN, *_PASSED_BY):
-        answer = _REFUSE if numbers in _PASSED_BY else _REFUSE | _PERM
-        if (number := numbers[place]) is not None:
+    for kind, answer in (("forbidden", _REFUSE | _PERM), ("passed_by", _REFUSE)):
+        for number in calls[kind].values():
             steps += [(_EQUAL, 0, 1, number), (_RETURN, 0, 0, answer)]
     steps.append((_RETURN, 0, 0, _ALLOW))
     program = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *step) for step in steps))
