@@ -28,7 +28,7 @@ from itertools import accumulate
 from typing import Any
 
 from fleet_slip.base import pluralize
-from fleet_slip.calibration.intercept import intercept_columns
+from fleet_slip.calibration.course_label import intercept_columns
 from fleet_slip.calibration.receiver_delay import delay_columns
 from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog

@@ -9,7 +9,7 @@ from importlib.metadata import version as package_version
 from typing import Any
 
 from fleet_slip.calibration.car_calibration import three_digits
-from fleet_slip.calibration.intercept import InterceptEstimate, estimate_intercept
+from fleet_slip.calibration.course_label import InterceptEstimate, estimate_intercept
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.signals import MEASURED, TRAINING_DRIVES

@@ -85,7 +85,7 @@ def require_sound_drives(
 
 MAX_ANGLE_ERROR_DEG = 0.15
 """Error of the label that an unknown or remaining delay may cause: as much as the intercept has
-from the mounting of reference sensors (`calibration.intercept`)."""
+from the mounting of reference sensors (`calibration.course_label`)."""
 USUAL_YAW_RATE_RAD_S = 0.25
 """Standard deviation of the yaw rate of cars without moments of the course."""
 MAX_CARS = 5

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 import pytest
 
 import fleet_slip
-from fleet_slip.calibration.intercept import PLANE
+from fleet_slip.calibration.course_label import PLANE
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.errors import RefusedError, UsageError
 from fleet_slip.export.c_gram import sets_on_board
