@@ -562,8 +562,7 @@ class Fleet:
             grams = training.gram(self, executor, progress)
             examined = self.cohort(training.cohort).examine()
             training = changed(training, cohort=examined.cohort)
-            with examined.explaining():
-                selection, publication, refusal = training.publish(self)
+            selection, publication, refusal = training.publish(self)
         return LearnReport(
             model=name,
             mapping=mapping.name,

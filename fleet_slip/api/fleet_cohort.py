@@ -87,9 +87,8 @@ class FleetCohort:
         request = request or SelectionRequest(**options)
         plan = SelectionPlan.from_request(self.warehouse.catalog, request)
         screen = self.examine()
-        with screen.explaining():
-            plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)
-            selection = run_plan(self.warehouse, plan, screen.cohort, nested=nested)
+        plan = ensure_rows(self.warehouse, plan, self.predicate, screen.cohort)
+        selection = run_plan(self.warehouse, plan, screen.cohort, nested=nested)
         return replace(selection, examined=str(screen))
 
     def diagnose(

@@ -78,11 +78,10 @@ class FleetEvaluation:
         else:
             examined = screen_computed_drives(self.warehouse, predicate)
         rows = replace(rows, sql=cohort_of_rows(signals, examined.cohort).sql)
-        with examined.explaining():
-            overlap = find_training_overlap(
-                self.warehouse, self._models.registry, version.manifest, rows
-            )
-            result = score(self.warehouse, version.manifest, rows if cohort else overlap.unseen)
+        overlap = find_training_overlap(
+            self.warehouse, self._models.registry, version.manifest, rows
+        )
+        result = score(self.warehouse, version.manifest, rows if cohort else overlap.unseen)
         all_seen = overlap.trained == overlap.drives
         return replace(
             result,
@@ -193,7 +192,7 @@ class FleetEvaluation:
         screen = SensorScreen(cohort)
         if not include_faulty:
             screen = screen_computed_drives(self.warehouse, cohort)
-        with open_workers(self.warehouse.root, threads) as executor, screen.explaining():
+        with open_workers(self.warehouse.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, screen.cohort, car, executor)
         content |= {"cohort": cohort, **({"examined": str(screen)} if str(screen) else {})}
         return store_evaluation(evaluations_of(self.warehouse, "measured"), content)

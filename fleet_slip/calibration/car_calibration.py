@@ -506,17 +506,6 @@ class Calibration(Answer):
             "{name}|{unit}|{cars:,}|{median:.3g}|{std:.2g}|{error:.2g}",
             text_columns=2,
         )
-        parameters = (parameter for car in self.cars.values() for parameter in car.values())
-        if not any(parameter.uncertainty for parameter in parameters):
-            yield Remark("no car has two drives: uncertainties cannot be estimated")
-        types = self._types_of_receivers()
-        if types:
-            yield TextTable(
-                "\ndelay of types of satellite receivers",
-                "type|cars|delay s|+-|differs by",
-                ({"name": name, **figures} for name, figures in types.items()),
-                "{name}|{cars:,}|{delay_s:.3f}|{uncertainty_s:.2g}|{spread_s:.2g}",
-            )
 
     def _of_car(self, car: str) -> Iterator[Part]:
         yield TextTable(
@@ -530,11 +519,8 @@ class Calibration(Answer):
             "{car.count}|{definition.grain}",
             text_columns=2,
         )
-        missing = self.missing[car]
-        for reason in dict.fromkeys(missing.values()):
-            names = [name for name, why in missing.items() if why == reason]
-            are = "is" if len(names) == 1 else "are"
-            yield Remark(f"{', '.join(names)} {are} missing: {reason}")
+        for name, reason in self.missing[car].items():
+            yield Remark(f"{name} is missing: {reason}")
         if delay := self.receivers.cars.get(car):
             yield Remark(f"its satellite receiver is late by {delay}")
 

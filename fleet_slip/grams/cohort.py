@@ -415,7 +415,7 @@ def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
     return DataError(
         f"no drive matches the cohort predicate {predicate.quoted}. The warehouse has sources "
         f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
-        'drives"'
+        'drives"; drives with faulty sensors with: fleet-slip quality'
     )
 
 

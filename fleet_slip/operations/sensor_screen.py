@@ -11,7 +11,7 @@ drives.
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import date
 from math import ceil
@@ -26,7 +26,7 @@ from fleet_slip.base import Record, canonical_json, pluralize, sha256_of
 from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import MEASURED, RECEIVED, TRAINING_DRIVES
-from fleet_slip.errors import AlarmError, DataError, NotComputedError, NotScreenedError
+from fleet_slip.errors import AlarmError, NotScreenedError
 from fleet_slip.grams.cohort import Cohort, empty_cohort_error, load_cohort, require_training
 from fleet_slip.grams.update import ensure_grams
 from fleet_slip.ingest.recordings import SourceRef
@@ -393,24 +393,6 @@ class SensorScreen:
     @property
     def _faults_text(self) -> str:
         return ", ".join(f"{number:,} {fault}" for fault, number in self.faults.items())
-
-    @contextmanager
-    def explaining(self) -> Iterator[None]:
-        """Explain the error of an empty cohort if all its drives were left out."""
-        try:
-            yield
-        except DataError as error:
-            if (
-                len(self.faults_by_hash) < self.drives
-                or not self.faults_by_hash
-                or isinstance(error, NotComputedError)
-            ):
-                raise
-            raise DataError(
-                f"All {pluralize(self.drives, 'drive')} have faulty sensors "
-                f"({self._faults_text}); none left to train on. See: fleet-slip quality. To use "
-                "them anyway: --include-faulty"
-            ) from None
 
     def findings(self, warehouse: Warehouse) -> tuple[SensorFault, ...]:
         """Return the faulty drives by name, by day and drive."""
