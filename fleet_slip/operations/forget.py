@@ -10,7 +10,7 @@ jobs that have not read the new logs. Files of such jobs are deleted by them or 
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, timedelta
 
 import polars as pl
@@ -37,13 +37,12 @@ from fleet_slip.grams.update import gram_digests, read_rows, reconcile
 from fleet_slip.models.registry import Registry
 from fleet_slip.operations.rewriting import (
     RETENTION_HOURS,
-    Rewriting,
     VacuumReport,
+    build_rewriting,
     find_replaced,
     find_temporary_files,
     find_unreferenced,
     path_below,
-    rewrite,
     vacuum,
     without_rows,
 )
@@ -434,14 +433,9 @@ def _rewrite_logs(
     concerned = [file for file in logs.files if file.path in drives]
     if not concerned:
         return 0, 0, 0
-    added = rewrite(
-        warehouse,
-        logs,
-        [Rewriting("kept", [file], drives[file.path]) for file in concerned],
-        note={"job": "forget"},
-        data_change=True,
-        progress=progress,
-    )
+    change = build_rewriting(warehouse, logs, [[file] for file in concerned], drives, progress)
+    logs.commit_or_discard(replace(change, note={"job": "forget"}))
+    added = change.add
     rows = sum(file.rows for file in concerned) - sum(map(rows_in, added))
     return rows, len(added), len(concerned) - len(added)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from datetime import date
 from decimal import Decimal
-from typing import Any
+from types import MappingProxyType
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -41,69 +41,37 @@ from fleet_slip.warehouse.gram_reader import BEING_WRITTEN_HOURS, rows_of_set
 from fleet_slip.warehouse.warehouse import Warehouse
 
 
-@dataclass(frozen=True)
-class Rewriting:
-    """Files of one day to merge into one with the prefix `name`, without some drives."""
-
-    name: str
-    files: Sequence[TableFile]
-    without: Collection[str] = ()
-
-
-def rewrite(
+def build_rewriting(
     warehouse: Warehouse,
     logs: Snapshot,
-    rewritings: Sequence[Rewriting],
-    *,
-    note: Mapping[str, Any],
-    data_change: bool,
+    packs: Sequence[Sequence[TableFile]],
+    without: Mapping[str, Collection[str]] = MappingProxyType({}),
     progress: Progress = no_progress,
-) -> list[AddAction]:
-    """Replace log files and their Gram rows in one commit on a snapshot; return the new files.
+) -> Change:
+    """Write each pack of log files of a day as one file, and commit the Gram rows of these.
 
-    Files without remaining drives are removed. `progress` counts rewritings. Raises
-    `ConflictError`, after deleting the new files, and `StorageError`.
+    `without` are the drives to drop, by file; a pack without other drives is only removed. Returns
+    the change of the logs; `progress` counts packs. Raises `ConflictError`, after deleting the new
+    files, and `StorageError`.
     """
-    new = write_again(warehouse, logs, rewritings, data_change=data_change, progress=progress)
-    replaced = [file for rewriting in rewritings for file in rewriting.files]
-    transactions = rewrite_transactions(logs, replaced)
-    logs.commit_or_discard(
-        Change(
-            add=new, remove=replaced, transactions=transactions, note=note, data_change=data_change
-        )
-    )
-    return new
-
-
-def write_again(
-    warehouse: Warehouse,
-    logs: Snapshot,
-    rewritings: Sequence[Rewriting],
-    *,
-    data_change: bool = True,
-    progress: Progress = no_progress,
-) -> list[AddAction]:
-    """Write log files and commit their Gram rows; return the files to add. Raises as `rewrite`."""
     new: list[AddAction] = []
-    replaced = [file for rewriting in rewritings for file in rewriting.files]
+    replaced = [file for pack in packs for file in pack]
     try:
-        for rewriting in rewritings:
-            rows = read_kept_drives(logs.table, rewriting.files, rewriting.without)
+        for pack in packs:
+            dropped = {drive for file in pack for drive in without.get(file.path, ())}
+            rows = read_kept_drives(logs.table, pack, dropped)
             if rows.num_rows:
-                action = logs.table.write_file(rewriting.name, rows, rewriting.files[0].day)
-                new.append(dataclasses.replace(action, data_change=data_change))
-            progress(1, len(rewritings))
+                action = logs.table.write_file("kept" if without else "compact", rows, pack[0].day)
+                new.append(dataclasses.replace(action, data_change=bool(without)))
+            progress(1, len(packs))
         commit_ahead(warehouse, new, replaced)
     except FleetSlipError:
         logs.table.discard(new)
         raise
-    return new
-
-
-def rewrite_transactions(logs: Snapshot, replaced: Sequence[TableFile]) -> list[AppTransaction]:
-    """Return transactions by which rewrites of one day conflict; Delta itself lets them pass."""
+    # By these, rewrites of one day conflict; Delta itself lets them pass.
     days = sorted({str(file.day) for file in replaced})
-    return [AppTransaction(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
+    transactions = [AppTransaction(f"rewrite/{day}", (logs.version or 0) + 1) for day in days]
+    return Change(new, replaced, transactions, data_change=bool(without))
 
 
 def read_kept_drives(
@@ -129,15 +97,12 @@ def _read(table: Table, file: TableFile) -> pa.Table:
     stored = table.read(file.path)
     columns = {}
     for field in table.schema:
-        if field.name in table.partition_by:
-            continue
-        is_stored = field.name in stored.schema.names
-        if not is_stored and field.name in table.optional:
-            continue
-        if not is_stored:
-            column = pa.chunked_array([pa.nulls(stored.num_rows, field.type)])
-        else:
+        if field.name in stored.schema.names:
             column = stored[field.name]
+        elif field.name in table.optional or field.name in table.partition_by:
+            continue
+        else:
+            column = pa.chunked_array([pa.nulls(stored.num_rows, field.type)])
         if pa.types.is_string(field.type):
             columns[field.name] = pc.dictionary_encode(column).unify_dictionaries()
         else:
@@ -186,11 +151,9 @@ def build_removal(
     }
     files = {s.file for s in sources} - {source.file for source in remaining if source}
     transactions = Fingerprints(snapshot.transactions).withdraw(sources, files)
-    concerned = [file for file in snapshot.files if removed.get(file.path)]
-    if concerned:
-        transactions += rewrite_transactions(snapshot, concerned)
-    rewritings = [Rewriting("kept", [file], removed[file.path]) for file in concerned]
-    return Change(write_again(warehouse, snapshot, rewritings), concerned, transactions)
+    packs = [[file] for file in snapshot.files if removed.get(file.path)]
+    change = build_rewriting(warehouse, snapshot, packs, removed)
+    return dataclasses.replace(change, transactions=[*transactions, *change.transactions])
 
 
 def _without_refused(snapshot: Snapshot, sources: Collection[SourceRef]) -> Change:
@@ -273,13 +236,9 @@ def _compact_day(warehouse: Warehouse, day: date, target_rows: int) -> int:
     small = [f for f in snapshot.files if f.day == day and 2 * f.rows <= target_rows]
     packs = list(_packs(small, target_rows))
     if packs:
-        rewrite(
-            warehouse,
-            snapshot,
-            [Rewriting("compact", pack) for pack in packs],
-            note={"job": "compact", "day": day.isoformat()},
-            data_change=False,
-        )
+        note = {"job": "compact", "day": day.isoformat()}
+        change = build_rewriting(warehouse, snapshot, packs)
+        snapshot.commit_or_discard(dataclasses.replace(change, note=note))
     return sum(file.rows for pack in packs for file in pack)
 
 

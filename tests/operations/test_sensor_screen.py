@@ -95,7 +95,7 @@ def test_a_kept_verdict_of_which_a_bit_flipped_is_found_again(fleet: Fleet, tmp_
 
 
 def test_a_cohort_of_which_no_drive_is_in_order_says_so(fleet: Fleet) -> None:
-    with pytest.raises(DataError, match="without 2 faulty drives.*: fleet-slip quality"):
+    with pytest.raises(DataError, match=r"without 2 faulty drives.*: fleet-slip quality"):
         fleet.cohort("day = DATE '2026-10-06'").select(models="table1")
 
 
