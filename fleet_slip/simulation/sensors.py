@@ -34,7 +34,10 @@ class Delay:
         full_ticks = math.floor(self._ticks)
         if self._previous is None:
             self._previous = np.full(full_ticks + 1, values[0])
-        return _delayed(values, self._previous, self._ticks - full_ticks)
+        joined, fraction = np.concatenate([self._previous, values]), self._ticks - full_ticks
+        self._previous = joined[len(values) :]
+        delayed: FloatArray = (1.0 - fraction) * joined[1:] + fraction * joined[:-1]
+        return delayed[: len(values)]
 
 
 class LowPass:
@@ -54,24 +57,6 @@ class LowPass:
         filtered = _low_pass(values, float(previous), float(output), self._gain)
         self._last = (values[-1], filtered[-1])
         return filtered
-
-
-@kernel
-def _delayed(values: FloatArray, previous: FloatArray, fraction: float) -> FloatArray:
-    """Delay values by `len(previous) - 1 + fraction` samples; update `previous`, the last ones."""
-    first, ticks = len(previous), len(values)
-    delayed = np.empty(ticks)
-    for i in range(min(first, ticks)):
-        newer = previous[i + 1] if i + 1 < first else values[i + 1 - first]
-        delayed[i] = (1.0 - fraction) * newer + fraction * previous[i]
-    for i in range(first, ticks):
-        delayed[i] = (1.0 - fraction) * values[i + 1 - first] + fraction * values[i - first]
-    if ticks < first:
-        previous[: first - ticks] = previous[ticks:].copy()
-        previous[first - ticks :] = values
-    else:
-        previous[:] = values[ticks - first :]
-    return delayed
 
 
 @kernel
@@ -231,20 +216,18 @@ class Distortion:
         components g sin φ and g sin θ of gravity (Kidambi et al. 2014).
         """
         sensors, car = self._flaws.sensors, self._flaws.car
-        r, turning = truth["yaw_rate_rad_s"], truth["yaw_acceleration_rad_s2"]
-        position = sensors.inertial_x_m, sensors.inertial_y_m
-        mounting = (
-            math.radians(sensors.inertial_roll_deg),
-            math.radians(sensors.inertial_pitch_deg),
-            math.radians(sensors.inertial_yaw_deg),
-        )
-        gradients = (
-            math.radians(car.roll_gradient_deg_per_g) / GRAVITY_MPS2,
-            math.radians(car.pitch_gradient_deg_per_g) / GRAVITY_MPS2,
-        )
-        motion = truth["ax_mps2"], truth["ay_mps2"], r, turning
-        lagged = truth["leaning_ax_mps2"], truth["leaning_ay_mps2"]
-        measured = _inertial_unit(motion, lagged, position, mounting, gradients)
+        ax, ay, r, turning = (truth[name] for name in (*INERTIAL, "yaw_acceleration_rad_s2"))
+        x, y = sensors.inertial_x_m, sensors.inertial_y_m
+        per_ay = math.radians(car.roll_gradient_deg_per_g) / GRAVITY_MPS2
+        per_ax = math.radians(car.pitch_gradient_deg_per_g) / GRAVITY_MPS2
+        phi = per_ay * truth["leaning_ay_mps2"] + math.radians(sensors.inertial_roll_deg)
+        theta = per_ax * truth["leaning_ax_mps2"] + math.radians(sensors.inertial_pitch_deg)
+        yaw = math.radians(sensors.inertial_yaw_deg)
+        local_x = ax - r * r * x - turning * y
+        local_y = ay + turning * x - r * r * y
+        level_x = _cosine(theta) * local_x + GRAVITY_MPS2 * _sine(theta)
+        level_y = _cosine(phi) * local_y + GRAVITY_MPS2 * _sine(phi)
+        measured = level_x + yaw * level_y, level_y - yaw * level_x, _cosine(phi) * r
         return dict(zip(INERTIAL, measured, strict=True))
 
     def _angles(self, truth: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
@@ -267,62 +250,22 @@ class Distortion:
         if not (sensors.gps_heading_std_deg or sensors.gps_velocity_std_mps):
             return {"gps_vx_mps": vx, "gps_vy_mps": vy}
         self._gps = self._gps or GaussMarkov(3, sensors.gps_correlation_s, self._generator)
-        errors = self._gps.next(len(vx))
-        std = math.radians(sensors.gps_heading_std_deg), sensors.gps_velocity_std_mps
-        return dict(zip(GPS, _satellite_velocity(vx, vy, errors, std), strict=True))
+        heading, error_x, error_y = self._gps.next(len(vx))
+        angle, std_mps = (
+            heading * math.radians(sensors.gps_heading_std_deg),
+            sensors.gps_velocity_std_mps,
+        )
+        seen = vx + angle * vy + std_mps * error_x, vy - angle * vx + std_mps * error_y
+        return dict(zip(GPS, seen, strict=True))
 
 
-@equation
-def _sine(angle: float) -> float:
-    """Return the sine of an angle below 0.3 rad with an error of 2e-5, portable to the bit."""
+def _sine(angle: FloatArray) -> FloatArray:
+    """Return the sine of angles below 0.3 rad with an error of 2e-5, portable to the bit."""
     return angle * (1.0 - angle * angle / 6.0)
 
 
-@equation
-def _cosine(angle: float) -> float:
+def _cosine(angle: FloatArray) -> FloatArray:
     return 1.0 - angle * angle / 2.0
-
-
-@kernel
-def _inertial_unit(
-    motion: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    lagged: tuple[FloatArray, FloatArray],
-    position: tuple[float, float],
-    mounting: tuple[float, float, float],
-    gradients: tuple[float, float],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return accelerations and yaw rate at the inertial unit; see `Distortion._accelerations`."""
-    ax, ay, rate, turning = motion
-    lagged_ax, lagged_ay = lagged
-    (x, y), (roll, pitch, yaw), (per_ay, per_ax) = position, mounting, gradients
-    ticks = len(ax)
-    unit_ax, unit_ay, unit_rate = np.empty(ticks), np.empty(ticks), np.empty(ticks)
-    for i in range(ticks):
-        r = rate[i]
-        local_x = ax[i] - r * r * x - turning[i] * y
-        local_y = ay[i] + turning[i] * x - r * r * y
-        phi, theta = per_ay * lagged_ay[i] + roll, per_ax * lagged_ax[i] + pitch
-        level_x = _cosine(theta) * local_x + GRAVITY_MPS2 * _sine(theta)
-        level_y = _cosine(phi) * local_y + GRAVITY_MPS2 * _sine(phi)
-        unit_ax[i] = level_x + yaw * level_y
-        unit_ay[i] = level_y - yaw * level_x
-        unit_rate[i] = _cosine(phi) * r
-    return unit_ax, unit_ay, unit_rate
-
-
-@kernel
-def _satellite_velocity(
-    vx: FloatArray, vy: FloatArray, errors: FloatArray, std: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Add errors of heading and of both components, with these standard deviations."""
-    heading, error_x, error_y = errors
-    heading_std, velocity_std = std
-    seen_x, seen_y = np.empty(len(vx)), np.empty(len(vx))
-    for i in range(len(vx)):
-        angle = heading[i] * heading_std
-        seen_x[i] = vx[i] + angle * vy[i] + velocity_std * error_x[i]
-        seen_y[i] = vy[i] - angle * vx[i] + velocity_std * error_y[i]
-    return seen_x, seen_y
 
 
 SAMPLE_RATE_HZ = int(1 / SAMPLE_TIME_S)
