@@ -22,11 +22,11 @@ from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
+from fleet_slip.evaluation.identify import tune
 from fleet_slip.evaluation.kalman import independent_state
 from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive, hold_last
 from fleet_slip.evaluation.single_track import Axles, follow, measured_speed_mps, sideslip_angle
 from fleet_slip.evaluation.test_drives import TestDrive
-from fleet_slip.evaluation.tuning import tune
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6

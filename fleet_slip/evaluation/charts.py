@@ -11,8 +11,8 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Patch
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
-from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.test_drives import TestDrive, find_stretches
 from fleet_slip.pages.page import BINS, WIDTH_IN, Picture, colour, degrees, join_words
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, NotEvaluatedError, ReportData
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
-from fleet_slip.evaluation.report_data import DRAWN_FILTERS, NotEvaluatedError, ReportData
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.export.c import COEFFICIENT_BYTES, describe_costs, dot_product_operations
 from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific

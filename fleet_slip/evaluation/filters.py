@@ -22,11 +22,10 @@ from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
 from fleet_slip.evaluation.evaluator import Estimator
-from fleet_slip.evaluation.identify import IdentifiedVehicle, identify
+from fleet_slip.evaluation.identify import IdentifiedVehicle, TuningResult, identify, tune
 from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, read_drives
 from fleet_slip.evaluation.single_track import measured_speed_mps
 from fleet_slip.evaluation.test_drives import TestDrive
-from fleet_slip.evaluation.tuning import TuningResult, tune
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion

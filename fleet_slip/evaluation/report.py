@@ -9,9 +9,9 @@ from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import CLAIMS, PAPER_TABLE_TWO, Status, evaluate_claim
+from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, ReportData, latest_evaluation
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import linear_estimate, restore_filter, train_models
-from fleet_slip.evaluation.report_data import DRAWN_FILTERS, ReportData, latest_evaluation
 from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import (

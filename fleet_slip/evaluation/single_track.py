@@ -14,8 +14,8 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants
-from fleet_slip.vehicle.tyre import cornering_stiffness
 
 # Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
 # reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque

@@ -31,8 +31,8 @@ from fleet_slip.simulation.simulate import (
     simulate_batches,
     simulate_logs,
 )
+from fleet_slip.vehicle.dynamics import brush_force
 from fleet_slip.vehicle.parameters import VehicleParameters, constants
-from fleet_slip.vehicle.tyre import brush_force
 from fleet_slip.warehouse.warehouse import Warehouse
 
 

@@ -74,10 +74,7 @@ NotEmpty = Field(min_length=1)
 def _require_road(name: str) -> str:
     from fleet_slip.simulation.traffic import require_road  # noqa: PLC0415 - imports highway-env
 
-    try:
-        return require_road(name)
-    except ConfigError as error:
-        raise ValueError(str(error)) from None
+    return require_road(name)
 
 
 RoadWithTraffic = Annotated[str, AfterValidator(_require_road)]

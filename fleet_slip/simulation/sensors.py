@@ -16,8 +16,8 @@ from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config, Name
 from fleet_slip.simulation.imperfections import Imperfections, Latency, NotNegative, Range
 from fleet_slip.vehicle.driver import SAMPLE_S
+from fleet_slip.vehicle.dynamics import arctan2
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2
-from fleet_slip.vehicle.tyre import arctan2
 
 
 class Delay:

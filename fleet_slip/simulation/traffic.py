@@ -18,7 +18,7 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.errors import ConfigError, RefusedError
+from fleet_slip.errors import RefusedError
 from fleet_slip.simulation.roads import LINE_STEP_M, SLOWEST_MPS, SpeedLimits, SpeedProfile
 
 if TYPE_CHECKING:
@@ -76,13 +76,13 @@ SITES = {
 
 
 def require_road(name: str) -> str:
-    """Return the name of a road with traffic. Raises `ConfigError` if it is unknown."""
+    """Return the name of a road with traffic. Raises `ValueError` if it is unknown."""
     if name not in SITES:
-        raise ConfigError(f"{name!r} is not a road with traffic. Choose from: {', '.join(SITES)}")
+        raise ValueError(f"{name!r} is not a road with traffic. Choose from: {', '.join(SITES)}")
     try:
         gymnasium.spec(SITES[name].environment)
     except gymnasium.error.Error as error:
-        raise ConfigError(
+        raise ValueError(
             f"highway-env {highway_env.__version__} has no road {name!r}: {error}"
         ) from None
     return name

@@ -24,7 +24,13 @@ from fleet_slip.vehicle.driver import (
     Handling,
     decide,
 )
-from fleet_slip.vehicle.dynamics import Compliance, ComplianceRates, Environment, front_wheels
+from fleet_slip.vehicle.dynamics import (
+    Compliance,
+    ComplianceRates,
+    Environment,
+    arctan2,
+    front_wheels,
+)
 from fleet_slip.vehicle.integration import (
     SECOND_ORDER,
     Motion,
@@ -35,7 +41,6 @@ from fleet_slip.vehicle.integration import (
     advance_car,
 )
 from fleet_slip.vehicle.parameters import Constants, Controls, ImperfectionConstants, State
-from fleet_slip.vehicle.tyre import arctan2
 
 # Lanes in memory. Every quantity is a row of `LANES` numbers in one flat array, at an offset that
 # is constant at compile time, so that loops over lanes become vector instructions.

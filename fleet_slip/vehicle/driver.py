@@ -14,6 +14,7 @@ import math
 from typing import NamedTuple
 
 from fleet_slip.compiling import equation
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.integration import Path, Pose
 from fleet_slip.vehicle.parameters import (
     GRAVITY_MPS2,
@@ -23,7 +24,6 @@ from fleet_slip.vehicle.parameters import (
     VehicleParameters,
     constants,
 )
-from fleet_slip.vehicle.tyre import cornering_stiffness
 
 SAMPLE_S = 0.01
 """Time between two decisions of the driver, and between two samples, in s."""

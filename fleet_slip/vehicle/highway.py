@@ -33,6 +33,7 @@ from fleet_slip.vehicle.dynamics import (
     WheelForce,
     Wheels,
     body_acceleration,
+    cornering_stiffness,
     imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import (
@@ -59,7 +60,6 @@ from fleet_slip.vehicle.parameters import (
     imperfection_constants,
     load_vehicle,
 )
-from fleet_slip.vehicle.tyre import cornering_stiffness
 
 CHECKED_S = 1.5
 """Time of a drive that is compared with highway-env."""

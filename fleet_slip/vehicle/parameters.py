@@ -81,7 +81,7 @@ class Suspension(Config):
 
 
 class Tyre(Config):
-    """Parameters of the brush tyre (`fleet_slip.vehicle.tyre`) and its wheel."""
+    """Parameters of the brush tyre (`fleet_slip.vehicle.dynamics`) and its wheel."""
 
     rolling_radius_m: FiniteFloat = Field(gt=0)
     spin_inertia_kgm2: FiniteFloat = Field(gt=0)

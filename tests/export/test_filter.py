@@ -18,12 +18,12 @@ from fleet_slip.evaluation.filter_column import observer_of
 from fleet_slip.evaluation.identify import (
     NOISE_NAMES,
     PRIOR_STD,
+    Coordinates,
     FitParameters,
     IdentifiedVehicle,
     vehicle_with_fit,
 )
 from fleet_slip.evaluation.labelled_drives import LabelledDrive
-from fleet_slip.evaluation.tuning import Coordinates
 from fleet_slip.export.c import count_costs
 from fleet_slip.export.files import export_files, program_content, with_states
 from fleet_slip.export.program import UNKNOWN_CAR, Program

@@ -12,6 +12,7 @@ from fleet_slip.vehicle.dynamics import (
     Compliance,
     ComplianceRates,
     Environment,
+    cornering_stiffness,
     imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import (
@@ -31,7 +32,6 @@ from fleet_slip.vehicle.parameters import (
     constants,
     imperfection_constants,
 )
-from fleet_slip.vehicle.tyre import cornering_stiffness
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.cli.app import app
-from fleet_slip.evaluation.tuning import Coordinates, Optimum, minimize
+from fleet_slip.evaluation.identify import Coordinates, Optimum, minimize
 from tests.support.once import require_no_failed_run
 
 
@@ -58,7 +58,6 @@ def call(root: Path, *words: str) -> str:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fleet_slip.evaluation.filters.TUNING_S", LITTLE_S)
         patch.setattr("fleet_slip.evaluation.identify.minimize_from", briefly)
-        patch.setattr("fleet_slip.evaluation.tuning.minimize_from", briefly)
         result = CliRunner().invoke(app, ["--root", str(root), *words])
     require_no_failed_run(root)
     if result.exception is not None:

@@ -10,8 +10,8 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.resources import SHIPPED_CONFIGS
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections, constants, load_vehicle
-from fleet_slip.vehicle.tyre import cornering_stiffness
 from tests.support.linear_bicycle import LinearBicycle, steer
 
 CARS = ("compact_hatchback", "d_class_sedan", "suv")

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from fleet_slip.errors import ConfigError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.driver import handling
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, Controls, State, constants, load_vehicle
-from fleet_slip.vehicle.tyre import cornering_stiffness
 from tests.support.rolling import CAR, SEDAN, Run, holding, kinetic_energy, rates, rolling
 
 RATIO = SEDAN.steering.ratio

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from fleet_slip.compiling import kernel
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.driver import MAX_GRIP_USE, Handling, slip_growth
+from fleet_slip.vehicle.dynamics import TyreForce, arctan2, brush_force, cornering_stiffness
 from fleet_slip.vehicle.integration import STEP_S, Pose, PoseSlopes, advance_pose, lag_step
 from fleet_slip.vehicle.parameters import Constants, constants, load_vehicle
-from fleet_slip.vehicle.tyre import TyreForce, arctan2, brush_force, cornering_stiffness
 from tests.support.rolling import CAR
 
 PEAK = CAR.stiffness_rear

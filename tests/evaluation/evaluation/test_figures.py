@@ -12,8 +12,8 @@ from fleet_slip.evaluation.filters import linear_estimate
 from fleet_slip.evaluation.test_drives import TestDrive, apply_failure, join, peak_slip
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Failure, load_scenario
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.parameters import constants, load_vehicle
-from fleet_slip.vehicle.tyre import cornering_stiffness
 
 ALL = np.ones(5, dtype=np.bool_)
 

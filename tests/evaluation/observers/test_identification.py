@@ -19,11 +19,12 @@ from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
     identify,
     identify_held_out,
+    rmse_rad,
+    tune,
     vehicle_with_fit,
 )
 from fleet_slip.evaluation.kalman import FilterNoise
 from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive
-from fleet_slip.evaluation.tuning import rmse_rad, tune
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from tests.support.drives import noisy, simulated_drive, slalom

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from fleet_slip.evaluation.evaluation_document import ReportData
 from fleet_slip.evaluation.report import gather
-from fleet_slip.evaluation.report_data import ReportData
 from fleet_slip.models.registry import Registry
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse

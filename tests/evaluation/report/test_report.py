@@ -28,10 +28,9 @@ from fleet_slip.evaluation.claims import (
     many_vehicles,
     noise_is_slight,
 )
-from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
+from fleet_slip.evaluation.evaluation_document import ReportData, evaluations_of, store_evaluation
 from fleet_slip.evaluation.evaluator import ErrorStatistics
 from fleet_slip.evaluation.report import render, table_two
-from fleet_slip.evaluation.report_data import ReportData
 from fleet_slip.pages.page import Cell, draw, number
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.documents import Document
