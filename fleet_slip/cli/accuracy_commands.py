@@ -10,7 +10,7 @@ from typer import Argument, Context, Option
 from fleet_slip.base import require_extra
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
-from fleet_slip.cli.options import fleet_of, recorded
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import print_answer, progress, say, write_text
 from fleet_slip.errors import UsageError
 
@@ -56,7 +56,6 @@ def predict(
     print_answer(predictions, json)
 
 
-@recorded
 def evaluate(
     context: Context,
     model: opt.Model = None,
@@ -197,7 +196,6 @@ def report(
     )
 
 
-@recorded
 def watch(
     context: Context,
     drive: Annotated[

@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_group
 
 import fleet_slip
+from fleet_slip.cli.options import recorded
 from fleet_slip.cli.output import Streams, configure_remarks, say
 from fleet_slip.errors import (
     INTERRUPTED,
@@ -52,6 +53,12 @@ MODULES = {
     "operation_commands": "status contract quality calibrate monitor verify compact forget migrate",
 }
 """The modules of `fleet_slip.cli` that define the commands, each as a function."""
+
+RECORDED = (
+    "run learn nightly ingest simulate gram publish promote rollback pin unpin evaluate watch "
+    "compact forget migrate"
+)
+"""The commands whose runs are in the view `runs`."""
 
 COMMANDS = {name: module for module, names in MODULES.items() for name in names.split()}
 
@@ -91,7 +98,8 @@ def load_command(name: str) -> Any:
     if group := getattr(module, f"{name}_app", None):
         app.add_typer(group, name=name)
     else:
-        app.command(name)(getattr(module, name))
+        function = getattr(module, name)
+        app.command(name)(recorded(function) if name in RECORDED.split() else function)
     return get_group(app).commands[name]
 
 

@@ -13,7 +13,7 @@ from typer import Argument, Context, Option
 from fleet_slip.api.calls import open_workers
 from fleet_slip.base import last_day, pluralize
 from fleet_slip.cli import options as opt
-from fleet_slip.cli.options import fleet_of, recorded
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import (
     print_answer,
     print_json,
@@ -38,7 +38,6 @@ ALL_SETS = "all"
 """Name that stands for every feature set."""
 
 
-@recorded
 def simulate(
     context: Context,
     campaign: Annotated[str, Argument(help="Campaign of configs/campaigns, or a TOML file.")],
@@ -68,7 +67,6 @@ def simulate(
     print_answer(report, json)
 
 
-@recorded
 def ingest(
     context: Context,
     files: Annotated[
@@ -321,7 +319,6 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draf
 # Gram rows.
 
 
-@recorded
 def gram(
     context: Context,
     features: Annotated[

@@ -8,7 +8,7 @@ from typer import Argument, Context, Option
 
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
-from fleet_slip.cli.options import fleet_of, recorded
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import print_answer, print_json, print_parts, say, write_text
 from fleet_slip.errors import UsageError
 from fleet_slip.rendering import TextTable
@@ -68,7 +68,6 @@ def select(
         write_text(save, selection.compared.as_toml(), "" if json else remark)
 
 
-@recorded
 def publish(
     context: Context,
     name: opt.ModelName,
@@ -229,7 +228,6 @@ def show(
         print_answer(version, json, everything=everything, on_board=describe_costs(version))
 
 
-@recorded
 def promote(
     context: Context,
     reference: Annotated[str, Argument(help="NAME@VERSION.", autocompletion=opt.complete_model)],
@@ -243,7 +241,6 @@ def promote(
     say(f"{version.manifest.name}@{alias} is now version {version.version}")
 
 
-@recorded
 def rollback(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Point an alias back at its previous version, and pin it there.
 
@@ -256,7 +253,6 @@ def rollback(context: Context, model: opt.ModelName, alias: opt.Alias = "champio
     )
 
 
-@recorded
 def pin(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Keep an alias at its version: publications become candidates, until promote or unpin.
 
@@ -266,7 +262,6 @@ def pin(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -
     say(f"{model}@{alias} is pinned to version {version.version}")
 
 
-@recorded
 def unpin(context: Context, model: opt.ModelName, alias: opt.Alias = "champion") -> None:
     """Let publications move an alias again.
 

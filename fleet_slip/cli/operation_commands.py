@@ -8,7 +8,7 @@ from typer import Context, Option
 from fleet_slip.base import date_of
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.cli import options as opt
-from fleet_slip.cli.options import fleet_of, recorded
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import (
     print_answer,
     print_json,
@@ -150,7 +150,6 @@ def verify(
     print_answer(verification, json)
 
 
-@recorded
 def compact(
     context: Context,
     target_rows: Annotated[
@@ -183,7 +182,6 @@ def compact(
     print_answer(report, json)
 
 
-@recorded
 def forget(
     context: Context,
     vehicle: Annotated[str | None, Option(help="vehicle_id to erase.")] = None,
@@ -232,7 +230,6 @@ def forget(
             report.require_all()
 
 
-@recorded
 def migrate(context: Context, json: opt.Json = False) -> None:
     """Bring the data root to this program and to the signal catalog: add columns.
 

@@ -10,11 +10,10 @@ from typer import Argument, Context, Option
 
 import fleet_slip
 from fleet_slip.errors import FleetSlipError
-from fleet_slip.storage.runs import Run, recording
+from fleet_slip.storage.runs import recording
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.warehouse.warehouse import Warehouse
 
 P = ParamSpec("P")
 
@@ -34,25 +33,16 @@ def recorded(command: Callable[P, None]) -> Callable[P, None]:
             return command(*arguments, **options)
         context = cast(Context, options["context"])
         warehouse = fleet_of(context).warehouse
-        with (
-            recording(warehouse.root, command.__name__, sys.argv[1:]) as current_run,
-            _lineage(context, warehouse, current_run, options),
-        ):
-            return command(*arguments, **options)
+        lineage: AbstractContextManager[None] = nullcontext()
+        with recording(warehouse.root, command.__name__, sys.argv[1:]) as current_run:
+            if target := context.find_root().params.get("lineage"):
+                from fleet_slip.operations.lineage import emit_lineage
+
+                lineage = emit_lineage(target, warehouse, current_run, options)
+            with lineage:
+                return command(*arguments, **options)
 
     return run
-
-
-def _lineage(
-    context: Context, warehouse: "Warehouse", current_run: Run, options: dict[str, object]
-) -> AbstractContextManager[None]:
-    """Return the emitter of lineage events, if --lineage names a file or a URL."""
-    target = context.find_root().params.get("lineage")
-    if not target:
-        return nullcontext()
-    from fleet_slip.operations.lineage import emit_lineage
-
-    return emit_lineage(target, warehouse, current_run, options)
 
 
 def complete_model(context: Context, incomplete: str) -> list[str]:

@@ -15,7 +15,7 @@ from fleet_slip.base import date_of, last_day
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.data_commands import warn_of_passed_over
-from fleet_slip.cli.options import fleet_of, recorded
+from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import print_answer, print_json, print_parts, progress_of_steps, say
 from fleet_slip.errors import UsageError
 
@@ -74,7 +74,6 @@ def demo(
         typer.launch(str(page))
 
 
-@recorded
 def run(
     context: Context,
     campaign: Annotated[
@@ -123,7 +122,6 @@ def run(
         )
 
 
-@recorded
 def learn(
     context: Context,
     name: opt.ModelName,
@@ -161,7 +159,6 @@ def learn(
         raise report.problem
 
 
-@recorded
 def nightly(
     context: Context,
     inbox: Annotated[str, Option(help="Folder of logs; new logs in it are ingested.")],

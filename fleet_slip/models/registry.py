@@ -96,8 +96,12 @@ class AliasHistory:
         """
         trail: list[int] = []
         for move in self.moves():
-            if move.alias == alias:
-                trail = _after(trail, move)
+            if move.alias != alias or move.command in ("pin", "unpin"):
+                continue
+            if move.command == "rollback":
+                trail = trail[:-1]
+            elif trail[-1:] != [move.version]:
+                trail.append(move.version)
         return trail[-2] if len(trail) > 1 else None
 
     def best_of(self, alias: str) -> int | None:
@@ -150,19 +154,6 @@ class AliasHistory:
         )
         content = move.model_dump(mode="json", exclude_none=True)
         return self.documents.create(after + 1, content) is not None
-
-
-def _after(trail: list[int], move: AliasMove) -> list[int]:
-    """Return the versions that an alias pointed at, after another move."""
-    match move.command:
-        case "rollback":
-            return trail[:-1]
-        case "pin" | "unpin":
-            return trail
-        case _ if trail and trail[-1] == move.version:
-            return trail
-        case _:
-            return [*trail, move.version]
 
 
 # One published version of a model, which estimates angles from data frames.
