@@ -15,7 +15,7 @@ READERS = {
     "resources.py": "the system's folder for caches, needed when a module is imported",
     "compiling.py": "numba's folder for caches, needed when a module is imported",
     "storage/objects.py": "AWS_ALLOW_HTTP, which stands beside the credentials of the libraries",
-    "ingest/formats/confined.py": "what a child process inherits",
+    "ingest/formats/reading.py": "what a child process inherits",
 }
 
 
