@@ -310,10 +310,12 @@ def make_checks(
         "holes": (UNKNOWN_CAR, _holes(program, np.random.default_rng(2))),
         "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
     }
-    return tuple(
-        _check(signals, manifest, program, name, car, samples)
-        for name, (car, samples) in drives.items()
-    )
+    checks = []
+    for name, (car, samples) in drives.items():
+        ticks, counts = tuple(samples), (car.fact_counts(program), car.number_counts(program))
+        angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
+        checks.append(TestVector(name, car.facts, *counts, ticks, angles))
+    return tuple(checks)
 
 
 def angles_by_kernel(
@@ -362,20 +364,6 @@ def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
         count if count is not None and signal.min_count <= count <= signal.max_count else None
         for count, signal in zip(sample, signals, strict=True)
     )
-
-
-def _check(
-    signals: SignalCatalog,
-    manifest: Manifest,
-    program: Program,
-    name: str,
-    car: Car,
-    samples: Iterable[Sample],
-) -> TestVector:
-    ticks = tuple(samples)
-    angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
-    counts = car.fact_counts(program), car.number_counts(program)
-    return TestVector(name, car.facts, *counts, ticks, angles)
 
 
 def _smooth(program: Program) -> Iterable[Sample]:

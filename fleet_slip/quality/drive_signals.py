@@ -79,12 +79,9 @@ def is_slow(signals: Signals) -> BoolArray:
 
     There a label is noise, and no estimate is compared with it. Of shape (1,) without a speed.
     """
-    speed = np.full(1, np.nan)
-    wheels = [signals[name] for name in WHEELS if name in signals]
+    speed, wheels = np.full(1, np.nan), wheel_speed_mps(signals)
     sources = [np.abs(signals[name]) for name in OWN_SPEEDS if name in signals]
-    if wheels:
-        sources.append(np.median(wheels, axis=0) * RADIUS_M)
-    for source in sources:
+    for source in sources if wheels is None else [*sources, wheels]:
         speed = np.where(np.isfinite(speed), speed, source)
     return speed < MOVING_MPS
 

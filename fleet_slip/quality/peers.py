@@ -320,11 +320,9 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
 def _gains(drives: MeanMoments, label: int) -> FloatArray | None:
     """Return the gain of each drive's label on the common relation; None without one."""
     inputs, with_label, variances = _label_moments(drives, label)
-    starts = [np.ones(len(inputs)), _leading_signs(inputs.sum(axis=0), with_label)]
-    fits = [_fit_signs(inputs, with_label, start) for start in starts]
-    explained = [float(weights @ (signs @ with_label)) for signs, weights, _ in fits]
-    signs, _, gains = fits[int(np.argmax(explained))]
-    if not max(explained) > MIN_EXPLAINED * float(variances.sum()):
+    start = _leading_signs(inputs.sum(axis=0), with_label)
+    signs, weights, gains = _fit_signs(inputs, with_label, start)
+    if not weights @ (signs @ with_label) > MIN_EXPLAINED * variances.sum():
         return None
     majority = np.sign(signs.sum()) or signs[0]
     return np.asarray(gains * majority)
