@@ -1,4 +1,4 @@
-"""Code blocks of a page: found by Sybil, and each run as a reader would type it.
+"""Code blocks of a page, and how each is run as a reader would type it.
 
 - `console`: every line that begins with `$ ` is a command. The lines after it are what it prints;
   `…` stands for any text, and a command without such lines may print anything.
@@ -16,10 +16,9 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
-from sybil import Document, Example, Region
-from sybil.evaluators.python import PythonEvaluator
-from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
+from markdown_it import MarkdownIt
 
 import fleet_slip
 from fleet_slip.cli.app import app
@@ -28,22 +27,24 @@ from tests.support.commands import PATIENCE_S
 
 RUN = frozenset({"console", "bash", "python", "sql"})
 SHOWN = frozenset({"text", "json", "toml", "yaml", "csv", "diff"})
-_FENCES = RawFencedCodeBlockLexer(re.compile(r"(?P<language>\S*)(?P<options>[^\n]*)$\n", re.M))
-_TITLE = re.compile(r'\s*title="(?P<title>[\w.-]+)"\s*')
-_MARK = re.compile(r"<!-- (not run): \S.* -->\n\Z")
-_run_python = PythonEvaluator()
+_TITLE = re.compile(r'title="(?P<title>[\w.-]+)"')
+_MARK = re.compile(r"<!-- not run: \S.* -->\n")
 
 
 @dataclass(frozen=True)
 class Block:
-    """A code block of a page; the page's first line is line 1."""
+    """A code block of a page: its first line, and whether a comment above marks it as not run.
 
+    Python blocks of a page share `names`.
+    """
+
+    page: Path
     line: int
     language: str
     options: str
     source: str
-    mark: str
-    example: Example
+    is_marked: bool
+    names: dict[str, Any]
 
     @property
     def title(self) -> str | None:
@@ -55,36 +56,24 @@ class Block:
     def fault(self) -> str | None:
         """Why it is neither run, nor marked, nor for reading."""
         if self.options and not self.title:
-            return f"unknown options {self.options.strip()!r}"
+            return f"unknown options {self.options!r}"
         if self.language not in RUN | SHOWN:
             return f"{self.language or 'no language'}: use one of {sorted(RUN | SHOWN)}"
-        if self.mark and self.language not in RUN:
-            return f"marked as {self.mark}, but blocks of its language never are"
+        if self.is_marked and self.language not in RUN:
+            return "marked as not run, but blocks of its language never are"
         return None
 
 
 def blocks(page: Path) -> list[Block]:
     """Return the code blocks of a page, in order."""
-    document = Document.parse(str(page), _regions)
-    return [_block(example) for example in document.examples()]
-
-
-def _regions(document: Document) -> Iterator[Region]:
-    for found in _FENCES(document):
-        yield Region(found.start, found.end, found.lexemes["source"], _run_python, found.lexemes)
-
-
-def _block(example: Example) -> Block:
-    found = _MARK.search(example.document.text[: example.start])
-    lexemes = example.region.lexemes
-    return Block(
-        example.line,
-        lexemes["language"],
-        lexemes["options"],
-        str(lexemes["source"]),
-        found[1] if found else "",
-        example,
-    )
+    found, names, marked = [], dict[str, Any](), False
+    for token in MarkdownIt("commonmark").parse(page.read_text(encoding="utf-8")):
+        if token.type == "fence" and token.map:
+            language, _, options = token.info.partition(" ")
+            line, options = token.map[0] + 1, options.strip()
+            found.append(Block(page, line, language, options, token.content, marked, names))
+        marked = token.type == "html_block" and bool(_MARK.fullmatch(token.content))
+    return found
 
 
 def run(block: Block, known: dict[str, str]) -> None:
@@ -95,10 +84,11 @@ def run(block: Block, known: dict[str, str]) -> None:
     assert block.fault is None, block.fault
     if block.title:
         Path(block.title).write_text(block.source, encoding="utf-8")
-    elif block.language in SHOWN or block.mark:
+    elif block.language in SHOWN or block.is_marked:
         return
     elif block.language == "python":
-        block.example.evaluate()
+        code = compile("\n" * block.line + block.source, str(block.page), "exec")
+        exec(code, block.names)  # noqa: S102 - of our own pages
     elif block.language == "sql":
         with fleet_slip.connect("data") as database:
             assert database.execute(block.source).fetchall()
