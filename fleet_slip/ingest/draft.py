@@ -71,8 +71,6 @@ def draft_mapping(signals: SignalCatalog, file: Path, profile: FileProfile) -> D
     for name, guess in guesses.items():
         if raster := rasters.get(guess.column):
             guesses[name] = guess.because(f"its times are in {raster}", time=raster)
-        if guess.is_weak and guess.readings:
-            guesses[name] = guesses[name].doubted("name and unit are ambiguous")
     asked_for = {name for name, guess in guesses.items() if guess.doubts or guess.rivals}
     if COURSE in guesses and asked_for & {COURSE, SATELLITE_SPEED, "yaw_rate"}:
         asked_for |= {COURSE, SATELLITE_SPEED}  # which stand together

@@ -56,8 +56,6 @@ class Guess:
         Of the signal in a mapping, without the column: unit, negate, sign …
     reasons
         Texts for people.
-    is_weak
-        True if its name may mean another signal.
     doubts
         Reasons against it.
     rivals
@@ -70,7 +68,6 @@ class Guess:
     profile: Profile
     keys: Mapping[str, Any]
     reasons: tuple[str, ...]
-    is_weak: bool = False
     doubts: tuple[str, ...] = ()
     rivals: tuple["Guess", ...] = ()
     readings: tuple[Keys, ...] = ()
@@ -129,8 +126,9 @@ def _scored(catalog: SignalCatalog, profile: Profile) -> Iterator[tuple[float, G
             score *= _WEAK
         if not score or (guess := _guess(catalog, signal, profile, words)) is None:
             continue
-        fits = 0.0 if guess.readings else _UNIT_FITS
-        yield score + fits, replace(guess, is_weak=weak)
+        if weak and guess.readings:
+            guess = guess.doubted("name and unit are ambiguous")
+        yield score + (0.0 if guess.readings else _UNIT_FITS), guess
 
 
 def _satellites(guesses: dict[str, Guess]) -> dict[str, Guess]:
@@ -205,7 +203,7 @@ def _guess(catalog: SignalCatalog, signal: str, profile: Profile, words: str) ->
     how = "the format calls it" if profile.channel.title else "its name contains"
     named = f"{how} {words!r}"
     if unit is None:
-        units = _UNITS_OF[_si_unit(catalog, signal)]
+        units = vocabulary()["choices"][_si_unit(catalog, signal)]
         several: tuple[Keys, ...] = tuple({"unit": unit} for unit in units)
         unknown = f" that is known: {text!r}" if text else ""
         reason = f"the file has no unit{unknown}; values up to {largest:.3g}"
@@ -235,14 +233,6 @@ def _si_unit(catalog: SignalCatalog, signal: str, radius_m: float | None = None)
 
 # Units that the file does not contain: a person chooses among those of other files.
 
-_UNITS_OF = {
-    "m/s^2": ("m/s^2", "g"),
-    "rad/s": ("deg/s", "rad/s"),
-    "rad": ("deg", "rad"),
-    "m/s": ("m/s", "km/h", "mph"),
-    "Pa": ("bar", "kPa"),
-    "1": ("1", "%"),
-}
 _OF_WHEELS: tuple[Keys, ...] = (
     {"unit": "km/h", "radius_m": RADIUS_M},
     {"unit": "m/s", "radius_m": RADIUS_M},
@@ -253,7 +243,6 @@ _OF_WHEELS: tuple[Keys, ...] = (
 
 # Guesses where the times of a log are, and which columns identify its cars and trips.
 
-_UNITS = {"s": "s", "sec": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns"}
 _STEPS = ((0.5, "s"), (500.0, "ms"), (500_000.0, "us"), (np.inf, "ns"))
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _EPOCH_S = (6e8, 4e9)
@@ -427,7 +416,8 @@ def _numbers(profile: Profile, present: FloatArray) -> TimeGuess:
         return TimeGuess(clock, "its digits are hours, minutes and seconds of the day", rate_hz)
     step = float(np.median(np.diff(present)))
     ends = parts_of(name)[-1]
-    named = _UNITS.get((profile.channel.unit or in_brackets).lower()) or _UNITS.get(ends)
+    units = vocabulary()["time"]["units"]
+    named = units.get((profile.channel.unit or in_brackets).lower()) or units.get(ends)
     since_1970 = [u for u, s in _SECONDS.items() if _EPOCH_S[0] < present[0] * s < _EPOCH_S[1]]
     likely = [*since_1970, *(name for limit, name in _STEPS if step < limit)]
     unit = named or likely[0]
