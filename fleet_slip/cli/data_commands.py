@@ -300,9 +300,8 @@ def _ask_for_open(draft: "Draft", text: str) -> str:
 def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draft, str]":
     """Return the draft of a mapping for a log, and its text."""
     from fleet_slip.ingest.draft import draft_mapping, name_of, write_draft
-    from fleet_slip.ingest.file_groups import FileGroup
     from fleet_slip.ingest.formats.file_formats import CanBus, read_can_database
-    from fleet_slip.ingest.log_files import find_logs
+    from fleet_slip.ingest.log_files import FileGroup, find_logs
     from fleet_slip.ingest.profile import profile_file
 
     bus = read_can_database(CanBus(database=str(can.absolute())), can.parent) if can else None

@@ -2,8 +2,8 @@
 
 The processing of a row, one module a step, in this order:
 
-1. `log_files` finds the logs of this machine: files, and those in folders. It refuses URLs.
-   `file_groups` makes one log of several files of a drive.
+1. `log_files` finds the logs of this machine: files, and those in folders. It refuses URLs, and
+   makes one log of several files of a drive.
 2. `batches` reads a file in bounded batches of the columns that the mapping uses, by the reader of
    its format (`formats`); several time bases become one table.
 3. `checked_columns` checks each row by itself: values in SI units, or the reason why it is refused.

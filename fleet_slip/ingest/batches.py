@@ -14,10 +14,10 @@ import polars as pl
 
 from fleet_slip.base import quote_name
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.file_groups import open_log, seconds_of
 from fleet_slip.ingest.formats.reading import file_errors
 from fleet_slip.ingest.formats.source import BASE, EARLIEST_S, OWN_TIME, Budget
 from fleet_slip.ingest.formats.tables import BATCH_ROWS
+from fleet_slip.ingest.log_files import open_log, seconds_of
 from fleet_slip.ingest.mapping import Mapping
 
 _CLOCK = "this file has its own clock: set own_clock = true under [time]"

@@ -18,7 +18,6 @@ from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import CHOOSE, WHEEL_PREFIX, TimeBase
-from fleet_slip.ingest.file_groups import FileGroup
 from fleet_slip.ingest.guess import (
     Guess,
     TimeGuess,
@@ -28,6 +27,7 @@ from fleet_slip.ingest.guess import (
     guess_time,
     headings,
 )
+from fleet_slip.ingest.log_files import FileGroup
 from fleet_slip.ingest.profile import FileProfile
 from fleet_slip.quality.drive_signals import RADIUS_M
 

@@ -24,10 +24,10 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest.checked_columns import RowChecker, describe_refused, is_grouped
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives import DriveCutter, DriveRows, sort_by_group
-from fleet_slip.ingest.file_groups import FileGroup, open_log
 from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
+from fleet_slip.ingest.log_files import FileGroup, open_log
 from fleet_slip.ingest.mapping import FromColumn, Mapping
 from fleet_slip.ingest.ticks import PREFIX, MeasuredDrive, drive_id, to_ticks
 from fleet_slip.ingest.vocabulary import is_called, vocabulary

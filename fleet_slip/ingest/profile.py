@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import parse_numbers
-from fleet_slip.ingest.file_groups import FileGroup, open_log
 from fleet_slip.ingest.formats.csv import decompressed, first_lines
 from fleet_slip.ingest.formats.file_formats import CanBus, CsvFormat, Encoding, FileFormats
 from fleet_slip.ingest.formats.reading import (
@@ -24,6 +23,7 @@ from fleet_slip.ingest.formats.reading import (
 )
 from fleet_slip.ingest.formats.source import OWN_TIME, Channel, Source
 from fleet_slip.ingest.formats.vbo import VBO_BEGINS
+from fleet_slip.ingest.log_files import FileGroup, open_log
 from fleet_slip.ingest.vocabulary import unit_called, vocabulary
 
 # Guesses how a text file is written: encoding, separator, and where header, units and data are.

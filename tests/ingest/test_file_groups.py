@@ -10,8 +10,7 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.file_groups import FileGroup
-from fleet_slip.ingest.log_files import find_logs
+from fleet_slip.ingest.log_files import FileGroup, find_logs
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.commands import run_on
 from tests.support.measured import OWN_CLOCK, a_mapping, csv_text, own_clock, read_measured
