@@ -16,7 +16,7 @@ from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, assign_folds
-from fleet_slip.grams.drive_sums import read_drives
+from fleet_slip.grams.compute import read_drives
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.regression.folds import FoldAssignment
 from fleet_slip.warehouse.gram_reader import cohort_files

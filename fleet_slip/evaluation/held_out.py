@@ -34,7 +34,7 @@ from fleet_slip.evaluation.labelled_drives import (
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
-from fleet_slip.grams.drive_sums import DriveBlocks, counts_of, drive_sums, gram_rows
+from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.publish import manifest_of, with_straight_intercept
 from fleet_slip.models.request import SelectionPlan, SelectionRequest

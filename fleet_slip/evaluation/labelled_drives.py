@@ -18,7 +18,7 @@ from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.errors import QuestionError
 from fleet_slip.evaluation.evaluator import MissingSignalError
 from fleet_slip.grams.calibrated_columns import CarCounts
-from fleet_slip.grams.drive_sums import counts_of
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.predict import Predictor
 from fleet_slip.quality.drive_signals import SPEEDS, is_slow
 from fleet_slip.vehicle.parameters import VehicleParameters

@@ -21,7 +21,7 @@ from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
-from fleet_slip.grams.drive_sums import counts_of
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 

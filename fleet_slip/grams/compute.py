@@ -1,27 +1,443 @@
-"""Gram rows of log files: plain feature sets by `jobs/gram.sql`, windows by the kernel."""
+"""Gram rows of log files: plain feature sets by `jobs/gram.sql`, windows by the compiled kernel.
+
+The kernel sums the rows, blocks and course changes of each drive.
+"""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from math import ceil
 from os import cpu_count
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
+from fleet_slip.arrays import BoolArray, FloatArray, IntArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import (
+    COURSE,
+    COURSE_LATE,
+    TURNED_DIVISOR,
+    CourseUnits,
+    course_units,
+    split_late,
+)
 from fleet_slip.catalog.definitions import COUNT_BITS, Slope, rows_behind
-from fleet_slip.catalog.features import PLAIN
+from fleet_slip.catalog.features import PLAIN, FeatureSet
+from fleet_slip.catalog.signals import HALF_TURN, SignalCatalog
 from fleet_slip.columns.column_sql import with_absent, with_columns
+from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts
 from fleet_slip.compute.tasks import LocalThreads, in_flight, run_tasks
-from fleet_slip.errors import QuestionError
-from fleet_slip.grams.drive_sums import CourseDelays, wide_grams
+from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.resources import read_sql
 from fleet_slip.storage.table import TableFile, absent_columns
 from fleet_slip.warehouse.database import open_database, reading_files
 from fleet_slip.warehouse.warehouse import Warehouse
+
+CourseDelays = Mapping[str, int] | None
+"""Delay of the course of each car in parts of a tick; 0 for other cars."""
+
+# Rows of drives, one drive at a time in the order of time, from log files or a query.
+
+
+def read_drives(warehouse: Warehouse, file: TableFile, plan: ColumnPlan) -> Iterator[DriveCounts]:
+    """Yield the drives of a log file, with their metadata as facts and rows in the order of time.
+
+    As in SQL, a drive without a row of tick 0 is skipped.
+    """
+    drive_columns = tuple(warehouse.catalog.signals.drive)
+    columns = [n for n in (*drive_columns, "tick", *plan.signals) if n in file.null_counts]
+    for drive in rows_by_drive(warehouse.logs.read(file.path, columns)):
+        ticks = drive["tick"].to_numpy()
+        if (ticks[1:] < ticks[:-1]).any():
+            order = np.argsort(ticks, kind="stable")
+            drive, ticks = drive.take(order), ticks[order]  # noqa: PLW2901
+        start = int(np.searchsorted(ticks, 0))
+        if start < len(ticks) and ticks[start] == 0:
+            metadata = {
+                name: drive[name][start].as_py() if name in columns else None
+                for name in drive_columns
+            }
+            yield counts_of(drive, plan, metadata)
+
+
+def counts_of(
+    rows: pa.Table,
+    plan: ColumnPlan,
+    facts: Mapping[str, Any] | None = None,
+    numbers: Mapping[str, int] | None = None,
+) -> DriveCounts:
+    """Return the rows of a drive in the order of time as the input of a column plan.
+
+    `facts` default to those of the first row; `numbers` are the calibration parameters of the car.
+    """
+    counts, present = {}, {}
+    for name in plan.signals:
+        if name not in rows.column_names:
+            counts[name] = np.zeros(len(rows), dtype=np.int16)
+            present[name] = np.zeros(len(rows), dtype=np.bool_)
+            continue
+        column = rows[name].combine_chunks()
+        if column.null_count:
+            present[name] = column.is_valid().to_numpy(zero_copy_only=False)
+            column = column.fill_null(0)
+        counts[name] = column.to_numpy()
+    if facts is None:
+        facts = {name: rows[name][0].as_py() for name in plan.facts}
+    return DriveCounts(rows["tick"].to_numpy(), counts, present, facts, numbers or {})
+
+
+def drives_of_stream(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]:
+    """Yield the rows of each drive from batches that are sorted by drive."""
+    segments: list[pa.Table] = []
+    for batch in batches:
+        for segment in rows_by_drive(pa.Table.from_batches([batch])):
+            if segments and segments[0]["drive_id"][0] != segment["drive_id"][0]:
+                yield pa.concat_tables(segments)
+                segments = []
+            segments.append(segment)
+    if segments:
+        yield pa.concat_tables(segments)
+
+
+def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
+    """Yield the rows of each drive, in their order."""
+    ids = rows["drive_id"].combine_chunks()
+    if not pa.types.is_dictionary(ids.type):
+        ids = pc.dictionary_encode(ids)
+    drive_of_row = ids.indices.to_numpy()
+    starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    if len(starts) > len(np.unique(drive_of_row[starts])):  # the rows of drives are mixed
+        order = np.argsort(drive_of_row, kind="stable")
+        rows, drive_of_row = rows.take(order), drive_of_row[order]
+        starts = np.flatnonzero(np.diff(drive_of_row, prepend=-1))
+    for start, stop in pairwise([*starts.tolist(), rows.num_rows]):
+        yield rows.slice(start, stop - start)
+
+
+@dataclass(frozen=True)
+class DriveBlocks:
+    """Division of the rows of a drive into blocks of time, or one block per duration of changes.
+
+    With several durations each block contains all rows.
+    """
+
+    block_ticks: int | None = None
+    durations: tuple[str, ...] = ()
+
+    @classmethod
+    def of_set(cls, feature_set: FeatureSet) -> "DriveBlocks":
+        """Return the division of the drives of a feature set."""
+        durations = tuple(f"{time_s:f} s" for time_s in feature_set.change_s)
+        return cls(feature_set.block_ticks, durations if len(durations) > 1 else ())
+
+    def numbers(self, ticks: NDArray[Any]) -> IntArray:
+        """Return the block number of each row, shape (rows,); 0 without blocks of time."""
+        if not self.block_ticks:
+            return np.zeros(len(ticks), dtype=np.int64)
+        return ticks.astype(np.int64) // self.block_ticks
+
+    def name(self, number: int) -> str | None:
+        """Return the name of a block; names sort as numbers do; None for an undivided drive."""
+        if self.block_ticks:
+            return f"block {number + 1:04}"
+        return self.durations[number] if self.durations else None
+
+
+# Gram rows of any feature set by the kernel: equal to those by SQL, faster.
+#
+# Each drive is read once, in the order of time. Columns are integers below 2^19 in binary64. Their
+# products and sums over blocks stay below 2^53, and so are exact in any order. Totals have 64 bits.
+
+_INT64 = 2**63
+
+
+def wide_grams(
+    warehouse: Warehouse, files: Sequence[TableFile], feature_set: str, delays: CourseDelays = None
+) -> pa.Table:
+    """Return the Gram rows of log files for a feature set, sorted as by `jobs/gram.sql`.
+
+    Raises `DataError` for a drive whose ticks windows cannot use, and `StorageError` for sums of
+    more than 64 bits.
+    """
+    catalog = warehouse.catalog
+    resolved, model = catalog.feature_set(feature_set), catalog.first_stage_model(feature_set)
+    plan = ColumnPlan.of_set(catalog, feature_set)
+    plans: dict[str | None, ColumnPlan] = {None: plan}
+    identity = catalog.identity(feature_set)
+    schema = warehouse.computed_schema(in_time=resolved.in_time)
+    rows: list[dict[str, Any]] = []
+    # Files run in parallel; further threads of the BLAS would compete with them.
+    with threadpool_limits(1, user_api="blas"):
+        for file in sorted(files, key=lambda file: file.path):
+            drives = read_drives(warehouse, file, plan)
+            for drive in sorted(drives, key=lambda drive: str(drive.facts["drive_id"])):
+                fold = model.fold_of(str(drive.facts["drive_id"])) if model else None
+                if fold not in plans:
+                    plans[fold] = ColumnPlan.of_set(catalog, feature_set, fold)
+                delay = (delays or {}).get(drive.facts["vehicle_id"])
+                metadata = {**drive.facts, "feature_set": identity, COURSE_LATE: delay}
+                metadata |= {"file": file.path, "day": file.day}
+                rows += _rows_of_drive(catalog.signals, plans[fold], resolved, drive, metadata)
+    return pa.Table.from_pylist(rows, schema=schema)
+
+
+def _rows_of_drive(
+    signals: SignalCatalog,
+    plan: ColumnPlan,
+    feature_set: FeatureSet,
+    drive: DriveCounts,
+    metadata: Mapping[str, Any],
+) -> Iterator[dict[str, Any]]:
+    blocks = DriveBlocks.of_set(feature_set)
+    try:
+        if feature_set.change_ticks:
+            delay = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
+            sums = change_sums(signals, plan, drive, feature_set.change_ticks, delay)
+        else:
+            sums = drive_sums(plan, blocks, drive)
+    except DataError as error:
+        raise DataError(f"{metadata['file']}: drive {metadata['drive_id']}: {error}") from None
+    return gram_rows(sums, feature_set.columns, blocks, metadata)
+
+
+def gram_rows(
+    sums_by_pattern: "Mapping[Pattern, BlockSums]",
+    columns: Sequence[str],
+    blocks: DriveBlocks,
+    metadata: Mapping[str, Any],
+) -> Iterator[dict[str, Any]]:
+    """Yield the Gram rows of the sums of a drive with its metadata, sorted as by SQL."""
+    for absent, block in sorted(sums_by_pattern):
+        sums = sums_by_pattern[absent, block]
+        names = [name for i, name in enumerate(columns) if not absent >> i & 1]
+        yield {
+            **metadata,
+            "part": blocks.name(block),
+            "signals": ",".join(names),
+            "n": sums.n,
+            "clipped": sums.clipped,
+            "sums": sums.sums,
+            "products": sums.products[np.tril_indices(len(names))],
+        }
+
+
+@dataclass
+class BlockSums:
+    """Sums over the rows of a drive, or of a block of it, that have the same columns."""
+
+    size: int
+    n: int = 0
+    clipped: int = 0
+    sums: NDArray[np.int64] = field(init=False)
+    products: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.sums = np.zeros(self.size, dtype=np.int64)
+        self.products = np.zeros((self.size, self.size), dtype=np.int64)
+
+    def add(self, values: FloatArray, clipped: FloatArray) -> None:
+        """Add complete rows, shape (columns, rows), and the number of clipped values of each.
+
+        Sums of at most `BLOCK_ROWS` rows are exact. Columns of zeros, such as those of a closed
+        gate, are skipped.
+        """
+        self.n += values.shape[1]
+        self.clipped += int(clipped.sum())
+        self.sums += values.sum(axis=1).astype(np.int64)
+        nonzero = values.any(axis=1)
+        values = values if nonzero.all() else values[nonzero]
+        self.products[np.ix_(nonzero, nonzero)] += (values @ values.T).astype(np.int64)
+
+
+Pattern = tuple[int, int]
+"""Bit mask of the columns that rows lack, and number of the block of the drive."""
+
+
+def drive_sums(
+    plan: ColumnPlan, blocks: DriveBlocks, counts: DriveCounts
+) -> dict[Pattern, BlockSums]:
+    """Return the sums of the rows of a drive by pattern; raises as `wide_grams`."""
+    _require_64_bits(len(counts.ticks), max(plan.limits))
+    sums: dict[Pattern, BlockSums] = {}
+    for rows, values, clipped in plan.blocks(counts):
+        _add_by_pattern(sums, values, clipped, blocks.numbers(counts.ticks[rows]))
+    return sums
+
+
+def change_sums(
+    signals: SignalCatalog,
+    plan: ColumnPlan,
+    counts: DriveCounts,
+    durations: Sequence[int],
+    delay: int = 0,
+) -> dict[Pattern, BlockSums]:
+    """Return the sums of the changes of a drive by pattern; a block is a duration in ticks."""
+    _require_64_bits(len(counts.ticks), 2 * max(plan.limits))
+    fixes = Fixes(course_units(signals), plan, counts, delay)
+    sums: dict[Pattern, BlockSums] = {}
+    for block, duration in enumerate(durations):
+        rows, values, clipped = fixes.changes(duration)
+        _add_by_pattern(sums, values, clipped, np.full(len(rows), block))
+    return sums
+
+
+def _require_64_bits(rows: int, largest: int) -> None:
+    if rows * largest**2 >= _INT64:
+        raise StorageError(f"the drive has {rows:,} rows: too many for 64-bit sums.")
+
+
+def _add_by_pattern(
+    sums: dict[Pattern, BlockSums], values: FloatArray, clipped: FloatArray, blocks: IntArray
+) -> None:
+    """Add rows to the sums of their pattern, at most `BLOCK_ROWS` at a time."""
+    for (absent, block), rows in _find_patterns(values, blocks):
+        present = [i for i in range(len(values)) if not absent >> i & 1]
+        total = sums.setdefault((absent, block), BlockSums(len(present)))
+        for start in range(0, len(rows), BLOCK_ROWS):
+            chunk = rows[start : start + BLOCK_ROWS]
+            selected = values if len(chunk) == len(clipped) else values.take(chunk, axis=1)
+            complete = selected if len(present) == len(selected) else selected[present]
+            total.add(complete, clipped[chunk])
+
+
+def _find_patterns(
+    values: FloatArray, blocks: IntArray
+) -> Iterator[tuple[Pattern, NDArray[np.int64]]]:
+    """Yield each pattern of missing columns and block, and its rows."""
+    is_missing = np.isnan(values)
+    incomplete = np.flatnonzero(is_missing.any(axis=0))  # usually few: only these are sorted
+    pattern_of_row, masks = np.zeros(values.shape[1], dtype=np.int64), [0]
+    if len(incomplete):
+        packed = np.packbits(is_missing[:, incomplete], axis=0, bitorder="little")
+        patterns, indices = np.unique(packed, axis=1, return_inverse=True)
+        masks += [int.from_bytes(column.tobytes(), "little") for column in patterns.T]
+        pattern_of_row[incomplete] = 1 + indices.reshape(-1)
+    key_of_row = blocks * len(masks) + pattern_of_row
+    for key in np.unique(key_of_row).tolist():
+        block, pattern = divmod(key, len(masks))
+        yield (masks[pattern], block), np.flatnonzero(key_of_row == key)
+
+
+# Changes between satellite fixes of one drive, as `catalog/course.py` defines them.
+#
+# Only rows with a fix are in memory: at most one in ten.
+
+
+class Fixes:
+    """Rows of a drive that have a fix."""
+
+    def __init__(
+        self, units: CourseUnits, plan: ColumnPlan, drive: DriveCounts, delay: int = 0
+    ) -> None:
+        """Find the fixes of a drive whose course is late by `delay` parts of a tick.
+
+        Course and yaw rate are the last columns of the plan.
+        """
+        self.units = units
+        self.ticks = drive.ticks.astype(np.int64)
+        delay_ticks, self.gain = split_late(delay)
+        self.rows, self.course = _find_fixes(drive, self.ticks, delay_ticks)
+        self.yaw_rate = np.empty(len(self.ticks))  # of all rows, NaN where it is missing
+        values: list[FloatArray] = []
+        clipped: list[FloatArray] = []
+        self.first_clipped = np.zeros(0)
+        for rows, block, block_clipped in plan.blocks(drive):
+            self.yaw_rate[rows] = block[-1]
+            begin, end = np.searchsorted(self.rows, (rows.start, rows.stop))
+            fixed = self.rows[begin:end] - rows.start
+            values.append(block[:-2].take(fixed, axis=1))
+            clipped.append(block_clipped[fixed])
+            if not rows.start:
+                self.first_clipped = block_clipped[:1].copy()
+        self.counts, self.clipped = np.concatenate(values, axis=1), np.concatenate(clipped)
+
+    def changes(self, duration: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return the changes between fixes that are `duration` ticks apart.
+
+        Returns the rows of the later fixes, the columns, and the number of clipped values of each.
+        Columns have shape (columns, changes), end with `AUXILIARY` and the label, and are NaN where
+        missing.
+        """
+        rows, yaw_rate, units = self.rows, self.yaw_rate, self.units
+        before, now = _pair_fixes(self.ticks[rows], duration)
+        turned, complete = _twice_turned(self.ticks, yaw_rate, rows[before], rows[now])
+        before, now, turned = before[complete], now[complete], turned[complete]
+        by_delay = self.gain * (yaw_rate[rows[now]] - yaw_rate[rows[before]]).astype(np.int64)
+        course_change = self.course[now] - self.course[before]
+        change, plausible = _sideslip_change(units, course_change, turned, by_delay)
+        before, now, turned, change = (v[plausible] for v in (before, now, turned, change))
+        # Straight driving by the yaw rate at both fixes and in between.
+        fastest = np.maximum(np.abs(yaw_rate[rows[before]]), np.abs(yaw_rate[rows[now]]))
+        straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
+        auxiliary = [
+            _divide_rounded(turned, TURNED_DIVISOR),
+            straight,
+            straight * change,
+        ]  # `AUXILIARY`
+        # The first row has no change: it records a drive without a course.
+        is_start = self.ticks[:1] == 0
+        offset, size = int(is_start.sum()), len(self.counts)
+        columns = np.full((size + len(auxiliary) + 1, offset + len(now)), np.nan)
+        columns[:size, offset:] = self.counts.take(now, axis=1)
+        columns[:size, offset:] -= self.counts.take(before, axis=1)
+        columns[size:, offset:] = [*auxiliary, change]
+        clipped = np.concatenate([self.first_clipped[is_start], self.clipped[now]])
+        return np.concatenate([np.flatnonzero(is_start), rows[now]]), columns, clipped
+
+
+def _find_fixes(drive: DriveCounts, ticks: IntArray, delay_ticks: int) -> tuple[IntArray, IntArray]:
+    """Return the rows of the fixes, `delay_ticks` before they arrive, and the course."""
+    fixed = np.flatnonzero(drive.present.get(COURSE, np.ones(len(ticks), dtype=np.bool_)))
+    rows = np.searchsorted(ticks, ticks[fixed] - delay_ticks)
+    exists = ticks[np.minimum(rows, len(ticks) - 1)] == ticks[fixed] - delay_ticks
+    return rows[exists], drive.counts[COURSE][fixed[exists]].astype(np.int64)
+
+
+def _pair_fixes(ticks: IntArray, duration: int) -> tuple[IntArray, IntArray]:
+    """Return the indices of the fixes that are `duration` ticks apart, the earlier ones first."""
+    if not ticks.size:
+        return ticks, ticks
+    before = np.minimum(np.searchsorted(ticks, ticks - duration), ticks.size - 1)
+    now = np.flatnonzero(ticks[before] == ticks - duration)
+    return before[now], now
+
+
+def _twice_turned(
+    ticks: IntArray, yaw_rate: FloatArray, before: IntArray, now: IntArray
+) -> tuple[IntArray, BoolArray]:
+    """Return J between pairs of rows, and a mask of pairs without a missing yaw rate between."""
+    missing = np.isnan(yaw_rate)
+    counts = np.where(missing, 0.0, yaw_rate).astype(np.int64)
+    total, gaps = np.cumsum(counts), np.cumsum(missing)
+    turned = 2 * (total[now] - total[before]) - counts[now] + counts[before]
+    is_gapless = ticks[now] - ticks[before] == now - before
+    return turned, is_gapless & (gaps[now] == gaps[before]) & ~missing[before]
+
+
+def _sideslip_change(
+    units: CourseUnits, course: IntArray, turned: IntArray, by_delay: IntArray
+) -> tuple[IntArray, BoolArray]:
+    """Return the changes of the side-slip angle in counts of the label, and the plausible ones."""
+    change = units.turn * course - 2 * HALF_TURN * turned + by_delay
+    full_turn = 2 * HALF_TURN * units.turn
+    change -= full_turn * _divide_rounded(change, full_turn)
+    return _divide_rounded(change, units.divisor), np.abs(change) <= units.largest
+
+
+def _divide_rounded(number: IntArray, divisor: int) -> IntArray:
+    quotient: IntArray = (2 * np.abs(number) + divisor) // (2 * divisor)
+    return np.sign(number) * quotient
+
 
 # Statement of a feature set from `jobs/gram.sql`.
 

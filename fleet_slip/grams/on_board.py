@@ -45,7 +45,7 @@ from fleet_slip.catalog.features import PLAIN, Feature
 from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S, Signal
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
-from fleet_slip.grams.drive_sums import DriveBlocks
+from fleet_slip.grams.compute import DriveBlocks
 from fleet_slip.grams.update import (
     files_to_rewrite,
     gram_digests,

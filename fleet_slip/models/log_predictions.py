@@ -14,7 +14,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record, pluralize, require_extra
 from fleet_slip.errors import AlarmError, DataError, InputError, MissingColumnError, UsageError
 from fleet_slip.grams.calibrated_columns import CarCounts
-from fleet_slip.grams.drive_sums import counts_of
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.ingest.logs import log_table
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import open_measured

@@ -23,7 +23,7 @@ from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError, InputError
-from fleet_slip.grams.drive_sums import counts_of
+from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.manifest import Manifest
 
 # Estimates of a published model, sample by sample in the order of time, from logged counts.

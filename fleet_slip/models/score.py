@@ -14,7 +14,7 @@ from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import hash_names
-from fleet_slip.grams.drive_sums import counts_of, drives_of_stream
+from fleet_slip.grams.compute import counts_of, drives_of_stream
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry

@@ -29,8 +29,7 @@ from fleet_slip.errors import (
     RefusedError,
     StorageError,
 )
-from fleet_slip.grams.compute import by_sql, has_statement
-from fleet_slip.grams.drive_sums import wide_grams
+from fleet_slip.grams.compute import by_sql, has_statement, wide_grams
 from fleet_slip.grams.on_board import impossible_rows, onboard_feature_sets
 from fleet_slip.grams.update import reconcile, recorded_delays, transaction_name
 from fleet_slip.models.registry import Registry

@@ -15,7 +15,7 @@ from fleet_slip.columns.drive_columns import ColumnPlan, compute_columns
 from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.export.files import program_content
 from fleet_slip.export.stepping import compile_program, make_checks
-from fleet_slip.grams.drive_sums import read_drives
+from fleet_slip.grams.compute import read_drives
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.registry import ModelVersion
 from tests.export import plain

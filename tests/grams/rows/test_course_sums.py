@@ -14,8 +14,7 @@ import pytest
 
 from fleet_slip.catalog.course import MAX_CHANGE_RAD, TURNED, course_units
 from fleet_slip.columns.drive_columns import ColumnPlan
-from fleet_slip.grams.compute import aggregate
-from fleet_slip.grams.drive_sums import Fixes, counts_of, wide_grams
+from fleet_slip.grams.compute import Fixes, aggregate, counts_of, wide_grams
 from fleet_slip.regression.gram import Gram
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS, configs_with

@@ -22,8 +22,7 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.columns.drive_columns import BLOCK_ROWS, ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.errors import DataError, QuestionError
-from fleet_slip.grams.compute import aggregate, by_sql, gram_statement
-from fleet_slip.grams.drive_sums import wide_grams
+from fleet_slip.grams.compute import aggregate, by_sql, gram_statement, wide_grams
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.verify import grams_of
 from fleet_slip.regression.gram import Gram
