@@ -142,13 +142,6 @@ def test_a_value_with_a_name_is_no_number(tmp_path: Path) -> None:
     assert log.drives["sideslip"].to_pylist() == expected
 
 
-def test_names_of_values_can_be_a_condition(tmp_path: Path) -> None:
-    frames = [motion(i, state="on" if i < 30 else "off") for i in range(50)]
-    text = 'where = [{ column = "Motion.state", one_of = ["on"] }]\n' + MAPPING
-    log = read(write_trace(tmp_path, frames), text)
-    assert (log.counts.rows_kept, log.counts.rows_left_out) == (30, 20)
-
-
 def test_a_message_on_two_buses_must_be_told_apart(tmp_path: Path) -> None:
     frames = [frame for i in range(50) for frame in (motion(i, 1), motion(i, 2, ax=0.0))]
     file = write_trace(tmp_path, frames)

@@ -16,7 +16,7 @@ from fleet_slip.errors import InputError
 from fleet_slip.ingest import batches
 from fleet_slip.ingest import checked_columns as checking
 from fleet_slip.ingest.formats import csv as csv_batches
-from fleet_slip.ingest.formats import source, tables
+from fleet_slip.ingest.formats import source
 from fleet_slip.ingest.formats.csv import BLOCK_BYTES
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.reading import open_source
@@ -304,21 +304,6 @@ def test_a_row_group_that_is_a_whole_file_is_not_in_memory_as_a_whole(tmp_path: 
         assert pa.total_allocated_bytes() - before < values.nbytes / 2
 
 
-def test_a_list_is_refused_before_it_is_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two rows may hold millions of equal values in a few bytes."""
-    values = pa.ListArray.from_arrays(pa.array([0, 1, 3_000_000], pa.int32()), np.zeros(3_000_000))
-    table = pa.table({"t": [0.0, 0.01], "ax": values, "beta": [0.0, 0.0]})
-    pq.write_table(table, tmp_path / "log.parquet")
-    monkeypatch.setattr(tables, "plain_column", None)
-    with pytest.raises(InputError, match=r"column .ax. has the type list"):
-        read_measured(tmp_path / "log.parquet", a_mapping())
-    pq.write_table(table.slice(0, 1), tmp_path / "log.parquet")
-    with pytest.raises(InputError, match=r"has the type list<.*, which is neither a number"):
-        read_measured(tmp_path / "log.parquet", a_mapping())
-
-
 TEXT = csv_text(good_columns(200)).encode()
 
 
@@ -376,24 +361,6 @@ def test_a_file_that_becomes_far_more_than_it_is_is_refused(
     monkeypatch.setattr(source, "FREE_ROWS", 10**6)
     monkeypatch.setattr(source, "FREE_BYTES", 10_000)
     assert "it decompresses to more than" in refusal(tmp_path, bomb)
-
-
-@pytest.mark.parametrize("in_memory", [1, 2**20])
-def test_pieces_come_back_by_key_and_no_file_has_a_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
-) -> None:
-    monkeypatch.setattr(source, "IN_MEMORY_BYTES", in_memory)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    kept = Spool()
-    for number in range(10):
-        kept.add(number % 3, b"%d" % number * number)
-    assert list(kept.read(1)) == [b"1", b"4444", b"7777777"]
-    assert list(tmp_path.iterdir()) == []
-    kept.clear()
-    assert list(kept.read(1)) == []
-    kept.add(1, b"again")
-    assert list(kept.read(1)) == [b"again"]
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_full_disk_is_an_error_that_names_the_folder(

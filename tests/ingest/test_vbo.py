@@ -161,17 +161,6 @@ def test_what_a_file_lacks_is_said(tmp_path: Path, old: str, new: str, message: 
         assert read_measured(tmp_path / "a.vbo", dated).drives["day"][0].as_py() == DRIVE["day"]
 
 
-def test_a_mapping_that_reads_it_as_csv_still_does(tmp_path: Path) -> None:
-    text = write(tmp_path / "a.vbo")
-    lines = text.split("\n")
-    csv = {"header_line": lines.index("[column names]") + 2, "data_line": lines.index("[data]") + 2}
-    clock = {"column": "time", "unit": None, "format": "%H%M%S%.f"}
-    as_csv = mapping(csv={"separator": " ", **csv}, time=clock, drive=DRIVE)
-    rows, also = (read_measured(tmp_path / "a.vbo", one) for one in (mapping(), as_csv))
-    for name in ("tick", "ay", "yaw_rate", "vehicle_speed"):
-        assert rows.drives[name].to_pylist() == also.drives[name].to_pylist()
-
-
 def test_the_mapping_of_the_page_is_one(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text("utf-8")
     toml = page.partition("## VBO")[2].partition("```toml")[2].partition("```")[0]

@@ -5,66 +5,15 @@ import datetime
 import json
 import random
 from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
-WORDS = (
-    "",
-    "..",
-    "../../etc/passwd",
-    "/etc/passwd",
-    "'; DROP TABLE logs; --",
-    "' OR '1'='1",
-    '"',
-    "a\nb",
-    "a\r\nerror: forged",
-    "\x1b[2J",
-    "\0",
-    "{label}",
-    "%s%n",
-    "$root",
-    "*",
-    "[a-z]",
-    "ax",
-    "tick",
-    "select",
-    "Ünïcödé ✓",
-    "\u202egnp.csv",
-    "é" * 300,
-    "x" * 5000,
-    "nan",
-    "-inf",
-    "1e308",
-    "true",
-    "2024-13-45",
-    "file:///etc/passwd",
-    "http://127.0.0.1:9/x",
-    "C:\\x",
-    ".hidden",
-    "-rf",
-)
+_VALUES = json.loads((Path(__file__).parents[2] / "data" / "hostile_values.json").read_text())
+WORDS: tuple[str, ...] = (*_VALUES["words"], "é" * 300, "x" * 5000)
 """Names and texts that have broken programs."""
 
-NUMBERS = (
-    0,
-    -1,
-    1,
-    2**15,
-    2**31,
-    2**63,
-    2**64,
-    -(2**63) - 1,
-    10**30,
-    0.0,
-    -0.0,
-    0.1,
-    1e308,
-    -1e308,
-    5e-324,
-    float("nan"),
-    float("inf"),
-    float("-inf"),
-)
-
+NUMBERS: tuple[float, ...] = tuple(_VALUES["numbers"])
+"""Numbers that have: the integers first, then floats."""
 
 HUGE = "@huge"
 """Stands for an integer of more digits than Python converts."""
