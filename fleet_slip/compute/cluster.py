@@ -14,14 +14,12 @@ import time
 import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future, InvalidStateError
-from contextvars import copy_context
+from concurrent.futures import CancelledError, Executor, Future
 from dataclasses import dataclass
 from functools import cache, partial
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from threading import Event, Thread
 from typing import Any
 
 import dask
@@ -32,7 +30,7 @@ from distributed.comm.addressing import resolve_address
 from distributed.scheduler import KilledWorker
 from distributed.versions import VersionMismatchWarning
 
-from fleet_slip.compute.tasks import LostTaskError
+from fleet_slip.compute.tasks import POLL_S
 from fleet_slip.errors import ClusterError, FleetSlipError, RefusedError, StorageError
 from fleet_slip.resources import folder
 from fleet_slip.storage.folder import Folder
@@ -56,7 +54,7 @@ SHIPPED = (".py", ".sql", ".toml")
 IN_FLIGHT_MIN = 8
 """Minimum number of concurrent tasks: more workers may be starting."""
 
-POLL_S = 1.0
+LOST = "the connection to the Dask scheduler was lost"
 PATIENCE_S = 120.0
 """Maximum time without workers, in s: a container may take that long to start."""
 
@@ -138,95 +136,58 @@ def _marker(root: Folder) -> Iterator[Marker]:
 
 
 class ClusterExecutor(Executor):
-    """Runs tasks on a Dask cluster. A future raises `LostTaskError` if its workers died.
+    """Runs tasks on a Dask cluster."""
 
-    If the scheduler is lost, or no worker comes, all futures raise `ClusterError`.
-    """
+    lost_task = KilledWorker
+    """Error of a task whose workers died."""
 
     def __init__(self, client: Client, address: str, marker: Marker) -> None:
-        self.workers = 0
-        self._threads = 0
         self._client, self._address, self._marker = client, address, marker
         self._dask = client.get_executor(pure=False)
-        self._futures: set[Future[Any]] = set()
-        self._last_seen_s = time.monotonic()
-        self._closing = Event()
-        self._count_workers()
-        self._watcher = Thread(target=copy_context().run, args=(self._watch,), daemon=True)
-        self._watcher.start()
+        self._threads, self._looked_s, self._last_seen_s = 0, 0.0, time.monotonic()
 
     @property
     def in_flight(self) -> int:
-        """Number of concurrent tasks that keeps the workers busy."""
+        """Number of concurrent tasks that keeps the workers busy; counted once a second.
+
+        Raises `ClusterError` if the scheduler is lost, or no worker comes.
+        """
+        now = time.monotonic()
+        if now - self._looked_s < POLL_S:
+            return max(IN_FLIGHT_MIN, 2 * self._threads)
+        self._looked_s = now
+        if self._client.status == "closed":
+            raise self._error(LOST)
+        if self._client.status == "running":
+            with contextlib.suppress(OSError, TimeoutError):  # the client connects again, or closes
+                self._threads = sum(self._client.nthreads().values())
+                self._last_seen_s = now if self._threads else self._last_seen_s
+        if now - self._last_seen_s > PATIENCE_S:
+            raise self._error(f"the cluster has had no worker for {now - self._last_seen_s:.0f} s")
         return max(IN_FLIGHT_MIN, 2 * self._threads)
 
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+    def submit(self, function: Callable[..., Any], /, *args: Any, **_: Any) -> Future[Any]:
         """Run a function of one argument on a worker."""
-        if kwargs or len(args) != 1:
-            raise TypeError("a task on a cluster is a function and its one argument")
-        task = pickled(self._marker, function, args[0])
-        future: Future[Any] = Future()
-        self._futures.add(future)
-        with contextlib.suppress(ClosedClientError):  # the watcher fails it
-            remote_future = self._dask.submit(work, environment(), task)
-            remote_future.add_done_callback(partial(self._settle, future))
-            future.add_done_callback(
-                lambda local_future: local_future.cancelled() and remote_future.cancel()
-            )
+        (item,) = args
+        try:
+            task = pickled(self._marker, function, item)
+            future: Future[Any] = self._dask.submit(work, environment(), task)
+        except ClosedClientError:
+            raise self._error(LOST) from None
         return future
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: ARG002
-        """Cancel all tasks: a caller that leaves before their end has failed."""
-        self._closing.set()
-        self._watcher.join()
-        for future in list(self._futures):
-            future.cancel()
-
-    def _settle(self, future: Future[Any], remote_future: Future[Any]) -> None:
-        if remote_future.cancelled():  # with its connection; or by us
-            self._fail(future, "the connection to the Dask scheduler was lost")
-            return
-        self._futures.discard(future)
-        error = remote_future.exception()
-        if isinstance(error, KilledWorker):
-            error = LostTaskError(str(error))
-        with contextlib.suppress(InvalidStateError):  # it was given up
-            if error is not None:
-                future.set_exception(error)
-            else:
-                future.set_result(remote_future.result())
-
-    def _watch(self) -> None:
-        while not self._closing.wait(POLL_S):
-            status, problem = self._client.status, ""
-            if status == "closed":
-                problem = "the connection to the Dask scheduler was lost"
-            elif status == "running":
-                self._count_workers()
-            waited_s = time.monotonic() - self._last_seen_s
-            if waited_s > PATIENCE_S:
-                problem = problem or f"the cluster has had no worker for {waited_s:.0f} s"
-            for future in list(self._futures) if problem else ():
-                self._fail(future, problem)
-
-    def _count_workers(self) -> None:
+    def result(self, future: Future[Any]) -> Any:
+        """Return the result of a task. Raises `ClusterError` if the scheduler is lost."""
         try:
-            threads = self._client.nthreads()
-        except (OSError, TimeoutError):
-            return  # the client connects again, or closes
-        self.workers, self._threads = len(threads), sum(threads.values())
-        if threads:
-            self._last_seen_s = time.monotonic()
+            return future.result()
+        except CancelledError:
+            raise self._error(LOST) from None
 
-    def _fail(self, future: Future[Any], reason: str) -> None:
-        self._futures.discard(future)
-        with contextlib.suppress(InvalidStateError):
-            future.set_exception(
-                ClusterError(
-                    f"{self._address}: {reason}. Finished work is kept: check the cluster, and "
-                    "run the same command again."
-                )
-            )
+    def _error(self, reason: str) -> ClusterError:
+        return ClusterError(
+            f"{self._address}: {reason}. Finished work is kept: check the cluster, and run the "
+            "same command again."
+        )
 
 
 def pickled(marker: Marker, function: Callable[[Any], Any], item: Any) -> bytes:

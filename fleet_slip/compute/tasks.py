@@ -1,7 +1,7 @@
 """Execution of tasks on threads or in an executor.
 
-An executor on other machines may define `in_flight`, its number of concurrent tasks, and raise
-`LostTaskError`.
+An executor on other machines may define `in_flight`, its number of concurrent tasks, `lost_task`,
+the error of a task whose workers died, and `result`, which returns the result of a future.
 """
 
 from collections import deque
@@ -24,15 +24,14 @@ IN_FLIGHT = 4
 
 NAMED_MAX = 5
 
+POLL_S = 1.0
+"""Interval at which a cluster is looked at, in s."""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 AHEAD = 2
 """Items to read in advance."""
-
-
-class LostTaskError(BrokenExecutor):
-    """Every process that ran the task died."""
 
 
 class LocalThreads(ThreadPoolExecutor):
@@ -64,6 +63,8 @@ def run_tasks(
             yield item, function(item)
         return
     pending, lost = iter(items), []
+    lost_task = getattr(executor, "lost_task", BrokenExecutor)
+    result_of = getattr(executor, "result", Future.result)
     futures: dict[Future[Result], Item] = {}
     try:
         while True:
@@ -71,11 +72,11 @@ def run_tasks(
                 futures[executor.submit(function, item)] = item
             if not futures:
                 break
-            for future in wait(futures, return_when=FIRST_COMPLETED).done:
+            for future in wait(futures, POLL_S, FIRST_COMPLETED).done:
                 item = futures.pop(future)
                 try:
-                    result = future.result()
-                except LostTaskError:
+                    result = result_of(future)
+                except lost_task:
                     lost.append(name_of(item))
                 else:
                     yield item, result
