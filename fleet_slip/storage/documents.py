@@ -242,21 +242,23 @@ def accept_losses(root: Folder, paths: Iterable[str]) -> list[str]:
 
     Raises `QuestionError` if nothing is lost there.
     """
+    lost = {
+        f"{folder.path}/{document_file(number)}": (folder, number)
+        for folder in document_folders(root)
+        for number in folder.inventory().lost
+    }
     accepted = []
     for path in paths:
-        for folder in document_folders(root):
-            files = {f"{folder.path}/{document_file(n)}": n for n in folder.inventory().lost}
-            chosen = [file for file in files if path.rstrip("/") in (file, folder.path)]
-            for file in chosen:
-                folder.accept_loss(files[file])
-            accepted += chosen
-            if chosen:
-                break
-        else:
+        chosen = [f for f, (folder, _) in lost.items() if path.rstrip("/") in (f, folder.path)]
+        if not chosen:
             raise QuestionError(
                 f"{path}: no document is missing there. Name a file that verify reports as "
                 "missing; delete a damaged one first."
             )
+        for file in chosen:
+            folder, number = lost[file]
+            folder.accept_loss(number)
+        accepted += chosen
     return accepted
 
 
