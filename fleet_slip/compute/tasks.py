@@ -55,14 +55,36 @@ def run_tasks(
 ) -> Iterator[tuple[Item, Result]]:
     """Call a function on items; yield each item with its result on completion, in any order.
 
-    Without an executor, calls run in this thread. Raises `ClusterError` at the end with the tasks
-    whose workers died; any other error ends the iteration.
+    Without an executor, calls run in this thread. Tasks whose workers died are repeated one at a
+    time at the end, since any task of a worker may have killed it. Raises `ClusterError` with the
+    tasks that failed again; any other error ends the iteration.
     """
     if executor is None:
         for item in items:
             yield item, function(item)
         return
-    pending, lost = iter(items), []
+    suspects: list[Item] = []
+    lost: list[Item] = []
+    yield from _completed(executor, function, items, suspects)
+    for item in suspects:
+        yield from _completed(executor, function, [item], lost)
+    if lost:
+        more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
+        raise ClusterError(
+            f"{', '.join(map(name_of, lost[:NAMED_MAX]))}{more}: every worker that tried it died, "
+            "often out of memory; see the workers' logs. Everything else is done. Give the workers "
+            "more memory, and run the same command again."
+        )
+
+
+def _completed(
+    executor: Executor,
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    lost: list[Item],
+) -> Iterator[tuple[Item, Result]]:
+    """Yield items with their results; add those whose workers died to `lost`."""
+    pending = iter(items)
     lost_task = getattr(executor, "lost_task", BrokenExecutor)
     result_of = getattr(executor, "result", Future.result)
     futures: dict[Future[Result], Item] = {}
@@ -71,25 +93,18 @@ def run_tasks(
             for item in islice(pending, max(0, in_flight(executor) - len(futures))):
                 futures[executor.submit(function, item)] = item
             if not futures:
-                break
+                return
             for future in wait(futures, POLL_S, FIRST_COMPLETED).done:
                 item = futures.pop(future)
                 try:
                     result = result_of(future)
                 except lost_task:
-                    lost.append(name_of(item))
+                    lost.append(item)
                 else:
                     yield item, result
     finally:
         for future in futures:
             future.cancel()
-    if lost:
-        more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
-        raise ClusterError(
-            f"{', '.join(lost[:NAMED_MAX])}{more}: every worker that tried it died, often out of "
-            "memory; see the workers' logs. Everything else is done. Give the workers more memory, "
-            "and run the same command again."
-        )
 
 
 def read_ahead(items: Iterator[Item]) -> Generator[Item, None, None]:

@@ -79,6 +79,7 @@ def test_a_task_that_kills_every_worker_is_named_and_the_rest_is_done(
             done[order.name] = result
     assert caught.value.exit_code == 11
     assert done == {order.name: order.name.upper() for order in items if not order.deadly}
+    assert len(items[1].started_in) == 2  # among others, and alone
 
 
 def test_a_scheduler_that_is_restarted_ends_the_command(
