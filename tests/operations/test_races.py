@@ -216,7 +216,7 @@ def test_no_gram_row_of_a_forgotten_car_lands_after_the_erasure(
     assert not mentions(tmp_path, "beta")
 
 
-def test_vacuum_does_not_move_what_took_the_place_of_a_leftover(
+def test_vacuum_does_not_remove_what_took_the_place_of_a_leftover(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warehouse = Warehouse(LocalFolder(tmp_path / "data"))

@@ -134,7 +134,7 @@ def test_a_changed_line_of_the_history_is_a_problem_and_all_else_is_told(
     (history,) = (path_of(warehouse.root) / "runs").iterdir()
     history.write_text(history.read_text().replace('"done"', '"gone"'))
     found = status_of(warehouse)
-    assert found.problems == (f"runs/{history.name}: line 4 was changed or damaged",)
+    assert found.problems == (f"runs/{history.name}: line 4 was changed or torn",)
     assert (found.last_runs, found.tables["logs"].rows) == ((), 50)
 
 
