@@ -90,8 +90,9 @@ def code_folder(digest: str) -> Path | None:
         base = Path(chosen or cache_folder("compiled")).resolve()
         folder = base / f"{PREFIX}{digest}"
         new = not folder.is_dir()
-        base.mkdir(0o700, parents=True, exist_ok=True)
-        folder.mkdir(0o700, exist_ok=True)
+        for parent in reversed([folder, *folder.parents]):
+            if not parent.is_dir():
+                parent.mkdir(0o700, exist_ok=True)
         _require_own(folder)
     except OSError as error:
         LOGGER.warning(
@@ -136,14 +137,15 @@ def _imported(file: Path) -> list[Path]:
 
 def _require_own(folder: Path) -> None:
     """Raise `OSError` if other users can write or replace a folder, or if its disk is full."""
-    for place in (folder, folder.parent):
-        status = place.stat(follow_symlinks=False)
-        # In a sticky folder such as /tmp, only owners can rename.
-        by_others = status.st_mode & 0o022 and (
-            place == folder or not status.st_mode & stat.S_ISVTX
-        )
-        if by_others or status.st_uid not in (os.getuid(), 0):
-            raise PermissionError(f"other users can write {place}")
+    for parent in (folder, *folder.parents):
+        status = parent.stat(follow_symlinks=False)
+        if parent == folder:
+            safe = status.st_uid == os.getuid() and not status.st_mode & 0o022
+        else:  # in a sticky folder such as /tmp, only owners can rename
+            by_others = status.st_mode & 0o022 and not status.st_mode & stat.S_ISVTX
+            safe = status.st_uid in (os.getuid(), 0) and not by_others
+        if not safe:
+            raise PermissionError(f"other users can write {parent}")
     space = os.statvfs(folder)
     if space.f_bavail * space.f_frsize < LEAST_FREE_BYTES or not os.access(folder, os.W_OK):
         raise OSError(f"{folder} cannot be written, or its disk is full")

@@ -38,6 +38,8 @@ ATTEMPTS = 1000
 T = TypeVar("T")
 
 MAX_DIGITS = 9
+MAX_DEPTH = 100
+"""Levels of a document. Python's own limit for JSON differs between its versions."""
 
 _NUMBER = re.compile(rf"([1-9][0-9]{{0,{MAX_DIGITS - 1}}})\.(json|sha256|lost)")
 
@@ -117,7 +119,8 @@ class DocumentFolder:
         file = self.file(number)
         text = self.folder.read(document_file(number))
         try:
-            envelope = json.loads(text)
+            envelope = json.loads(text, object_pairs_hook=_object_of_different_keys)
+            _require_depth(envelope)
             document = Document(number, envelope["content"], checksum(envelope["content"]))
             place = {key: envelope[key] for key in ("format", "folder", "number")}
             is_intact = envelope["sha256"] == _seal(place, document.sha256)
@@ -266,6 +269,29 @@ def _numbers_in(names: list[str], kind: str) -> set[int]:
     """Return the numbers in the names of files of a kind: json, sha256 or lost."""
     matches = map(_NUMBER.fullmatch, names)
     return {int(match[1]) for match in matches if match and match[2] == kind}
+
+
+def _object_of_different_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object. Raises `ValueError` for a key that appears twice."""
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError("a key appears twice")
+    return members
+
+
+def _require_depth(value: Any) -> None:
+    """Raise `ValueError` for JSON that is nested more than `MAX_DEPTH` levels."""
+    level = [value]
+    for _ in range(MAX_DEPTH):
+        level = [
+            child
+            for parent in level
+            if isinstance(parent, dict | list)
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+        ]
+        if not level:
+            return
+    raise ValueError("nested too deeply")
 
 
 def document_file(number: int) -> str:

@@ -117,6 +117,11 @@ def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
     assert found_by(cache, monkeypatch) is None
     assert f"other users can write {cache}" in caplog.text
     cache.chmod(0o700)
+    (tmp_path / "link").symlink_to(cache)
+    tmp_path.chmod(0o777)
+    assert found_by(tmp_path / "link", monkeypatch) is None
+    assert f"can write {tmp_path}" in caplog.text
+    tmp_path.chmod(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(kept(cache, ".nbi")))  # no folder
     assert compiling.code_folder.__wrapped__("0") is None
 

@@ -71,6 +71,8 @@ def forge(registry: Registry, kind: str, **changes: Any) -> None:
         {"trained_on": {"cohort": "true", "drives": -1, "rows": 1}},
         {"cross_validation": {"rmse_deg": -1}},
         {"cross_validation": {"correlation": 2}},
+        {"cross_validation": {"error_mean_deg": -1e9}},
+        {"trained_on": {"rows": 0}},
     ],
 )
 def test_a_forged_manifest_is_refused(registry: Registry, changes: dict[str, Any]) -> None:
@@ -106,6 +108,7 @@ def test_a_forged_history_is_refused(registry: Registry, changes: dict[str, Any]
         '{"content": ' + "[" * 5000 + "]" * 5000 + ', "sha256": ""}',
         '{"content": ' + "9" * 5000 + ', "sha256": ""}',
         '{"content": NaN, "sha256": ""}',
+        '{"content": {}, "content": {}, "sha256": ""}',  # which of the two would be read?
         '{"content": "\\ud800", "sha256": ""}',
         "[]",
         "",
