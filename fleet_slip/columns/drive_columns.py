@@ -320,8 +320,8 @@ def _signed(size: Any, sign_of: Any) -> Any:
 
 def _nearest(a: Any, b: Any) -> Any:
     """Return a / b to the nearest integer, halves away from zero."""
-    size = np.asarray(2.0 * np.abs(a) + b)
-    size /= 2.0 * b
+    size = np.asarray(np.abs(a) + 0.5 * b)  # exact below 2^52
+    size /= b
     np.floor(size, out=size)
     return np.copysign(size, a, out=size)
 
@@ -375,16 +375,16 @@ class _RunningSum:
         self.rows, self.gapless = 0, True
 
     def add(self, values: FloatArray) -> None:
-        missing = np.isnan(values)
         before, self.rows = self.rows, self.rows + len(values)
         sums, counts = (totals[before + 1 : self.rows + 1] for totals in (self.sums, self.counts))
-        if missing.any():
+        np.cumsum(values, out=sums)
+        if np.isnan(sums[-1]):
+            missing = np.isnan(values)
             self.gapless = False
-            values = np.where(missing, 0.0, values)
+            np.cumsum(np.where(missing, 0.0, values), out=sums)
             np.cumsum(~missing, out=counts)
         else:
             counts[:] = np.arange(1, len(values) + 1)
-        np.cumsum(values, out=sums)
         sums += self.sums[before]
         counts += self.counts[before]
 
