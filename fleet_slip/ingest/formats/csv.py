@@ -3,7 +3,7 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from functools import cached_property
 from io import BufferedReader, BytesIO
 from itertools import islice
@@ -100,9 +100,9 @@ class CsvSource(Source):
         """Return the position of a column. Raises `InputError`."""
         return "", find_column(self._file, [channel.name for channel in self._header], column)
 
-    def _cleaned(self, block: bytes, _start: int) -> bytes:
-        """Return a block with the separators of CSV in its lines from a position on."""
-        return block
+    def _cleaned(self, lines: bytes) -> bytes:
+        """Return lines with the separators of CSV."""
+        return lines
 
     def read(self, _base: str, places: dict[str, int]) -> Iterator[pl.DataFrame]:
         """Yield the columns as text or plain numbers, and `EXTRA_FIELDS`.
@@ -112,18 +112,48 @@ class CsvSource(Source):
         with self._file.open("rb") as stream:
             plain = text_of(stream, self.csv_format)
             names = [channel.name for channel in self._read_header(plain)]
-            numbers = set(self._numbers.columns & set(places))
-            padding, unfolded = self._padding(names), 0
-            for block in _whole_lines(plain, self._file, padding, self._cleaned):
+            numbers, unfolded = set(self._numbers.columns & set(places)), 0
+            for block in self._blocks(plain, len(names)):
                 if not unfolded:
-                    self._require_fields(block[len(padding) :], names)
-                unfolded += len(block) - len(padding)
+                    self._require_fields(block, names)
+                unfolded += len(block)
                 self._budget.require_unfolded(unfolded)
-                for lines, header in self._split_at_headers(block, padding, names):
+                for lines, header in self._split_at_headers(block, names):
                     yield self._parse_lines(lines, len(names), places, numbers)
                     if header:
                         places = {name: find_column(self._file, header, name) for name in places}
                         names = header
+
+    def _blocks(self, stream: BinaryIO, width: int) -> Iterator[bytes]:
+        """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one."""
+        remainder = before = b""
+        while more := stream.read(BLOCK_BYTES):
+            block = remainder + more
+            end = _end_of_lines(block)
+            if not end and len(block) > LINE_BLOCKS * BLOCK_BYTES:
+                raise InputError(
+                    f"{quote_name(self._file)}: a line is longer than "
+                    f"{LINE_BLOCKS * BLOCK_BYTES:,} bytes. Is a quote not closed?"
+                )
+            remainder = block[end:]
+            if end:
+                lines = self._cleaned(block[:end])
+                _require_text(lines, self._file)
+                before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
+                yield lines
+        if remainder:
+            _require_text(remainder, self._file)
+            yield self._with_cut_marked(self._cleaned(remainder), before, width)
+
+    def _with_cut_marked(self, line: bytes, before: bytes, width: int) -> bytes:
+        """Return the last line, with `CUT` in `EXTRA_FIELDS` if it has fewer fields than others."""
+        separator = self.csv_format.separator.encode()
+        separators = line.count(separator)
+        if not line.strip() or b'"' in before + line:
+            return line
+        if separators >= min(before.count(separator), width - 1):
+            return line
+        return line + separator * (width - separators) + f'"{CUT}"'.encode()
 
     def _require_fields(self, lines: bytes, names: list[str]) -> None:
         """Raise `InputError` if all first rows have fewer fields than there are names.
@@ -141,40 +171,28 @@ class CsvSource(Source):
                 "or set header_line and separator under [csv] in the mapping."
             )
 
-    def _padding(self, names: list[str]) -> bytes:
-        """Return a line of separators before a block.
-
-        It fixes the number of fields, and keeps a block from looking like a compressed file.
-        """
-        return self.csv_format.separator.encode() * len(names) + b"\n"
-
     def _split_at_headers(
-        self, block: bytes, first: bytes, names: list[str]
+        self, block: bytes, names: list[str]
     ) -> Iterator[tuple[bytes, list[str] | None]]:
-        """Yield a block of whole lines up to each header in it, and the names of that header.
-
-        `first` is the padding that the block has, of as many fields as the file's first header.
-        """
+        """Yield a block of whole lines up to each header in it, and the names of that header."""
         words = [name for name in names if not _NUMBER.fullmatch(name)]
         probe = max(words, key=len, default="").encode()
-        padding = self._padding(names)
-        start, padding = (0, b"") if padding == first else (len(first), padding)
-        place = block.find(probe, len(first)) if probe else -1
+        start, place = 0, block.find(probe) if probe else -1
         while place >= 0:
             begin = block.rfind(b"\n", 0, place) + 1
             end = block.find(b"\n", place) + 1 or len(block)
             fields = _fields(block[begin:end].decode().rstrip("\r\n"), self.csv_format)
             header = [channel.name for channel in described(fields or [])]
             if len(set(header) & set(names)) >= max(2, len(set(names)) / 2):
-                yield padding + block[start:end], header
-                start, padding = end, self._padding(header)
+                yield block[start:end], header
+                start = end
             place = block.find(probe, end)
-        yield padding + block[start:], None
+        yield block[start:], None
 
     def _parse_lines(
         self, block: bytes, width: int, places: dict[str, int], numbers: set[str]
     ) -> pl.DataFrame:
-        """Parse lines after one of padding; remove columns with other values from `numbers`."""
+        """Parse lines; remove columns with other values from `numbers`."""
         # Reading on over bad numbers is reading on over bad quotes. Beside a decimal comma a point
         # groups digits, but Polars reads it as one.
         grouped = self.csv_format.decimal_comma and b"." in block
@@ -190,12 +208,17 @@ class CsvSource(Source):
     def _parse(
         self, block: bytes, width: int, positions: dict[str, int], numbers: Set[str]
     ) -> pl.DataFrame:
-        """Parse all lines but the first. Columns are read by position: Polars renames doubles."""
+        """Parse lines. Columns are read by position: Polars renames doubles.
+
+        A line of separators before them fixes the number of fields, and keeps a block from looking
+        like a compressed file.
+        """
+        padding = self.csv_format.separator.encode() * width + b"\n"
         fields = [f"column {i}" for i in range(width)] + [EXTRA_FIELDS]
         schema: dict[str, type[pl.DataType]] = dict.fromkeys(fields, pl.String)
         schema |= {fields[positions[name]]: pl.Float64 for name in numbers}
         frame = pl.scan_csv(
-            BytesIO(block),
+            BytesIO(padding + block),
             has_header=False,
             separator=self.csv_format.separator,
             schema=schema,
@@ -212,20 +235,16 @@ def _csv_header(stream: BinaryIO, file: Path, csv_format: CsvFormat) -> list[str
     for _ in range(csv_format.header_line - 1):
         stream.readline(MAX_LINE_BYTES)
     line = stream.readline(MAX_LINE_BYTES + 1)
-    if not line.strip():
-        number = "first line" if csv_format.header_line == 1 else f"line {csv_format.header_line}"
-        raise InputError(
-            f"{quote_name(file)}: {f'its {number} is' if line else 'it is'} empty. Export it again."
-        )
-    if len(line) > MAX_LINE_BYTES:
-        raise InputError(
-            f"{quote_name(file)}: the header is longer than {MAX_LINE_BYTES:,} bytes. Is it a CSV "
-            "file?"
-        )
-    text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
-    names = _fields(text, csv_format)
+    names = None
+    if line.strip() and len(line) <= MAX_LINE_BYTES:
+        text = _decode(line.removeprefix(b"\xef\xbb\xbf"), file).rstrip("\r\n")
+        names = _fields(text, csv_format)
     if names is None:
-        raise InputError(f"{quote_name(file)}: its header is not CSV: a quote is not closed.")
+        raise InputError(
+            f"{quote_name(file)}: its line {csv_format.header_line} is no header of CSV: it is "
+            f"empty, has an open quote, or is longer than {MAX_LINE_BYTES:,} bytes. Export it "
+            "again, or set header_line under [csv] in the mapping."
+        )
     for _ in range(csv_format.header_line + 1, csv_format.data_line or 0):
         stream.readline(MAX_LINE_BYTES)
     return names
@@ -258,45 +277,6 @@ def _fields(line: str, csv_format: CsvFormat) -> list[str] | None:
         return next(csv.reader([line], delimiter=csv_format.separator, strict=True), [])
     except csv.Error:
         return None
-
-
-def _whole_lines(
-    stream: BinaryIO, file: Path, padding: bytes, clean: Callable[[bytes, int], bytes]
-) -> Iterator[bytes]:
-    """Yield blocks of UTF-8 that end with a line; a line break in quotes does not end one.
-
-    Each begins with the padding, a line of its own: put here, the block is not copied for it.
-    """
-    remainder = before = padding
-    while more := stream.read(BLOCK_BYTES):
-        block = remainder + more
-        end = _end_of_lines(block)
-        if end > len(padding):
-            lines, remainder = clean(block[:end], len(padding)), padding + block[end:]
-            _require_text(lines, file)
-            before = lines[lines.rfind(b"\n", 0, -1) + 1 :]
-            yield lines
-            continue
-        if len(block) > LINE_BLOCKS * BLOCK_BYTES:
-            raise InputError(
-                f"{quote_name(file)}: a line is longer than {LINE_BLOCKS * BLOCK_BYTES:,} bytes. "
-                "Is a quote not closed?"
-            )
-        remainder = block
-    if len(remainder) > len(padding):
-        _require_text(remainder, file)
-        yield _with_cut_marked(clean(remainder, len(padding)), before, padding)
-
-
-def _with_cut_marked(line: bytes, before: bytes, padding: bytes) -> bytes:
-    """Return the last line; a cut one has `CUT` in `EXTRA_FIELDS`."""
-    last, separator, fields = line[len(padding) :], padding[:1], len(padding) - 1
-    separators = last.count(separator)
-    if not last.strip() or b'"' in before + last:
-        return line
-    if separators >= min(before.count(separator), fields - 1):
-        return line
-    return line + separator * (fields - separators) + f'"{CUT}"'.encode()
 
 
 def _end_of_lines(block: bytes) -> int:

@@ -77,10 +77,10 @@ class VboSource(CsvSource):
         super()._read_header(stream)
         return described(self._lines[self.csv_format.header_line - 1].split())
 
-    def _cleaned(self, block: bytes, start: int) -> bytes:
-        """Return a block with one blank between fields, and none around them."""
-        lines = _BLANKS.sub(b" ", block[start:]) if _BLANKS.search(block, start) else block[start:]
-        return block[:start] + _AROUND.sub(rb"\1", lines)
+    def _cleaned(self, lines: bytes) -> bytes:
+        """Return lines with one blank between fields, and none around them."""
+        single = _BLANKS.sub(b" ", lines) if _BLANKS.search(lines) else lines
+        return _AROUND.sub(rb"\1", single)
 
     def _section(self, name: str) -> list[str]:
         """Return the lines of a section up to an empty one, none where there is no such section."""
