@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Container, Iterable
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -32,6 +33,7 @@ from fleet_slip.config import (
 )
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import (
+    CHOOSE,
     WHEEL_PREFIX,
     OffsetM,
     RowCondition,
@@ -197,6 +199,13 @@ class DriveMetadata(Config):
     receiver: OptionalFact = None
     adhesion: PositiveFloat | Elsewhere | None = None
 
+    @field_validator("day", mode="before")
+    @classmethod
+    def _day_is_set(cls, day: Any) -> Any:
+        if day == CHOOSE:
+            raise ValueError("is missing, and the time has no date: set a date, a column or a path")
+        return day
+
 
 class FilePattern(Config):
     """One of several files of a drive: those whose paths have equal texts at {}."""
@@ -255,6 +264,16 @@ class Mapping(Config):
             raise ValueError(f"write it as tables: {example}")  # noqa: TRY004 - as of pydantic
         return where
 
+    @model_validator(mode="before")
+    @classmethod
+    def _asks_for_the_day(cls, content: Any) -> Any:
+        """Mark a missing day, so that it is refused together with other missing keys."""
+        with suppress(AttributeError, KeyError, TypeError, ValidationError):
+            drive, time = content["drive"], TimeBase.model_validate(content.get("time", {}))
+            if drive.get("day") is None and not time.is_dated:
+                return {**content, "drive": {**drive, "day": CHOOSE}}
+        return content
+
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Mapping":
         self._signal_catalog = signals_of(info)
@@ -269,10 +288,6 @@ class Mapping(Config):
         require_satellites(self.signals)
         if self.label is not None:
             self.label.require_signals(self.signals, self._signal_catalog.label)
-        if self.drive.day is None and not self.time.is_dated:
-            raise ValueError(
-                "drive.day is missing, and the time has no date. Set a date, a column or a path"
-            )
         if self.file and not self.time.own_clock:
             raise ValueError("file: set own_clock = true under [time]; each file has its own times")
         for name, signal in self.signals.items():

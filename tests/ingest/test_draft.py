@@ -394,3 +394,15 @@ def test_answers_fill_in_what_a_draft_leaves_open(tmp_path: Path) -> None:
     (tmp_path / "log.toml").write_text(text)
     assert load_mapping(str(tmp_path / "log.toml"), CATALOG).drive.vehicle_id == "A7"
     assert answer_key(text, "ay", "") == text
+
+
+def test_a_mapping_names_all_missing_keys_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    pl.DataFrame({"t_s": np.arange(100) / 100, "ay": np.sin(np.arange(100))}).write_csv(file)
+    (tmp_path / "log.toml").write_text(
+        write_draft(draft_mapping(SIGNALS, file, profile_file(file)), "log")
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_mapping(str(tmp_path / "log.toml"), CATALOG)
+    for key in ("drive.day", "drive.vehicle_id", "drive.vehicle_model", "signals.ay.unit"):
+        assert key in str(caught.value)

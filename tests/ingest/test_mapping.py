@@ -100,7 +100,7 @@ def test_canonical_json_does_not_depend_on_the_layout(tmp_path: Path) -> None:
         ('unit = "s"', 'format = "%Q nonsense"', "not a strftime format"),
         ('unit = "s"', 'unit = "s", split_gap_s = 0.01', "longest_gap_s cannot be larger"),
         ('unit = "s"', 'unit = "s", longest_gap_s = nan', "time.longest_gap_s"),
-        ("day = 2024-05-31, ", "", "drive.day is missing"),
+        ("day = 2024-05-31, ", "", "drive.day: is missing"),
         ("2024-05-31", '"tomorrow"', "drive.day"),
         ('"v"', '"  "', "drive.vehicle_id: is empty"),
         ('"v"', f'"{"v" * 201}"', "drive.vehicle_id: has more than 200 characters"),
