@@ -95,31 +95,20 @@ def observer_of(
 def car_of(vehicle: IdentifiedVehicle) -> ObserverCar:
     """Return the numbers of an identified car and its filter."""
     car, noise = vehicle.car, vehicle.noise
-    body, suspension, tyre, yaw = car.body, car.suspension, car.tyre, noise.yaw_rate
-    return ObserverCar(
-        mass_kg=body.mass_kg,
-        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
-        front_axle_m=body.front_axle_m,
-        rear_axle_m=body.rear_axle_m,
-        height_m=body.height_m,
-        track_front_m=body.track_front_m,
-        track_rear_m=body.track_rear_m,
-        front_roll_share=suspension.front_roll_share,
-        roll_lag_s=suspension.roll_lag_s,
-        pitch_lag_s=suspension.pitch_lag_s,
-        stiffness_front_n=tyre.peak_stiffness_n
-        * suspension.front_stiffness_factor
-        * noise.stiffness_front_factor,
-        stiffness_rear_n=tyre.peak_stiffness_n
-        * suspension.rear_stiffness_factor
-        * noise.stiffness_rear_factor,
-        stiffness_load_n=tyre.peak_stiffness_load_n,
-        friction=tyre.friction * noise.adhesion,
-        friction_load_sensitivity=tyre.friction_load_sensitivity,
-        nominal_load_n=tyre.nominal_load_n,
-        **{name: getattr(noise, name) for name in ObserverCar.model_fields if hasattr(noise, name)},
-        **{name: getattr(yaw, name) for name in ObserverCar.model_fields if hasattr(yaw, name)},
-    )
+    suspension, tyre = car.suspension, car.tyre
+    numbers: dict[str, float] = {}
+    for part in (car.body, suspension, tyre, noise, noise.yaw_rate):
+        names = (name for name in ObserverCar.model_fields if hasattr(part, name))
+        numbers |= {name: getattr(part, name) for name in names}
+    front = tyre.peak_stiffness_n * suspension.front_stiffness_factor
+    rear = tyre.peak_stiffness_n * suspension.rear_stiffness_factor
+    numbers |= {
+        "stiffness_front_n": front * noise.stiffness_front_factor,
+        "stiffness_rear_n": rear * noise.stiffness_rear_factor,
+        "stiffness_load_n": tyre.peak_stiffness_load_n,
+        "friction": tyre.friction * noise.adhesion,
+    }
+    return ObserverCar(**numbers)
 
 
 def with_filter(
