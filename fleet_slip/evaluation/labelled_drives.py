@@ -20,7 +20,7 @@ from fleet_slip.evaluation.evaluator import MissingSignalError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.compute import counts_of
 from fleet_slip.models.predict import Predictor
-from fleet_slip.quality.drive_signals import SPEEDS, is_slow
+from fleet_slip.quality.drive_signals import RADIUS_M, SPEEDS, is_slow
 from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.database import reading_files
@@ -33,9 +33,6 @@ QUARTERS = 4
 SPEEDS_MPS = (8.0, 15.0, 25.0)
 LATERAL_MPS2 = (1.0, 2.5, 4.0)
 """Limits between kinds of driving, by mean speed and by root mean square of ay."""
-
-NOMINAL_RADIUS_M = 0.31
-"""Radius of a tyre, to classify kinds of driving."""
 
 Segments = frozenset[tuple[str, int]]
 """Segments held out together: name of a drive, and quarter of its time from 0."""
@@ -118,7 +115,7 @@ class LabelledDrive:
         lateral = _first_logged(signals.ay_mps2)
         words = []
         if len(wheel):
-            words.append(f"{_band(float(wheel.mean()) * NOMINAL_RADIUS_M, SPEEDS_MPS)} m/s")
+            words.append(f"{_band(float(wheel.mean()) * RADIUS_M, SPEEDS_MPS)} m/s")
         if len(lateral):
             size = float(np.sqrt(np.mean(lateral**2)))
             words.append(f"ay {_band(size, LATERAL_MPS2)} m/s²")

@@ -17,6 +17,7 @@ from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
 from fleet_slip.evaluation.test_drives import simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
+from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.resources import Configs
 from fleet_slip.simulation.roads import Track, load_track
 from fleet_slip.simulation.scenario import load_scenario
@@ -164,25 +165,15 @@ def frames_of(
 
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return vx and vy, from a speed and the reference angle if need be. Raises `DataError`."""
-    vx, vy = columns["vx_mps"], columns["vy_mps"]
-    if np.isfinite(vx).any():
-        return np.nan_to_num(vx), np.nan_to_num(vy)
-    wheels = [columns[name] for name in WHEELS]
-    if not np.isfinite(wheels).any():
-        speed = columns["vehicle_speed_mps"]
-        if not np.isfinite(speed).any():
-            raise DataError("the drive has neither a speed nor wheel speeds: nothing can be shown.")
-        return _with_sideslip(np.nan_to_num(speed), columns)
-    logged = np.isfinite(wheels)  # nanmean would warn of a tick without any wheel
-    mean = np.where(logged, wheels, 0.0).sum(axis=0) / np.maximum(logged.sum(axis=0), 1)
-    return _with_sideslip(0.31 * mean, columns)
-
-
-def _with_sideslip(
-    vx_mps: FloatArray, columns: Mapping[str, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return vx, and vy by the reference angle."""
-    return vx_mps, vx_mps * np.tan(np.nan_to_num(columns["sideslip_rad"]))
+    wheels = np.ma.masked_invalid([columns[name] for name in WHEELS]).mean(axis=0) * RADIUS_M
+    speeds = columns["vx_mps"], np.ma.filled(wheels, np.nan), columns["vehicle_speed_mps"]
+    vx = next((speed for speed in speeds if np.isfinite(speed).any()), None)
+    if vx is None:
+        raise DataError("the drive has neither a speed nor wheel speeds: nothing can be shown.")
+    vx, vy = np.nan_to_num(vx), columns["vy_mps"]
+    if not np.isfinite(vy).any():
+        vy = vx * np.tan(np.nan_to_num(columns["sideslip_rad"]))
+    return vx, np.nan_to_num(vy)
 
 
 def _smooth(values: FloatArray) -> FloatArray:

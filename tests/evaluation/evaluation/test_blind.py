@@ -38,14 +38,6 @@ def test_every_hash_has_a_set_of_its_own(scenarios: tuple[Scenario, ...], drawn:
     assert all(one.car.body.sprung_mass_kg > 0 for one in others), "every car can be"
 
 
-def test_the_same_hash_has_the_same_set(scenarios: tuple[Scenario, ...]) -> None:
-    first, again = (
-        [one.model_dump() for one in some]
-        for some in (scenarios, blind_scenarios(HASH, SHIPPED_CONFIGS))
-    )
-    assert str(first) == str(again)
-
-
 def test_signals_are_quantised_as_in_a_log_and_the_truth_is_exact() -> None:
     scenario = load_scenario("imperfect", SHIPPED_CONFIGS)
     (drive,) = simulate_drives(SIGNALS, [scenario])

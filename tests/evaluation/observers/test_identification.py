@@ -1,8 +1,7 @@
 """A car is identified from labelled drives, of mass and geometry alone."""
 
-from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
-from fleet_slip.evaluation import identify as identifying
 from fleet_slip.evaluation.filters import checksum_of_sources
 from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
@@ -118,40 +116,6 @@ def test_the_held_out_error_is_that_of_a_fit_without_the_drive(
     assert np.degrees(found.held_out_rad) > 0.8 > np.degrees(found.fit_rad)
 
 
-@dataclass(frozen=True)
-class Recorder(IdentifiedVehicle):
-    """A car that records every drive it estimates, beside those it was identified from."""
-
-    training: tuple[float, ...] = ()
-    estimated: tuple[list[tuple[float, tuple[float, ...]]], ...] = ()
-
-    def estimate(self, signals: DriveSignals) -> FloatArray:
-        self.estimated[0].append((float(signals.ax_mps2[0]), self.training))
-        return np.zeros(len(signals))
-
-
-def test_held_out_drives_are_not_training_drives(
-    drive: LabelledDrive, executor: Executor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    row = drive.beginning(1)
-    drives = [
-        replace(row, signals=replace(row.signals, ax_mps2=np.array([number])))
-        for number in np.arange(7.0)
-    ]
-    estimated: list[tuple[float, tuple[float, ...]]] = []
-
-    def record(measured: VehicleMeasures, drives: Sequence[LabelledDrive], _: Executor) -> Recorder:
-        training = tuple(float(one.signals.ax_mps2[0]) for one in drives)
-        return Recorder(CAR, ekf.EkfNoise(), 0.0, training=training, estimated=(estimated,))
-
-    monkeypatch.setattr(identifying, "identify", record)
-    identify_held_out(MEASURED, drives, executor)
-    assert sorted(number for number, _ in estimated) == list(range(7))
-    for number, training in estimated:
-        assert number not in training
-        assert len(training) >= 5, "a car is identified from all but a fold"
-
-
 def test_drives_without_a_label_are_refused(drive: LabelledDrive, executor: Executor) -> None:
     unknown = replace(drive, sideslip_rad=np.full(len(drive.signals), np.nan))
     with pytest.raises(DataError, match="no row has both"):
@@ -207,24 +171,6 @@ def test_tuning_makes_up_for_wrong_noise_and_never_makes_worse(executor: Executo
     assert found.rmse_rad < 1.05 * right
     again = rmse_rad(lambda d: kalman.estimate(d.signals, CAR, found.parameters), drives, executor)
     assert again == found.rmse_rad
-
-
-@pytest.mark.parametrize(
-    ("names", "parameters"),
-    [
-        (kalman.TUNABLE, kalman.FilterNoise()),
-        (ekf.TUNABLE, ekf.EkfNoise()),
-    ],
-)
-def test_tunable_parameters_exist_and_are_positive(
-    names: tuple[str, ...], parameters: Config
-) -> None:
-    for name in names:
-        value: object = parameters
-        for part in name.split("."):
-            value = getattr(value, part)
-        assert isinstance(value, float)
-        assert value > 0
 
 
 def test_the_checksum_depends_on_all_modules(tmp_path: Path) -> None:

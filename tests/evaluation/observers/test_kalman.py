@@ -25,7 +25,6 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import (
     GPS_EVERY,
-    TUNNEL_S,
     noisy,
     rolling_drive,
     slalom,
@@ -192,28 +191,6 @@ def test_steady_circle_persists_without_a_fix() -> None:
     found = fuse(only_first, yaw_rate, FilterNoise())
     np.testing.assert_allclose(found[0], vx, atol=1e-9)
     np.testing.assert_allclose(found[2], vy, atol=1e-9)
-
-
-def test_error_grows_in_a_tunnel_and_recovers_after_it() -> None:
-    exact, truth = slalom(CAR, 10_000)
-    begin_s = 60.0
-    lost = tunnel(len(exact), begin_s)
-    errors = np.stack(
-        [
-            kalman.estimate(without_fixes(noisy(exact, seed), lost), CAR, FilterNoise()) - truth
-            for seed in range(40)
-        ]
-    )
-    spread = np.sqrt(np.mean(errors**2, axis=0))
-
-    def around(time_s: float) -> float:
-        return float(spread[int(time_s / STEP_S) :][:100].mean())
-
-    before, inside, after = around(begin_s - 2), around(begin_s + 18), around(begin_s + 25)
-    assert inside > 2.5 * before
-    assert around(begin_s + 9) < inside
-    assert after < 1.3 * before
-    assert begin_s + TUNNEL_S < 100
 
 
 def test_begins_at_the_first_fix() -> None:

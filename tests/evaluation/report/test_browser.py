@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from pypdfium2 import PdfDocument
 
 import fleet_slip
 from fleet_slip.evaluation.watch import drive_frames, render_watch
@@ -29,9 +28,6 @@ CHROMIUM = (
 RULES = ("wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice")
 DARK = "--blink-settings=preferredColorScheme=0"
 NARROW_PX = 400
-LEAST_FULL = 0.6
-"""Share of a printed page down to its last mark, of all pages but the last."""
-
 DESK_PX = 1200
 LONG_PX = 16000
 
@@ -106,18 +102,6 @@ def test_a_narrow_screen_need_not_be_scrolled_across(
     )
     wide, seen = asked(frame, tmp_path, script, "--allow-file-access-from-files")
     assert wide <= seen
-
-
-@pytest.mark.parametrize("name", ["report"])
-def test_paper_has_no_half_empty_pages(pages: dict[str, Path], name: str, tmp_path: Path) -> None:
-    file = tmp_path / "page.pdf"
-    browse(pages[name], tmp_path, "--no-pdf-header-footer", f"--print-to-pdf={file}")
-    document = PdfDocument(file)
-    filled = []
-    for sheet in document:
-        marks = np.asarray(sheet.render(scale=0.5).to_pil().convert("L")) < 250
-        filled.append(float(np.flatnonzero(marks.any(axis=1)).max() / len(marks)))
-    assert all(share > LEAST_FULL for share in filled[:-1]), filled
 
 
 @dataclass(frozen=True)
