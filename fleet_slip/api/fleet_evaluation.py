@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from fleet_slip.evaluation.identify import IdentifiedVehicle
     from fleet_slip.evaluation.report import WrittenReport
     from fleet_slip.models.score import Score
-    from fleet_slip.vehicle.parameters import VehicleMeasures
+    from fleet_slip.vehicle.measures import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 WATCH_PAGE = Path("watch.html")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from fleet_slip.models.publish import DryRun, Publication
     from fleet_slip.models.registry import Difference
     from fleet_slip.models.summary import Selection
-    from fleet_slip.vehicle.parameters import VehicleMeasures
+    from fleet_slip.vehicle.measures import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 T = TypeVar("T")

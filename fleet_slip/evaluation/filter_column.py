@@ -35,7 +35,7 @@ from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.score import calibrated_cars
 from fleet_slip.models.summary import Selection
 from fleet_slip.regression.combination import CLIP_STD
-from fleet_slip.vehicle.parameters import VehicleMeasures
+from fleet_slip.vehicle.measures import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 
 COUNT_RAD = Fraction(1, 2**16)

@@ -47,7 +47,7 @@ from fleet_slip.regression.combination import (
     choose_combination,
 )
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
-from fleet_slip.vehicle.parameters import VehicleMeasures
+from fleet_slip.vehicle.measures import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 
 MAX_DRIVES = 96

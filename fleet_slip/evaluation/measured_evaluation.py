@@ -54,7 +54,8 @@ from fleet_slip.models.score import calibrated_cars, find_training_overlap
 from fleet_slip.models.summary import group_reasons
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters
+from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
 
 T = TypeVar("T")
