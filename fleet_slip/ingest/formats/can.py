@@ -181,24 +181,30 @@ class _AscLines:
     previous event as absolute. So it gets lines at time 0, and frames get their times from here.
     """
 
-    def __init__(self, lines: Iterable[str], can: Any) -> None:
-        self._lines, self._can = lines, can
+    def __init__(self, lines: Iterable[str], can: Any, zone: str | None) -> None:
+        self._lines, self._can, self._zone = lines, can, zone
         self.time_s, self._is_relative = 0.0, False
-        self.start: datetime | None = None
+        self.start_s: float | None = None
 
     def __iter__(self) -> Iterator[str]:
         for line in self._lines:
             self._is_relative |= _RELATIVE.match(line) is not None
-            if self.start is None and (date := _ASC_DATE.match(line)):
+            if self.start_s is None and self._zone and (date := _ASC_DATE.match(line)):
                 with suppress(ValueError):
                     start_s = self._can.ASCReader._datetime_to_timestamp(date[1])
-                    self.start = datetime.fromtimestamp(start_s)
+                    self.start_s = clock_start_s(datetime.fromtimestamp(start_s), self._zone)
             if event := _ASC_TIME.match(line):
                 time_s = float(event[1].replace(",", "."))
                 self.time_s = self.time_s + time_s if self._is_relative else time_s
                 yield f"0.0 {event[2]}"
             else:
                 yield line
+
+    def frames(self) -> Iterator[Any]:
+        """Yield the frames with their times, with dates if the mapping states their time zone."""
+        for frame in self._can.ASCReader(self):
+            frame.timestamp = (self.start_s or 0.0) + self.time_s
+            yield frame
 
     def close(self) -> None:
         """Leave the file open: python-can calls this at its end."""
@@ -213,7 +219,8 @@ def _read_trace(budget: Budget, zone: str | None) -> Iterator[Frames]:
         )
     can = load_library(budget.file, "can")
     if budget.file.suffix.lower() == ".asc":
-        yield from _read_asc(budget.file, can, zone)
+        with budget.file.open(encoding="cp1252", errors="replace") as text:
+            yield from _tables(_AscLines(text, can, zone).frames(), 0.0, bus_offset=1)
         return
     passes_over = logging.getLogger("can.io.blf")
     passes_over.setLevel(logging.WARNING)
@@ -231,36 +238,12 @@ def _read_trace(budget: Budget, zone: str | None) -> Iterator[Frames]:
         if is_blf and zone is not None and trace.start_timestamp:  # python-can reads UTC
             local = datetime.fromtimestamp(trace.start_timestamp, UTC).replace(tzinfo=None)
             shift_s = clock_start_s(local, zone) - trace.start_timestamp
-        for frames in _data_frames(trace):
-            yield _table_of(frames, shift_s, bus_offset=int(is_blf))
+        yield from _tables(trace, shift_s, bus_offset=int(is_blf))
         if b"LOBJ" in getattr(trace, "_tail", b""):  # which python-can passes over
             raise InputError(
                 f"{quote_name(budget.file)}: an object in it is damaged, or ends too early. Copy "
                 "it again."
             )
-
-
-def _read_asc(file: Path, can: Any, zone: str | None) -> Iterator[Frames]:
-    """Yield the data frames of an ASC trace, with dates if the mapping states their time zone."""
-    with file.open(encoding="cp1252", errors="replace") as text:
-        lines = _AscLines(text, can)
-
-        def timed() -> Iterator[Any]:
-            for frame in can.ASCReader(lines):
-                frame.timestamp = lines.time_s
-                yield frame
-
-        for frames in _data_frames(timed()):
-            start = lines.start if zone is not None else None
-            start_s = 0.0 if start is None else clock_start_s(start, zone)
-            yield _table_of(frames, start_s, bus_offset=1)
-
-
-def _data_frames(frames: Iterable[Any]) -> Iterator[list[Any]]:
-    """Yield the frames with data, some at once."""
-    sent = (frame for frame in frames if not (frame.is_error_frame or frame.is_remote_frame))
-    while several := list(islice(sent, AT_ONCE)):
-        yield several
 
 
 def _refuse_unknown(record: logging.LogRecord) -> bool:
@@ -270,20 +253,25 @@ def _refuse_unknown(record: logging.LogRecord) -> bool:
     return False
 
 
-def _table_of(frames: list[Any], start_s: float, bus_offset: int) -> Frames:
-    """Return frames of python-can, which counts the buses of ASC and BLF from 0, they from 1."""
-    sizes = np.array([len(frame.data) for frame in frames])
-    width = max(int(sizes.max()), 1)
-    payloads = b"".join(bytes(frame.data).ljust(width, b"\0") for frame in frames)
-    buses = (frame.channel for frame in frames)
-    return frame_table(
-        np.array([frame.arbitration_id for frame in frames]),
-        np.array([frame.is_extended_id for frame in frames]),
-        start_s + np.array([frame.timestamp for frame in frames]),
-        [str(bus + bus_offset if isinstance(bus, int) else bus) for bus in buses],
-        sizes,
-        np.frombuffer(payloads, dtype=np.uint8).reshape(-1, width),
-    )
+def _tables(trace: Iterable[Any], start_s: float, bus_offset: int) -> Iterator[Frames]:
+    """Yield the frames with data, some at once.
+
+    python-can counts the buses of ASC and BLF from 0, they from 1.
+    """
+    sent = (frame for frame in trace if not (frame.is_error_frame or frame.is_remote_frame))
+    while frames := list(islice(sent, AT_ONCE)):
+        sizes = np.array([len(frame.data) for frame in frames])
+        width = max(int(sizes.max()), 1)
+        payloads = b"".join(bytes(frame.data).ljust(width, b"\0") for frame in frames)
+        buses = (frame.channel for frame in frames)
+        yield frame_table(
+            np.array([frame.arbitration_id for frame in frames]),
+            np.array([frame.is_extended_id for frame in frames]),
+            start_s + np.array([frame.timestamp for frame in frames]),
+            [str(bus + bus_offset if isinstance(bus, int) else bus) for bus in buses],
+            sizes,
+            np.frombuffer(payloads, dtype=np.uint8).reshape(-1, width),
+        )
 
 
 class CanSource(Source):
