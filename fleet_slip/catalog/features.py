@@ -618,11 +618,11 @@ class FeatureFile(Config):
             ]
             unknown += [c for c in entry.calibrated if c not in self.calibrated]
             unknown += [entry.of] if entry.of and entry.of not in self.sets else []
+            if unknown:
+                raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
             still = [c for c in entry.calibrated if entry.change_s and self.calibrated[c].alone]
             if still:
                 raise ValueError(f"sets.{name}: {', '.join(still)}: a number does not change")
-            if unknown:
-                raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
         return self
 
     @property

@@ -29,7 +29,6 @@ from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.export.compiled import (
-    COLUMNS,
     SANITIZED,
     Counter,
     build,
@@ -294,24 +293,6 @@ def test_nothing_overflows(tmp_path: Path, of_course: Counter) -> None:
     for late in (-(2**31), 2**31 - 1, 7):
         given = struct.pack("<16sQqQ", b"VIN", 2**64 - 1, late, rows) + samples.tobytes()
         assert run_compiled([sanitized.program], given=given)
-
-
-def test_an_export_counts_what_teaches_the_model_again() -> None:
-    version = ModelVersion(1, learned(), "0" * 64, CATALOG)
-    files = export_files(version, None, "c", with_gram=True)
-    header = files["sideslip_any_gram.h"].decode()
-    assert "int32_t course_count;" in header and "_gram_pass(" in header
-    sizes = [one.columns for one in sets_on_board(CATALOG, version.manifest)[1:]]
-    assert set(sizes[-1]) == {*COLUMNS, *PLANE, SIGNALS.label}, "the columns themselves"
-    assert sizes[0] == (
-        *(
-            "ay",
-            "yaw_rate",
-            "curvature",
-            *sorted(COLUMNS, key=CATALOG.feature_set("course").columns.index),
-        ),
-        *("turned", "straight", "straight_course", SIGNALS.label),
-    )
 
 
 def test_what_a_car_is_not_told_it_cannot_count() -> None:

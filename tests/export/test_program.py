@@ -44,31 +44,6 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
             assert plain.angles(content, facts, numbers, list(check.samples)) == list(check.angles)
 
 
-def test_steps_that_several_columns_are_made_of_stand_once() -> None:
-    third = Fraction(1, 3)
-    content = program_content(
-        compile_program(CATALOG, model_of({"mean_5": third, "below": third, "ay": third}))
-    )
-    steps = [tuple(one) for one in content["steps"]]
-    assert len(steps) == len({*steps})
-    assert [one for one in steps if one[0] == "signal"] == [("signal", 0), ("signal", 1)]
-    assert [one[2] for one in steps if one[0] == "sum"] == [5, 3, 4]
-    before = {"signal": 0, "fact": 0, "number": 0, "constant": 0, "ago": 1, "sum": 1, "values": 1}
-    for place, (operation, *operands) in enumerate(steps):
-        assert all(one < place for one in operands[: before.get(str(operation), 2)])
-
-
-def test_a_running_mean_takes_no_more_than_its_most_values() -> None:
-    """5 of ay's counts, then more: with a most of 2, they are the mean of the first two."""
-    content = program_content(compile_program(CATALOG, model_of({"ever": Fraction(1, 1000)})))
-    for step in content["steps"]:
-        if step[0] in {"sum", "values"}:
-            step[3] = 2
-    first = plain.angles(content, [], [], [[5], [7], [None], [90]])
-    assert first[1] == first[3] != first[0]
-    assert first[2] is None
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_what_needs_more_than_63_bits_has_no_program(
     monkeypatch: pytest.MonkeyPatch, sign: int
