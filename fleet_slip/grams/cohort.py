@@ -600,14 +600,13 @@ class DriveWeights:
         return DownweightedDrive(float(self.weights[number]) / FULL, float(self.times[number]))
 
 
-def robust_weights(drives: DriveMoments, *, intercept: bool = True) -> DriveWeights:
+def robust_weights(drives: DriveMoments) -> DriveWeights:
     """Return weights min(1, c median rms / rms)^2 of drives, by reweighted least squares.
 
     `drives` are the moments of the inputs and the label, which is last. c is `USUAL_ERRORS`, or the
     lowest multiple of it by powers of 1.25 that takes at most `MAX_LOST_SHARE` of the weight.
     """
-    moments = drives.moments[:, int(not intercept) :, int(not intercept) :]
-    rows, limit = drives.moments[:, 0, 0], USUAL_ERRORS
+    moments, rows, limit = drives.moments, drives.moments[:, 0, 0], USUAL_ERRORS
     result = _reweight(moments, rows, limit)
     while float(rows @ (FULL - result.weights)) > MAX_LOST_SHARE * FULL * float(rows.sum()):
         limit *= 1.25

@@ -169,6 +169,7 @@ class ChallengerEvaluation:
     procedure: Procedure
     incumbents: dict[str, LinearModel]
     tolerance: float
+    has_intercept: bool = True
 
     @classmethod
     def prepare(
@@ -184,18 +185,19 @@ class ChallengerEvaluation:
             _require_same_columns(catalog, version, feature_set)
             models[version.reference] = version.manifest.counts_model(catalog, feature_set)
         winner, search = selection.winner.model, selection.searched_winner
-        label, intercept = catalog.signals.label, selection.compared.intercept
+        label = catalog.signals.label
         inputs = winner.signals if search is None else search.inputs
         incumbent_signals = (name for model in models.values() for name in model.signals)
         signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))
         cars = selection.cohort.count_vehicles_with((*signals, label))
         by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
         if search is None:
-            procedure = least_squares(inputs, label, intercept=intercept)
+            procedure = least_squares(inputs, label)
         else:
-            procedure = search_procedure(label, search, len(winner.signals), intercept=intercept)
+            procedure = search_procedure(label, search, len(winner.signals))
         tolerance = load_thresholds(catalog.configs).tolerance
-        return cls(catalog, winner.name, signals, by, procedure, models, tolerance)
+        has_intercept = selection.compared.intercept
+        return cls(catalog, winner.name, signals, by, procedure, models, tolerance, has_intercept)
 
     def groups_of(self, cohort: Cohort) -> Folds:
         """Return the drives that have all signals, by group. Raises `DataError` without."""
@@ -213,6 +215,7 @@ class ChallengerEvaluation:
         )
 
     def _complete(self, folds: CohortFolds) -> Folds:
+        folds = replace(folds, has_intercept=self.has_intercept)
         return folds.complete_cases(self.signals, self.catalog.signals.label, sparse=True)
 
     def as_published(self, reference: str, tested: Folds) -> CrossValidation:

@@ -114,7 +114,7 @@ def diagnose(cohort: Cohort, inputs: Sequence[str], *, intercept: bool = True) -
     # A single drive or trip contains no difference of drives: then errors are by rows.
     alone = len(moments) < 2
     total = served.table.total()
-    fits = nested_fits(total, inputs, label, intercept=intercept)
+    fits = nested_fits(total if intercept else total.about_origin(), inputs, label)
     fitted = fits[-1]
     naive = infer(fitted, scales)
     return Diagnosis(

@@ -272,7 +272,7 @@ def _downweight_outliers(
 def outlier_drives(cases: CompleteCases, *, intercept: bool) -> dict[str, DownweightedDrive]:
     """Return the drives that `robust` down-weights, the most unusual first."""
     table = cases.table if intercept else cases.table.about_origin()
-    weights = robust_weights(DriveMoments.from_table(table), intercept=intercept)
+    weights = robust_weights(DriveMoments.from_table(table))
     less = np.flatnonzero(weights.weights < FULL).tolist()
     names = cases.drives["drive_id"].to_pylist()
     return {
@@ -291,8 +291,7 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
     drives have, and searches that need more drives. Raises `DataError` if none is left, or no drive
     has the label.
     """
-    catalog, intercept = cohort.catalog, compared.intercept
-    folds = _labelled_folds(cohort, compared.folds)
+    catalog, folds = cohort.catalog, _labelled_folds(cohort, compared)
     skipped: dict[str, str] = {}
     candidates = [c for c in compared.model if _is_allowed(c, cohort, skipped)]
     searches = [s for s in compared.search if _has_drives(s, cohort, skipped)]
@@ -302,7 +301,7 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
     for candidate in rows.candidates:
         name, signals = candidate.name, candidate.signals
         try:
-            models.append(_cross_validate(name, signals, rows.folds, catalog, intercept))
+            models.append(_cross_validate(name, signals, rows.folds, catalog))
         except DataError as error:
             skipped[name] = str(error)
     searched = []
@@ -317,7 +316,7 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
             continue
         bounded = _bounded(search, cohort, compared.folds)
         try:
-            searched.append(search_models(rows.folds, among, catalog, bounded, intercept))
+            searched.append(search_models(rows.folds, among, catalog, bounded))
         except DataError as error:  # no drive, or not one in each fold, has all inputs
             skipped[f"{search.title} (search)"] = str(error)
     models += [model for search_result in searched for model in search_result.models]
@@ -326,13 +325,19 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
         raise DataError(f"no candidate model can be fitted. {' '.join(reasons)}")
     winner = choose_by(compared, models)
     if winner.model.name in {candidate.name for candidate in rows.candidates}:
-        winner = _refit(winner, folds, rows, catalog, intercept=intercept)
+        winner = _refit(winner, folds, rows, catalog)
     return Selection(cohort, compared, tuple(models), winner, skipped, searched=tuple(searched))
 
 
-def _labelled_folds(cohort: Cohort, folding: Folding) -> CohortFolds:
+def folds_of(cohort: Cohort, compared: ModelList) -> CohortFolds:
+    """Divide a cohort into the folds of a list, for models with its intercept."""
+    folds = cohort.folds(compared.folds.by, compared.folds.count)
+    return replace(folds, has_intercept=compared.intercept)
+
+
+def _labelled_folds(cohort: Cohort, compared: ModelList) -> CohortFolds:
     """Divide a cohort into folds. Raises `DataError` if no drive has the label."""
-    folds, label = cohort.folds(folding.by, folding.count), cohort.catalog.signals.label
+    folds, label = folds_of(cohort, compared), cohort.catalog.signals.label
     if not folds.tables_with([label]):
         raise DataError(
             f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
@@ -428,12 +433,12 @@ def find_complete_cases(
 
 
 def _cross_validate(
-    name: str, signals: Sequence[str], folds: CohortFolds, catalog: Catalog, intercept: bool
+    name: str, signals: Sequence[str], folds: CohortFolds, catalog: Catalog
 ) -> CrossValidation:
     """Cross-validate least squares on the rows that have the signals. Raises `DataError`."""
     label = catalog.signals.label
     complete = folds.complete_cases(signals, label, sparse=True)
-    procedure = least_squares(signals, label, intercept=intercept)
+    procedure = least_squares(signals, label)
     return cross_validate(name, complete, procedure, catalog.input_scales)
 
 
@@ -446,7 +451,7 @@ def _bounded(search: Search, cohort: Cohort, folding: Folding) -> Search:
 
 
 def search_models(
-    cohort: CohortFolds, inputs: Sequence[str], catalog: Catalog, search: Search, intercept: bool
+    cohort: CohortFolds, inputs: Sequence[str], catalog: Catalog, search: Search
 ) -> SearchedModels:
     """Search among the inputs on the rows that have them all. Raises `DataError`.
 
@@ -456,12 +461,11 @@ def search_models(
     folds = cohort.complete_cases(inputs, label, sparse=True)
 
     def fits(gram: Gram) -> list[Fit]:
-        moments = gram if intercept else gram.about_origin()
-        sets = stepwise_order(moments, inputs, label, search.method, search.max_features)
+        sets = stepwise_order(gram, inputs, label, search.method, search.max_features)
         is_nested = all(sets[size][:-1] == sets[size - 1] for size in range(1, len(sets)))
         if sets and is_nested:
-            return nested_fits(moments, sets[-1], label)[1:]
-        return [fit(moments, signals, label) for signals in sets]
+            return nested_fits(gram, sets[-1], label)[1:]
+        return [fit(gram, signals, label) for signals in sets]
 
     chosen = fits(folds.total)
     tests: list[list[ErrorSums]] = [[] for _ in chosen]
@@ -478,15 +482,12 @@ def search_models(
     return SearchedModels(search, tuple(inputs), models)
 
 
-def search_procedure(
-    label: str, searched: SearchedModels, size: int, *, intercept: bool
-) -> Procedure:
+def search_procedure(label: str, searched: SearchedModels, size: int) -> Procedure:
     """Return a procedure that repeats a search for at most `size` columns."""
 
     def procedure(gram: Gram) -> LinearModel:
-        moments = gram if intercept else gram.about_origin()
-        sets = stepwise_order(moments, searched.inputs, label, searched.search.method, size)
-        return fit(moments, sets[-1] if sets else (), label).model
+        sets = stepwise_order(gram, searched.inputs, label, searched.search.method, size)
+        return fit(gram, sets[-1] if sets else (), label).model
 
     return procedure
 
@@ -506,14 +507,12 @@ def choose_by(compared: ModelList, models: Sequence[CrossValidation]) -> Winner:
     return Winner(best, best, reason)
 
 
-def _refit(
-    winner: Winner, folds: CohortFolds, rows: ComparedRows, catalog: Catalog, *, intercept: bool
-) -> Winner:
+def _refit(winner: Winner, folds: CohortFolds, rows: ComparedRows, catalog: Catalog) -> Winner:
     """Fit a winner to all rows that have its signals, where these are more than the compared."""
     signals = winner.model.signals
     if len(folds.tables_with([*signals, catalog.signals.label])) == len(rows.folds.tables):
         return winner
-    model = _cross_validate(winner.model.name, signals, folds, catalog, intercept)
+    model = _cross_validate(winner.model.name, signals, folds, catalog)
     return replace(winner, model=model)
 
 
@@ -543,8 +542,7 @@ def _select_with_prior(cohort: Cohort, prior: Cohort, compared: ModelList) -> Se
     signals = tuple(name for name in searched if name in cohort.inputs) or alone.signals
     share = PRIOR_SHARE * Fraction(cohort.rows, prior.rows)
     weighted = replace(cohort, weight=Fraction(2) ** round(math.log2(share)))
-    folds = weighted.folds(compared.folds.by, compared.folds.count)
-    joined = _cross_validate("prior", signals, folds, cohort.catalog, compared.intercept)
+    joined = _cross_validate("prior", signals, folds_of(weighted, compared), cohort.catalog)
     figures = (
         f"RMSE on held-out drives: {joined.pooled.rmse_deg:.4f} deg with the prior, each row with "
         f"the weight {weighted.weight}, {alone.pooled.rmse_deg:.4f} deg without."
@@ -566,11 +564,11 @@ def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
     inputs, label = inputs_of(cohort, order), catalog.signals.label
     tolerance = parse_tolerance(request.tolerance)
     rule = Rule(request.ranking or "declared", request.criterion or "cv", tolerance)
-    folds = cohort.folds(plan.folds.by, plan.folds.count).complete_cases(inputs, label, sparse=True)
+    folds = replace(
+        cohort.folds(plan.folds.by, plan.folds.count), has_intercept=request.intercept
+    ).complete_cases(inputs, label, sparse=True)
     drives = clustered_moments(cohort.complete_cases(inputs), intercept=request.intercept)
-    choice = choose_nested(
-        folds, drives, inputs, label, catalog.input_scales, rule, intercept=request.intercept
-    )
+    choice = choose_nested(folds, drives, inputs, label, catalog.input_scales, rule)
     name, signals = choice.winner.model.name, choice.winner.model.signals
     model_list = f"order:{order} {rule.ranking} {rule.criterion}"
     compared = ModelList(

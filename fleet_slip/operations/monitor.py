@@ -163,11 +163,13 @@ def monitor(
             "--since."
         )
     champion = manifest.counts_model(catalog, feature_set)
-    refit = least_squares(champion.signals, champion.label, intercept=not manifest.through_origin)
+    refit = least_squares(champion.signals, champion.label)
     total = sum(compress(grams, training), Gram.zero(grams[0].signals))
     charted: list[Day] = []
     for day, gram, drives, is_training in zip(days, grams, sums.drives, training, strict=True):
-        model = refit(total - gram) if is_training else champion
+        remaining = total - gram
+        remaining = remaining.about_origin() if manifest.through_origin else remaining
+        model = refit(remaining) if is_training else champion
         errors = error_sums(model, gram).figures(catalog.input_scales[model.label])
         mean_deg, std_deg = errors.error_mean_deg, errors.error_std_deg
         charted.append(Day(day, drives, gram.n, mean_deg, std_deg, errors.rmse_deg, is_training))

@@ -203,9 +203,7 @@ def compare_paired(model: CrossValidation, other: CrossValidation, tolerance: fl
     return _gap(model, other, tolerance, error / rmse_sum if rmse_sum else 0.0)
 
 
-def nested_fits(
-    gram: Gram, order: Sequence[str], label: str, *, intercept: bool = True
-) -> list[Fit]:
+def nested_fits(gram: Gram, order: Sequence[str], label: str) -> list[Fit]:
     """Fit the nested models of an order of signals exactly.
 
     Parameters
@@ -215,7 +213,6 @@ def nested_fits(
     order : sequence of str
         The k signals; model j has the first j of them.
     label : str
-    intercept : bool
 
     Returns
     -------
@@ -227,12 +224,12 @@ def nested_fits(
     DataError
         If signals are linearly dependent, or the Gram has no rows.
     """
-    matrix = moments(gram.restrict([*order, label]), intercept=intercept)
+    matrix = moments(gram.restrict([*order, label]))
 
     def fit_first(size: int) -> Fit:
         at = [*range(size), len(order)]
         part = gram.restrict([*order[:size], label])
-        return fit_moments(part, [[matrix[i][j] for j in at] for i in at], intercept=intercept)
+        return fit_moments(part, [[matrix[i][j] for j in at] for i in at])
 
     full = fit_first(len(order))  # names all dependent signals
     return [*(fit_first(size) for size in range(len(order))), full]
@@ -300,8 +297,6 @@ def choose_nested(
     label: str,
     scales: Scales,
     rule: Rule,
-    *,
-    intercept: bool = True,
 ) -> NestedChoice:
     """Rank the inputs and choose one of the nested models.
 
@@ -310,7 +305,7 @@ def choose_nested(
     folds : Folds
         Rows with all inputs and the label.
     drives : DriveMoments
-        Of the same rows, the independent clusters of the evidence. About zero without intercept.
+        Of the same rows, the independent clusters of the evidence; about zero without intercept.
     inputs : sequence of str
         The k candidate signals.
     label : str
@@ -318,7 +313,6 @@ def choose_nested(
         Physical value of one count of each signal.
     rule : Rule
         Ranking and criterion.
-    intercept : bool
 
     Returns
     -------
@@ -334,15 +328,14 @@ def choose_nested(
     if rule.criterion not in CRITERIA:
         criteria = ", ".join(CRITERIA)
         raise QuestionError(f"unknown criterion {rule.criterion!r}. Known criteria: {criteria}.")
-    total = folds.total if intercept else folds.total.about_origin()
-    order = rank(rule.ranking, total, inputs, label)
-    fits = nested_fits(folds.total, order, label, intercept=intercept)
+    order = rank(rule.ranking, folds.total, inputs, label)
+    fits = nested_fits(folds.total, order, label)
     evidence = Evidence.measure(fits, drives)
     null, *models = (
         cross_validate(
             f"first {size}",
             folds,
-            least_squares(order[:size], label, intercept=intercept),
+            least_squares(order[:size], label),
             scales,
         )
         for size in range(len(order) + 1)

@@ -101,7 +101,8 @@ def by_value(values: Sequence[Any], bands: int | None = None) -> FoldAssignment:
 class Folds:
     """One Gram per fold, with names and number of drives; rows `auxiliary` are always trained on.
 
-    These have an intercept of their own: they contribute products about the means only.
+    These have an intercept of their own: they contribute products about the means only. Without
+    `has_intercept` training Grams are about the origin.
     """
 
     grams: tuple[Gram, ...]
@@ -109,10 +110,18 @@ class Folds:
     drives: int
     auxiliary: Gram | None = None
     weight: Fraction = Fraction(1)
+    has_intercept: bool = True
 
     @cached_property
     def total(self) -> Gram:
         """The Gram of all training rows, with integer weights."""
+        return self._about(self._sum)
+
+    def _about(self, training: Gram) -> Gram:
+        return training if self.has_intercept else training.about_origin()
+
+    @cached_property
+    def _sum(self) -> Gram:
         scaled_total = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
         if self.auxiliary is None or not self.weight:
             return scaled_total
@@ -133,13 +142,7 @@ class Folds:
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
         """Yield the training Gram and the test Gram of each fold."""
         for fold in self.grams:
-            yield self.total - fold.scaled(self._row_factor), fold
-
-    def without(self, number: int, drives: int) -> "Folds":
-        """Return the folds without one, with the number of their drives."""
-        grams = self.grams[:number] + self.grams[number + 1 :]
-        names = self.names[:number] + self.names[number + 1 :]
-        return replace(self, grams=grams, names=names, drives=drives)
+            yield self._about(self._sum - fold.scaled(self._row_factor)), fold
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ class CohortFolds:
     """The folds of a cohort whose drives may have different signals: `tables` of Grams by set.
 
     `count_drives` returns the number of drives with rows in some tables, given by index; for
-    `auxiliary` and `weight` see `Folds`.
+    `auxiliary`, `weight` and `has_intercept` see `Folds`.
     """
 
     names: tuple[str, ...]
@@ -155,6 +158,7 @@ class CohortFolds:
     count_drives: Callable[[Sequence[int]], int]
     auxiliary: tuple[Gram, ...] = ()
     weight: Fraction = Fraction(1)
+    has_intercept: bool = True
 
     @classmethod
     def from_tables(
@@ -222,7 +226,8 @@ class CohortFolds:
             gram.restrict(signals) for gram in self.auxiliary if set(signals) <= set(gram.signals)
         ]
         auxiliary = sum(matching[1:], matching[0]) if matching else None
-        return Folds(folds, names, self.count_drives(complete), auxiliary, self.weight)
+        drives = self.count_drives(complete)
+        return Folds(folds, names, drives, auxiliary, self.weight, self.has_intercept)
 
 
 # Accuracy of predictions from exact sums of predictions and labels.
@@ -444,9 +449,9 @@ def error_of_mean(values: Sequence[float]) -> float:
     return math.sqrt(square / (len(values) - 1) / len(values))
 
 
-def least_squares(inputs: Sequence[str], label: str, *, intercept: bool = True) -> Procedure:
+def least_squares(inputs: Sequence[str], label: str) -> Procedure:
     """Return the procedure that fits the label on given inputs."""
-    return lambda gram: fit(gram, inputs, label, intercept=intercept).model
+    return lambda gram: fit(gram, inputs, label).model
 
 
 def cross_validate(

@@ -42,12 +42,15 @@ class Gram:
     sums : tuple of int, shape (k,)
     products : tuple of int, shape (k(k+1)/2,)
         Sums of products, the lower triangle by rows.
+    has_mean : bool
+        False for moments about the origin: models have no intercept.
     """
 
     signals: tuple[str, ...]
     n: int
     sums: tuple[int, ...]
     products: tuple[int, ...]
+    has_mean: bool = True
 
     def __post_init__(self) -> None:
         k = len(self.signals)
@@ -144,11 +147,12 @@ class Gram:
             self.n,
             tuple(self.sums[i] for i in index),
             tuple(self.products[p] for p in packed_positions(tuple(index))),
+            self.has_mean,
         )
 
     def about_origin(self) -> "Gram":
         """Return the Gram with all sums zero, that of rows and their mirror image: no intercept."""
-        return Gram(self.signals, self.n, (0,) * len(self.sums), self.products)
+        return Gram(self.signals, self.n, (0,) * len(self.sums), self.products, has_mean=False)
 
     def centered(self) -> "Gram":
         """Return n times the Gram of the rows minus their mean, with n = 0: no effect on means."""

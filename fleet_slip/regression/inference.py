@@ -219,8 +219,8 @@ def classical_variances(fitted: Fit, variance: Fraction) -> list[Fraction]:
         In counts, the intercept first if any.
     """
     gram, part = fitted.gram, fitted.gram.restrict(fitted.model.signals)
-    inverse, denominator = exact.invert(moments(part, intercept=fitted.has_intercept))
-    unit = variance * (gram.n if fitted.has_intercept else 1) / denominator
+    inverse, denominator = exact.invert(moments(part))
+    unit = variance * gram.n / denominator
     k = range(fitted.size)
     slopes = [unit * inverse[i][i] for i in k]
     if not fitted.has_intercept:

@@ -77,13 +77,16 @@ class Fit:
         Coefficients in counts.
     rss : Fraction
         Residual sum of squares in counts^2.
-    has_intercept : bool
     """
 
     gram: Gram
     model: LinearModel
     rss: Fraction
-    has_intercept: bool = True
+
+    @property
+    def has_intercept(self) -> bool:
+        """False for moments about the origin."""
+        return self.gram.has_mean
 
     @property
     def size(self) -> int:
@@ -94,10 +97,7 @@ class Fit:
     def tss(self) -> Fraction:
         """Sum of squares of the label, about its mean if there is an intercept."""
         y = self.model.label
-        square = Fraction(self.gram.product(y, y))
-        if not self.has_intercept:
-            return square
-        return square - Fraction(self.gram.sum(y) ** 2, self.gram.n)
+        return self.gram.product(y, y) - Fraction(self.gram.sum(y) ** 2, self.gram.n)
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -110,19 +110,18 @@ class Fit:
         return float(1 - self.rss / self.tss) if self.tss else 0.0
 
 
-def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True) -> Fit:
+def fit(gram: Gram, inputs: Sequence[str], label: str) -> Fit:
     """Fit a label by ordinary least squares, exactly: equation (4) of the paper.
 
     Parameters
     ----------
     gram : Gram
-        Sums and products of counts, of at least the inputs and the label.
+        Sums and products of counts, of at least the inputs and the label. About the origin
+        (`Gram.about_origin`) the model has no intercept.
     inputs : sequence of str
         Signals to fit on, k of them; none for the mean.
     label : str
         Signal to estimate.
-    intercept : bool
-        Estimate a constant term as well.
 
     Returns
     -------
@@ -135,10 +134,10 @@ def fit(gram: Gram, inputs: Sequence[str], label: str, *, intercept: bool = True
         If the Gram has no rows, or if inputs are linearly dependent. The message names them.
     """
     part = gram.restrict([*inputs, label])
-    return fit_moments(part, moments(part, intercept=intercept), intercept=intercept)
+    return fit_moments(part, moments(part))
 
 
-def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
+def fit_moments(part: Gram, matrix: list[list[int]]) -> Fit:
     """Fit the last signal of a Gram on all others.
 
     Parameters
@@ -147,8 +146,6 @@ def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
         The k inputs and the label, which is last.
     matrix : list of list of int, shape (k + 1, k + 1)
         Its `moments`.
-    intercept : bool
-        True for moments about the means.
 
     Returns
     -------
@@ -163,28 +160,24 @@ def fit_moments(part: Gram, matrix: list[list[int]], *, intercept: bool) -> Fit:
     right = matrix[-1][:-1]
     solution = exact.solve([row[:-1] for row in matrix[:-1]], right)
     if solution is None:
-        raise DataError(dependence(part, inputs, intercept=intercept))
+        raise DataError(dependence(part, inputs))
     numerators, denominator = solution
     explained = sum(x * b for x, b in zip(numerators, right, strict=True))
     residual = matrix[-1][-1] - Fraction(explained, denominator)
-    offset = Fraction(0)
-    if intercept:
-        predicted = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
-        offset = Fraction(denominator * part.sums[-1] - predicted, denominator * part.n)
+    predicted = sum(x * s for x, s in zip(numerators, part.sums, strict=False))
+    offset = Fraction(denominator * part.sums[-1] - predicted, denominator * part.n)
     coefficients = tuple(Fraction(x, denominator) for x in numerators)
     model = LinearModel(tuple(inputs), label, coefficients, offset)
-    return Fit(part, model, residual / (part.n if intercept else 1), intercept)
+    return Fit(part, model, residual / part.n)
 
 
-def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
-    """Return the matrix of the normal equations.
+def moments(gram: Gram) -> list[list[int]]:
+    """Return the matrix of the normal equations: n times the products about the means.
 
     Parameters
     ----------
     gram : Gram
         Of k signals.
-    intercept : bool
-        Return n times the sums of products about the means; without it, raw sums of products.
 
     Returns
     -------
@@ -197,10 +190,10 @@ def moments(gram: Gram, *, intercept: bool = True) -> list[list[int]]:
     """
     if gram.n == 0:
         raise DataError("no rows to fit: choose a cohort with drives that have all signals.")
-    return gram.centered_products() if intercept else gram.raw()
+    return gram.centered_products()
 
 
-def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> str:
+def dependence(gram: Gram, inputs: Sequence[str]) -> str:
     """Describe how inputs depend linearly on each other.
 
     Parameters
@@ -209,8 +202,6 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
         Sums and products of counts, of at least the inputs.
     inputs : sequence of str
         Signals in the order in which a dependent one is looked for.
-    intercept : bool
-        Count a constant signal as dependent.
 
     Returns
     -------
@@ -225,7 +216,7 @@ def dependence(gram: Gram, inputs: Sequence[str], *, intercept: bool = True) -> 
     part = gram.restrict(inputs)
     relations = [
         _relation(part, column, weights)
-        for column, weights in exact.dependent_columns(moments(part, intercept=intercept)).items()
+        for column, weights in exact.dependent_columns(moments(part)).items()
     ]
     if not relations:
         return ""

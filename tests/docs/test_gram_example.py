@@ -31,8 +31,8 @@ def test_the_example_is_what_the_code_computes() -> None:
         assert str(products) in README.replace("−", "-")
         assert str(label) in README.replace("−", "-")
     assert (a + b) - b == a
-    both = fit(a + b, SIGNALS[:2], "y", intercept=False)
-    held_out = fit((a + b) - b, SIGNALS[:2], "y", intercept=False)
+    both = fit((a + b).about_origin(), SIGNALS[:2], "y")
+    held_out = fit(((a + b) - b).about_origin(), SIGNALS[:2], "y")
     assert list(map(Fraction, both.model.coefficients)) == [Fraction(67, 30), Fraction(-7, 5)]
     assert "w = [67/30, −7/5]" in README
     assert list(map(Fraction, held_out.model.coefficients)) == [2, -1]

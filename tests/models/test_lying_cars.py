@@ -71,8 +71,7 @@ def lie(gram: Gram, gain: int = 1, offset: int = 0, times: int = 1) -> Gram:
     at = packed_position(y, y)
     products[at] = gain**2 * products[at] + 2 * gain * offset * sums[y] + offset**2 * gram.n
     sums[y] = gain * sums[y] + offset * gram.n
-    scaled = (tuple(times * number for number in some) for some in (sums, products))
-    return Gram(gram.signals, times * gram.n, *scaled)
+    return Gram(gram.signals, gram.n, tuple(sums), tuple(products)).scaled(times)
 
 
 def forged(grams: Sequence[Gram], how: str) -> Rows:

@@ -159,7 +159,7 @@ def test_the_order_and_the_size_of_counts_do_not_matter() -> None:
     assert np.array_equal(
         robust_weights(DriveMoments.from_table(table.take(order))).weights, parts[order]
     )
-    origin = robust_weights(DriveMoments.from_table(table.about_origin()), intercept=False)
+    origin = robust_weights(DriveMoments.from_table(table.about_origin()))
     assert np.array_equal(origin.weights, parts)
 
 

@@ -44,9 +44,9 @@ def test_certified_digits(name: str) -> None:
     if degree is not None:
         counts, scales = polynomial(counts, scales, degree)
     signals = ("y", *(f"x{i}" for i in range(1, len(scales))))
-    fitted = fit(
-        Gram.from_counts(signals, counts), signals[1:], "y", intercept=problem["model"]["intercept"]
-    )
+    gram = Gram.from_counts(signals, counts)
+    gram = gram if problem["model"]["intercept"] else gram.about_origin()
+    fitted = fit(gram, signals[1:], "y")
     result = infer(fitted, dict(zip(signals, scales, strict=True)))
     certified = problem["certified"]
     assert len(result.estimates) == len(certified["coef"])

@@ -45,7 +45,8 @@ def test_cluster_errors_are_those_of_the_rows(intercept: bool, seed: int, inputs
     drives = [counts + 500 for counts in random_drives(seed, drives=9, inputs=inputs)]
     order = [*range(inputs)][::-1][:3]
     signals = [f"x{i + 1}" for i in order]
-    fitted = fit(gram_of(np.concatenate(drives)), signals, "y", intercept=intercept)
+    gram = gram_of(np.concatenate(drives))
+    fitted = fit(gram if intercept else gram.about_origin(), signals, "y")
     result = infer(fitted, unit_scales(inputs), moments_of(drives, intercept=intercept))
     columns = [drive[:, [*order, -1]] for drive in drives]
     errors, degrees = by_rows(columns, intercept=intercept)
@@ -131,7 +132,8 @@ def test_coefficients_errors_and_evidence_are_those_of_statsmodels(
 ) -> None:
     parts = collinear(seed, inputs, drives, collinearity, scale)
     counts = np.concatenate(parts)
-    fits = nested_fits(gram_of(counts), names(inputs)[:-1], "y", intercept=intercept)
+    gram = gram_of(counts) if intercept else gram_of(counts).about_origin()
+    fits = nested_fits(gram, names(inputs)[:-1], "y")
     x, y = counts[:, :-1].astype(float), counts[:, -1].astype(float)
     model = sm.OLS(y, sm.add_constant(x) if intercept else x)
     result, expected = infer(fits[-1], unit_scales(inputs)), model.fit()
