@@ -9,7 +9,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import fleet_slip
 from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.compute.tasks import LocalThreads
 from fleet_slip.errors import StorageError
@@ -20,10 +19,9 @@ from fleet_slip.operations.verify import check_grams, differing_drives, grams_of
 from fleet_slip.regression.gram import Gram, packed_size
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.storage.table import AppTransaction, Change
-from fleet_slip.warehouse.gram_reader import find_backlog, gram_table, is_onboard_file, named_files
+from fleet_slip.warehouse.gram_reader import find_backlog, gram_table
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
-from tests.support.counted_rows import START_S, rows_of_fleet, write_counted
 from tests.support.logs import DAY, land, log_rows, random_counts
 
 NAMES = SIGNALS.gram_signals
@@ -183,39 +181,6 @@ def test_gram_rows_that_came_in_pieces_are_one_table() -> None:
         assert table.signals == ("ax", "ay")
         assert table.products.shape == (6, packed_size(2))
         assert [table.sums[i].tolist() for i in range(6)] == [list(g.sums) for g in grams]
-
-
-def test_rows_of_cars_are_not_read(tmp_path: Path) -> None:
-    """A year of them is 17 GB, and none is of a log."""
-    fleet = fleet_slip.open(tmp_path / "data")
-    path = tmp_path / "day"
-    write_counted(path, rows_of_fleet(3, START_S, seed=1))
-    fleet.import_onboard_grams(path)
-    grams = fleet.warehouse.grams.snapshot()
-    [file] = grams.files
-    assert is_onboard_file(file)
-    Path(str(fleet.warehouse.grams.folder), file.path).write_bytes(b"nobody reads it")
-    found = find_backlog(fleet.warehouse.logs.snapshot(), grams)
-    assert not found.missing
-    assert not found.stale
-
-
-def test_files_are_told_by_feature_set(tmp_path: Path) -> None:
-    warehouse = fleet_slip.open(tmp_path / "data").warehouse
-    schema = warehouse.grams.usual_schema
-    rows = pa.Table.from_pylist(
-        [
-            {"feature_set": name, "file": f"{name[0]}-{i % 3}"}
-            for name in ("signals", "motion-1")
-            for i in range(9)
-        ],
-        schema=schema,
-    )
-    action = warehouse.grams.write_file("signals", rows)
-    warehouse.grams.snapshot().commit(Change(add=[action]))
-    done, named = named_files(warehouse.grams.snapshot(), "motion-1")
-    assert done == {"m-0", "m-1", "m-2"}
-    assert named == done | {"s-0", "s-1", "s-2"}
 
 
 def test_no_feature_set_is_called_as_the_rows_of_cars_are() -> None:
