@@ -42,13 +42,13 @@ from fleet_slip.calibration.sensor_relations import (
     estimate_parameters,
     kinds_by_set,
 )
-from fleet_slip.catalog.calibration_parameters import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import (
     CALIBRATION,
     CALIBRATION_PARAMETERS,
     DELAY,
     CalibrationParameterName,
 )
-from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import sqrt as sqrt_exact

@@ -14,9 +14,9 @@ import numpy as np
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
 from fleet_slip.calibration.car_calibration import Calibration, DriveSums, calibrate, collect_sums
-from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import STRAIGHT, STRAIGHT_COURSE, TURNED, turned_scale
+from fleet_slip.catalog.definitions import CalibrationParameterName
 from fleet_slip.errors import DataError
 from fleet_slip.quality.course_relation import COLUMNS
 from fleet_slip.regression.exact import solve_rational

@@ -20,8 +20,8 @@ import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.base import Record
-from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import LATE_PARTS, MAX_COURSE_DELAY, MIN_COURSE_DELAY
+from fleet_slip.catalog.definitions import DELAY
 from fleet_slip.catalog.signals import RECEIVER, SAMPLE_TIME_S
 from fleet_slip.regression.gram import GramTable
 from fleet_slip.regression.inference import Pooled, pool

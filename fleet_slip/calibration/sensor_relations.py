@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 
-from fleet_slip.catalog.calibration_parameters import (
+from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.catalog.definitions import (
     BY_COURSE,
     BY_SATELLITE,
     CalibrationParameterName,
 )
-from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.course import TURNED, turned_scale
 from fleet_slip.quality.course_relation import LEVERS_M, MIN_CHANGES, MIN_TURNED_RAD
 from fleet_slip.regression.exact import solve_rational
 from fleet_slip.regression.gram import Gram

@@ -9,10 +9,11 @@ from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 from fleet_slip.base import canonical_json, hash_fold, sha256_of
-from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.course import YAW_RATE, course_units
 from fleet_slip.catalog.definitions import (
+    CALIBRATION,
     COUNT_BITS,
+    DELAY,
     Combination,
     Definition,
     limit_of,

@@ -25,20 +25,18 @@ from pydantic import (
 )
 
 from fleet_slip.catalog.arithmetic import nearest_sql, parse
-from fleet_slip.catalog.calibration_parameters import (
-    CALIBRATION_PARAMETERS,
-    CalibrationParameterName,
-    ColumnUnit,
-)
 from fleet_slip.catalog.course import AUXILIARY
 from fleet_slip.catalog.course import MAX_CHANGE_TICKS as MAX_COURSE_CHANGE_TICKS
 from fleet_slip.catalog.definitions import (
+    CALIBRATION_PARAMETERS,
     COUNT_BITS,
     LARGEST_BITS,
     MAX_CHANGE_TICKS,
     AttributeFactor,
     AttributeText,
     Bits,
+    CalibrationParameterName,
+    ColumnUnit,
     Combination,
     Definition,
     Equation,

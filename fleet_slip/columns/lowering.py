@@ -13,8 +13,8 @@ from itertools import combinations_with_replacement
 from typing import Any, Literal, TypeVar
 
 from fleet_slip.catalog.arithmetic import nearest, parse, truncated
-from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.catalog.definitions import (
+    CALIBRATION_PARAMETERS,
     COUNT_BITS,
     MAX_ATTRIBUTE,
     WEIGHT,

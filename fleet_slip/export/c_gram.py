@@ -30,7 +30,6 @@ from typing import Any
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.course_label import intercept_columns
 from fleet_slip.calibration.receiver_delay import delay_columns
-from fleet_slip.catalog.calibration_parameters import CALIBRATION, DELAY
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import (
     AUXILIARY,
@@ -42,7 +41,7 @@ from fleet_slip.catalog.course import (
     YAW_RATE,
     course_units,
 )
-from fleet_slip.catalog.definitions import plain_column
+from fleet_slip.catalog.definitions import CALIBRATION, DELAY, plain_column
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import HALF_TURN, SAMPLE_TIME_S
 from fleet_slip.columns.column_sql import rows_of

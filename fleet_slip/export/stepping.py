@@ -14,8 +14,8 @@ import pyarrow as pa
 
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
-from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.catalog.definitions import round_number
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
 from fleet_slip.columns.lowering import power

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray
 from fleet_slip.calibration.car_calibration import calibration_of
-from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.course import AUXILIARY, TURNED
-from fleet_slip.catalog.definitions import ParameterFactor
+from fleet_slip.catalog.definitions import CALIBRATION, ParameterFactor
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.regression.gram import GramTable, packed_position, packed_positions
 from fleet_slip.warehouse.gram_reader import OpenedGrams, by_signals, gram_table

@@ -20,8 +20,8 @@ from deltalake.transaction import AddAction
 from fleet_slip.arrays import BoolArray, IntArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.calibration.receiver_delay import course_delays
-from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import COURSE_LATE
+from fleet_slip.catalog.definitions import DELAY
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import ConflictError, StorageError
 from fleet_slip.grams.compute import aggregate, compute_grams

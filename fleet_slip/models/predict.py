@@ -17,8 +17,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.catalog.calibration_parameters import round_number
 from fleet_slip.catalog.counts import round_chunks, valid_values
+from fleet_slip.catalog.definitions import round_number
 from fleet_slip.catalog.signals import SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts
 from fleet_slip.compiling import kernel

@@ -13,8 +13,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.course_label import course_moments
 from fleet_slip.calibration.receiver_delay import GRAIN_S, ReceiverDelay, receiver_delays
-from fleet_slip.catalog.calibration_parameters import DELAY
 from fleet_slip.catalog.course import YAW_RATE
+from fleet_slip.catalog.definitions import DELAY
 from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import RefusedError
 from fleet_slip.grams.cohort import hash_names

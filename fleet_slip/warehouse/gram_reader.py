@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from fleet_slip.arrays import BoolArray, IntArray
-from fleet_slip.catalog.calibration_parameters import CALIBRATION
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.course import TURNED
+from fleet_slip.catalog.definitions import CALIBRATION
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import (
     LONGEST_PAUSE_S,

@@ -32,12 +32,12 @@ from fleet_slip.calibration.sensor_relations import (
     estimate_parameters,
     kinds_by_set,
 )
-from fleet_slip.catalog.calibration_parameters import (
+from fleet_slip.catalog.course import TURNED, turned_scale
+from fleet_slip.catalog.definitions import (
     BY_COURSE,
     BY_SATELLITE,
     CALIBRATION_PARAMETERS,
 )
-from fleet_slip.catalog.course import TURNED, turned_scale
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.operations.forget import forget

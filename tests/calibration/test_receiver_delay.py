@@ -18,7 +18,7 @@ from fleet_slip.calibration.receiver_delay import (
     receiver_delays,
     with_pooled,
 )
-from fleet_slip.catalog.calibration_parameters import DELAY
+from fleet_slip.catalog.definitions import DELAY
 from fleet_slip.errors import RefusedError
 from fleet_slip.warehouse.erasure_log import ErasureLog, ErasureSubject
 from fleet_slip.warehouse.gram_reader import open_grams

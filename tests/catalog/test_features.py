@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray
-from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
 from fleet_slip.catalog.catalog import load_catalog
 from fleet_slip.catalog.definitions import (
+    CALIBRATION_PARAMETERS,
     EXCHANGED,
     OFFSETS,
     OPPOSITE,

@@ -17,9 +17,9 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from fleet_slip.catalog.calibration_parameters import CalibrationParameterName
 from fleet_slip.catalog.definitions import (
     AttributeFactor,
+    CalibrationParameterName,
     Combination,
     Definition,
     Equation,

@@ -8,7 +8,7 @@ import pytest
 
 import fleet_slip
 from fleet_slip.calibration.car_calibration import calibrate
-from fleet_slip.catalog.calibration_parameters import CALIBRATION_PARAMETERS
+from fleet_slip.catalog.definitions import CALIBRATION_PARAMETERS
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.errors import DataError, InputError
 from fleet_slip.grams.calibrated_columns import expand
