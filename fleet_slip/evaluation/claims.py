@@ -115,11 +115,6 @@ def change(report: ReportData, *scenarios: str) -> float:
     return largest_deg / float(report.errors(NOMINAL).rmse_deg)
 
 
-def nominal_errors(report: ReportData) -> dict[str, float]:
-    """Return the RMSE of each model of Table I on the nominal drive."""
-    return {name: report.errors(NOMINAL, model).rmse_deg for name, model in report.models.items()}
-
-
 def signal_count(report: ReportData) -> int:
     """Return the number of signals of the paper's choice."""
     return len(report.estimators[report.choice]["signals"])
@@ -275,7 +270,7 @@ def exactly_as_accurate(report: ReportData) -> Finding:
 @claim("III, Table II", "each model's root mean square error is at most that of Table II")
 def all_accurate(report: ReportData) -> Finding:
     """All models predict the side-slip angle accurately."""
-    errors = nominal_errors(report)
+    errors = {n: report.errors(NOMINAL, name).rmse_deg for n, name in report.models.items()}
     std_deg = report.scenario(NOMINAL)["truth"]["sideslip_std_deg"]
     return Finding(
         all(error <= math.hypot(*PAPER_TABLE_TWO[name]) for name, error in errors.items()),

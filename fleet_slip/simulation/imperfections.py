@@ -133,7 +133,7 @@ class ImperfectionRanges(Config):
     road: dict[str, Range] = Field(default={})
 
     @model_validator(mode="after")
-    def _both_ends_are_valid(self) -> "ImperfectionRanges":
+    def _is_valid(self) -> "ImperfectionRanges":
         for config, ranges in (
             (CarImperfections, self.car),
             (SensorImperfections, self.sensors),
@@ -144,10 +144,6 @@ class ImperfectionRanges(Config):
                 raise ValueError(f"{unknown[0]!r} is no imperfection. Choose from: {names}")
             config.model_validate({name: bounds.min for name, bounds in ranges.items()})
             config.model_validate({name: bounds.max for name, bounds in ranges.items()})
-        return self
-
-    @model_validator(mode="after")
-    def _tread_does_not_grow(self) -> "ImperfectionRanges":
         if self.tread_wear_per_100_days and self.tread_wear_per_100_days.min < 0:
             raise ValueError("tread_wear_per_100_days must be at least 0: a tread does not grow")
         return self

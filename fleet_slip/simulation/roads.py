@@ -80,13 +80,9 @@ class Track(Config):
     segments: tuple[Segment, ...] = Field(min_length=1, max_length=10_000)
 
     @model_validator(mode="after")
-    def _is_not_too_long(self) -> Self:
+    def _can_be_driven(self) -> Self:
         if self.length_m > MAX_LENGTH_M:
             raise ValueError(f"is {self.length_m:g} m long: give at most {MAX_LENGTH_M:g} m")
-        return self
-
-    @model_validator(mode="after")
-    def _curvature_is_continuous(self) -> Self:
         following = [*self.segments[1:], *(self.segments[:1] if self.closed else ())]
         for index, (segment, successor) in enumerate(zip(self.segments, following, strict=False)):
             end, start = segment.curvature_1pm[1], successor.curvature_1pm[0]
@@ -95,13 +91,7 @@ class Track(Config):
                     f"curvature jumps from {end} to {start} 1/m after segment {index}"
                     f" (counted from 0)"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _closed_track_closes(self) -> Self:
-        if not self.closed:
-            return self
-        gap_m, gap_rad = self.closure()
+        gap_m, gap_rad = self.closure() if self.closed else (0.0, 0.0)
         if gap_m > CLOSURE_TOLERANCE_M or gap_rad > CLOSURE_TOLERANCE_RAD:
             raise ValueError(
                 f"the lap does not close: its ends are {gap_m:.3f} m and {gap_rad:.5f} rad apart"

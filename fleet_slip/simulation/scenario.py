@@ -88,7 +88,7 @@ class Scenario(Config):
         return _complete(content, (), info) if isinstance(content, dict) else content
 
     @model_validator(mode="after")
-    def _pace_is_on_the_track(self) -> Self:
+    def _is_consistent(self) -> Self:
         stations = [point.station_m for point in self.pace]
         if stations != sorted(set(stations)):
             raise ValueError("the stations of pace must increase")
@@ -96,10 +96,6 @@ class Scenario(Config):
             raise ValueError(
                 f"pace: {stations[-1]} m is beyond {self.track.name}, {self.track.length_m:.0f} m"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _load_has_a_mass(self) -> Self:
         if self.load_position_m is not None and self.sprung_mass_kg is None:
             raise ValueError("load_position_m needs a sprung_mass_kg")
         return self

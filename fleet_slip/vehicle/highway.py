@@ -5,7 +5,9 @@ so that a positive steering angle turns the car to the right of the picture.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
@@ -218,20 +220,9 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """Return a car where another vehicle is, in the same motion if it has four wheels."""
         if not isinstance(vehicle, FourWheelVehicle):
             return super().create_from(vehicle)  # type: ignore[no-any-return]
-        copy = cls(
-            vehicle.road,
-            vehicle.position,
-            vehicle.heading,
-            vehicle.speed,
-            vehicle.parameters,
-            vehicle.adhesion,
-            vehicle.imperfections,
-        )
-        copy.lateral_speed, copy.yaw_rate = vehicle.lateral_speed, vehicle.yaw_rate
-        copy.last_motion = vehicle.last_motion
-        if hasattr(vehicle, "color"):
-            copy.color = vehicle.color
-        return copy
+        twin = copy(vehicle)
+        twin.history = deque(maxlen=cls.HISTORY_SIZE)
+        return twin
 
     @property
     def motion(self) -> State:
