@@ -1,7 +1,6 @@
 """SQL views of a data root, of one moment: its tables, the models and the history of runs."""
 
 import re
-import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,11 +138,6 @@ class Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, _traceback: object) -> None:
         if not isinstance(error, QueryGoesOnError):
             self.close()

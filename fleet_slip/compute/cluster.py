@@ -15,7 +15,6 @@ import uuid
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, Future
-from dataclasses import dataclass
 from functools import cache, partial
 from hashlib import sha256
 from importlib.metadata import version
@@ -65,6 +64,9 @@ FIRST_S = 10.0
 CLOSE_S = 5.0
 MARKER_FOLDER = ".cluster"
 
+Marker = tuple[Folder, str]
+"""Folder and name of a file by which a worker checks that it sees the same data root."""
+
 
 @contextlib.contextmanager
 def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
@@ -84,10 +86,13 @@ def cluster_executor(address: str, root: Folder) -> Iterator["ClusterExecutor"]:
             "scheduler; or name no cluster, and unset DASK_SCHEDULER_ADDRESS, to work on this "
             "machine."
         ) from None
+    markers, name = root / MARKER_FOLDER, uuid.uuid4().hex
     try:
-        with _marker(root) as marker, ClusterExecutor(client, address, marker) as executor:
-            yield executor
+        markers.create(name, b"")
+        yield ClusterExecutor(client, address, (markers, name))
     finally:
+        with contextlib.suppress(StorageError):
+            markers.delete(name)
         with contextlib.suppress(OSError, AssertionError):
             client.close(timeout=CLOSE_S)
 
@@ -102,37 +107,6 @@ def _connect(address: str) -> Client:
         with contextlib.suppress(AssertionError):
             return connect()
     return connect()
-
-
-@dataclass(frozen=True)
-class Marker:
-    """A file in the data root by which a worker checks that it sees the same root."""
-
-    folder: Folder
-    name: str
-
-    def require_seen(self, where: str) -> None:
-        """Raise `StorageError` if the file does not exist."""
-        try:
-            self.folder.read(self.name)
-        except StorageError as error:
-            raise StorageError(
-                f"{where} does not see the data root of this command ({error}). Use a file system "
-                "that all machines share, mounted at the same path, or an object store that all "
-                "may use."
-            ) from None
-
-
-@contextlib.contextmanager
-def _marker(root: Folder) -> Iterator[Marker]:
-    """Create a marker, and delete it at the end."""
-    marker = Marker(root / MARKER_FOLDER, uuid.uuid4().hex)
-    marker.folder.create(marker.name, b"")
-    try:
-        yield marker
-    finally:
-        with contextlib.suppress(StorageError):
-            marker.folder.delete(marker.name)
 
 
 class ClusterExecutor(Executor):
@@ -202,8 +176,15 @@ def work(expected: Mapping[str, str], task: bytes) -> Any:
     """
     this_worker = f"worker {socket.gethostname()}:{os.getpid()}"
     _require_same(this_worker, expected, environment())
-    marker, function, item = pickle.loads(task)  # noqa: S301 - from the scheduler, which is trusted
-    marker.require_seen(this_worker)
+    (markers, name), function, item = pickle.loads(task)  # noqa: S301 - the scheduler is trusted
+    try:
+        markers.read(name)
+    except StorageError as error:
+        raise StorageError(
+            f"{this_worker} does not see the data root of this command ({error}). Use a file "
+            "system that all machines share, mounted at the same path, or an object store that all "
+            "may use."
+        ) from None
     try:
         return function(item)
     except FleetSlipError as error:

@@ -274,12 +274,8 @@ class Evolution:
 
 def compare_schemas(schema: pa.Schema, delta: DeltaTable) -> Evolution:
     """Compare the catalog's schema with the stored table's."""
-    from deltalake.exceptions import DeltaError
-
-    try:
+    with storage_errors(delta.table_uri):
         stored = {field.name: field.metadata for field in delta.schema().fields}
-    except DeltaError as error:
-        raise StorageError(f"{delta.table_uri}: its schema cannot be read: {error}") from None
     scales = {name: scale for name, scale in scales_of(schema).items() if name in stored}
     return Evolution(
         added=tuple(name for name in schema.names if name not in stored),

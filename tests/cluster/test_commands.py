@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from distributed import Client
 
-from fleet_slip.compute.cluster import Marker, cluster_executor, environment, pickled, work
+from fleet_slip.compute.cluster import cluster_executor, environment, pickled, work
 from fleet_slip.compute.tasks import LocalThreads, run_tasks
 from fleet_slip.errors import RefusedError, StorageError
 from fleet_slip.storage.data_files import checksum_in
@@ -150,7 +150,7 @@ def test_a_scheduler_that_tells_other_news_at_once_is_asked_again(
 
 
 def test_a_task_makes_sure_of_its_ground(tmp_path: Path) -> None:
-    task = pickled(Marker(LocalFolder(tmp_path), "marker"), obey, Order("a", tmp_path))
+    task = pickled((LocalFolder(tmp_path), "marker"), obey, Order("a", tmp_path))
     with pytest.raises(StorageError, match="does not see the data root"):
         work(environment(), task)
     (tmp_path / "marker").touch()
