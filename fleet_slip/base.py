@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import shlex
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -197,11 +196,6 @@ def name_key(name: str) -> str:
 def pluralize(number: int, noun: str) -> str:
     """Return a number with its noun, such as `1 drive` or `1,500 Gram rows`."""
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
-
-
-def quote_argument(text: str) -> str:
-    """Quote an argument of a command line, by double quotes unless a shell would change it."""
-    return shlex.quote(text) if set(text) & set('"$`\\!') else f'"{text}"'
 
 
 def quote_name(text: object) -> str:

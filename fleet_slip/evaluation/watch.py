@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from markupsafe import Markup
 
-from fleet_slip.arrays import FloatArray, float_column
+from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
@@ -117,10 +117,11 @@ def drive_frames(warehouse: Warehouse, name: str, version: ModelVersion) -> Driv
             f"{name!r} is neither a drive nor a scenario. See: "
             'fleet-slip sql "SELECT drive_id, drive_name, source_file FROM drives"'
         )
-    columns = {name: float_column(rows, name) for name in names}
+    columns = {name: rows[name].to_numpy().astype(np.float64) for name in (*names, "time_s")}
+    time_s = columns.pop("time_s")
     facts = {name: rows[name][0].as_py() for name in (*FACTS, "track")}
     facts["drive_id"] = drive_id
-    frames = frames_of(drive_id, columns, facts, float_column(rows, "time_s"), version)
+    frames = frames_of(drive_id, columns, facts, time_s, version)
     return replace(
         frames, reference="reference" if rows["source"][0].as_py() == MEASURED else "true"
     )

@@ -8,7 +8,6 @@ root and a name can ask whether it was erased.
 
 "begun" of a car or drive also contains the digests of the drives' counts, by which a drive under
 another name is recognised: of its log (`digest_counts`) and of its Gram rows (`gram_digests`).
-Entries of release 0.2, which have no key, are an error: its data roots are not read any more.
 
 Names are hashed after `name_key`: `V1`, ` v1 ` and `V1` are one car. Entries of earlier releases
 contain the hash of the name as typed.
@@ -95,13 +94,7 @@ def _digest(text: str, key: str) -> str:
 @functools.lru_cache(100_000)
 def _entry(folder: DocumentFolder, number: int) -> Mapping[str, Any]:
     """Return an entry. Entries never change, so each is read once."""
-    entry = folder.read(number).content
-    if "key" not in entry:
-        raise StorageError(
-            f"{folder.file(number)}: of release 0.2, whose data roots this release does not read. "
-            "Ingest and simulate into a new data root."
-        )
-    return entry
+    return folder.read(number).content
 
 
 def skipped_drives(count: int) -> str:

@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import polars as pl
 from pydantic import Field, field_validator, model_validator
 
-from fleet_slip.arrays import is_finite
 from fleet_slip.config import Config, Name, added, read_named_file
 from fleet_slip.errors import ConfigError
 
@@ -61,7 +60,7 @@ class PlainNumbers:
 
     def are_in(self, column: pl.Series) -> bool:
         """Return True if a column that was parsed as numbers has one in every row."""
-        if column.null_count() or not is_finite(column.to_numpy()):
+        if column.null_count() or not column.is_finite().all():
             return False
         return not (self.missing and column.is_in(self.missing).any())
 
