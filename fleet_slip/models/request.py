@@ -186,15 +186,7 @@ class CandidateModel(Config):
     signals: Annotated[Members, Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _signals_are_inputs(self, info: ValidationInfo) -> "CandidateModel":
-        if catalog := _catalog_of(info):
-            inputs = catalog.inputs
-            for name in self.signals:
-                if name not in inputs:
-                    raise ValueError(
-                        f"model {self.name!r}: {name!r} is not an input. Inputs: "
-                        f"{name_inputs(catalog, inputs)}"
-                    )
+    def _signals_differ(self) -> "CandidateModel":
         if len(set(self.signals)) < len(self.signals):
             raise ValueError(f"model {self.name!r} names a signal twice")
         return self
@@ -297,7 +289,7 @@ class ModelList(Config):
         if absent := self.absent_from(inputs):
             raise ValueError(
                 f"{', '.join(absent)} is not in the feature set {self.features!r}. Its inputs: "
-                f"{', '.join(inputs)}"
+                f"{name_inputs(catalog, inputs)}"
             )
         return self
 

@@ -158,15 +158,15 @@ class _Search:
         """Return independent inputs, found by pivoting on the largest remaining variance."""
         if self._far_from_dependent():
             return list(range(self.inputs))
-        work, independent = self.matrix[:-1, :-1].copy(), list[int]()
-        while len(independent) < self.inputs:
-            variance = work.diagonal().copy()
-            variance[independent] = -1
-            best = int(np.argmax(variance))
-            if variance[best] < DEPENDENT:
-                break
+        work, names = self.matrix[:-1, :-1].copy(), np.arange(self.inputs)
+        independent = list[int]()
+        while work[best := int(np.argmax(work.diagonal())), best] >= DEPENDENT:
+            independent.append(int(names[best]))
             work -= np.multiply.outer(work[:, best], work[best] / work[best, best])
-            independent.append(best)
+            work[best, best] = -1  # taken
+            is_open = work.diagonal() > -0.5
+            if is_open.any() and 8 * is_open.sum() < 7 * len(names):
+                work, names = work[np.ix_(is_open, is_open)], names[is_open]
         return sorted(independent)
 
     def _far_from_dependent(self) -> bool:
