@@ -49,7 +49,7 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 
 @dataclass(frozen=True)
-class DriveRows:
+class SoundDrive:
     """Signals of a drive, the rows in which it moves, and its speed in m/s, if that is sound."""
 
     signals: Signals
@@ -61,7 +61,7 @@ class DriveRows:
         """Return True if the drive has these signals."""
         return set(names) <= set(self.signals)
 
-    def without(self, faults: Sequence[Fault]) -> "DriveRows":
+    def without(self, faults: Sequence[Fault]) -> "SoundDrive":
         """Return the drive with the signals that no fault names."""
         faulty = {name for fault in faults for name in fault.signals}
         sound = {name: values for name, values in self.signals.items() if name not in faulty}
@@ -84,7 +84,7 @@ def check_plausibility(
     computed from its velocities, where its remedies concern these.
     """
     label, faults = catalog.label, list(_without_change(catalog, signals))
-    sound = DriveRows(signals, label, np.ones(1, dtype=np.bool_)).without(faults)
+    sound = SoundDrive(signals, label, np.ones(1, dtype=np.bool_)).without(faults)
     sound = replace(sound, moving=is_moving(sound.signals))
     one_sided = list(find_one_sided(sound))
     faults += (fault for fault in one_sided if label not in fault.signals)
@@ -150,7 +150,7 @@ MIN_ONE_SIDED_S = 60.0
 """In a shorter drive a car may turn to one side."""
 
 
-def find_one_sided(drive: DriveRows) -> Iterator[Fault]:
+def find_one_sided(drive: SoundDrive) -> Iterator[Fault]:
     """Yield signals that never change their sign while the car drives; the label comes last.
 
     A car that does turn to one side, as on an oval, shows it by its rear wheels, or by the mean of
@@ -192,7 +192,7 @@ def _side(values: FloatArray, rows: BoolArray) -> int:
     return -1 if high <= -CHECKS["lost sign"].low * low else 0
 
 
-def _turning(drive: DriveRows) -> list[Fault]:
+def _turning(drive: SoundDrive) -> list[Fault]:
     """Compare the signs of turning, and both accelerations with the turns, while the car moves."""
     names = {"ax", *(name for parts in WITNESSES.values() for name in parts)}
     used = {name: values for name, values in drive.signals.items() if name in names}
@@ -208,7 +208,7 @@ def _turning(drive: DriveRows) -> list[Fault]:
     return [*faults, *find_swapped_axes(moments).values()]
 
 
-def _decide(fault: Fault, drive: DriveRows) -> Fault:
+def _decide(fault: Fault, drive: SoundDrive) -> Fault:
     """Return which one of ay and yaw rate contradicts the label, too; the fault if none does."""
     drive = replace(drive, speed=speed_mps(drive.signals))
     if drive.speed is None or not drive.has(drive.label, "yaw_rate", "ay"):
@@ -236,7 +236,7 @@ def _ratio(values: FloatArray, expected: FloatArray, rows: BoolArray) -> float |
     return ratio if ratio > 0 else None
 
 
-def _speeds(drive: DriveRows) -> Iterator[Fault]:
+def _speeds(drive: SoundDrive) -> Iterator[Fault]:
     """Compare each wheel with all, and each speed with the wheels; ay and yaw rate decide."""
     signals, moving = drive.signals, drive.moving
     wheels = wheel_speed_mps(signals)
@@ -261,7 +261,7 @@ def _speeds(drive: DriveRows) -> Iterator[Fault]:
             yield check.fault(*named, name=name, ratio=ratio)
 
 
-def _turns_at(speed: FloatArray, drive: DriveRows) -> bool:
+def _turns_at(speed: FloatArray, drive: SoundDrive) -> bool:
     """Return True if ay is the yaw rate times this speed."""
     if not drive.has("ay", "yaw_rate"):
         return False
@@ -271,7 +271,7 @@ def _turns_at(speed: FloatArray, drive: DriveRows) -> bool:
 
 
 def _compared(
-    drive: DriveRows, speed: FloatArray
+    drive: SoundDrive, speed: FloatArray
 ) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
     """Yield signals, the predictor of the first, its ratio to that, and their correlation."""
     signals, moving = drive.signals, drive.moving
@@ -295,7 +295,7 @@ def _compared(
         yield ("steering_wheel", angle), "15 times the other", *slope_of(wheel, column, moving)
 
 
-def _sizes(drive: DriveRows, speed: FloatArray) -> Iterator[Fault]:
+def _sizes(drive: SoundDrive, speed: FloatArray) -> Iterator[Fault]:
     """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
     for names, expected, slope, correlation in _compared(drive, speed):
         ratio = slope if correlation > 0 else -slope
@@ -310,7 +310,7 @@ MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05
 """Bends of 20 m and less, at a speed and yaw rate times speed at which the tyres hardly slip."""
 
 
-def _axles(drive: DriveRows, speed: FloatArray) -> Iterator[Fault]:
+def _axles(drive: SoundDrive, speed: FloatArray) -> Iterator[Fault]:
     """Compare axles in tight bends: the front one drives the longer way."""
     if not drive.has("yaw_rate", *WHEELS):
         return
@@ -353,7 +353,7 @@ Contradiction: TypeAlias = tuple[str, Mapping[str, float]]
 NONE: Contradiction = ("", {})
 
 
-def check_label(drive: DriveRows, *, from_velocities: bool) -> list[Fault]:
+def check_label(drive: SoundDrive, *, from_velocities: bool) -> list[Fault]:
     """Return the first fault of a label that the motion of its car shows."""
     if not drive.has(drive.label, "yaw_rate"):
         return []
@@ -366,7 +366,7 @@ def check_label(drive: DriveRows, *, from_velocities: bool) -> list[Fault]:
     return [check.fault(drive.label, **figures)]
 
 
-def _contradiction(drive: DriveRows) -> Contradiction:
+def _contradiction(drive: SoundDrive) -> Contradiction:
     signals, speed, moving = drive.signals, drive.speed, drive.moving
     angle = np.where(moving, signals[drive.label], np.nan)
     if speed is not None:
@@ -384,7 +384,7 @@ def _contradiction(drive: DriveRows) -> Contradiction:
     return NONE
 
 
-def _gentle(drive: DriveRows, speed: FloatArray) -> BoolArray:
+def _gentle(drive: SoundDrive, speed: FloatArray) -> BoolArray:
     """Return where the car turns gently and slowly, or not at all."""
     signals = drive.signals
     slow = (speed < SLOW_MPS) & (speed > 0) & (np.abs(signals["ay"]) < GENTLE_MPS2)
@@ -392,7 +392,7 @@ def _gentle(drive: DriveRows, speed: FloatArray) -> BoolArray:
 
 
 def _fit_lever(
-    angle: FloatArray, drive: DriveRows, speed: FloatArray
+    angle: FloatArray, drive: SoundDrive, speed: FloatArray
 ) -> tuple[float, float, float]:
     """Return the slope on the curvature in m, the constant and the explained share.
 
@@ -413,7 +413,7 @@ def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
     return bool(abs(np.corrcoef(curvature, squared)[0, 1]) > MAX_COLLINEARITY)
 
 
-def _lever(drive: DriveRows, speed: FloatArray, *, sliding: bool) -> Contradiction:
+def _lever(drive: SoundDrive, speed: FloatArray, *, sliding: bool) -> Contradiction:
     """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
     lever_m, zero, explained = _fit_lever(drive.signals[drive.label], drive, speed)
     check, sign = CHECKS["scale of the label"], CHECKS["sign of the label"]
@@ -441,7 +441,7 @@ def _lever(drive: DriveRows, speed: FloatArray, *, sliding: bool) -> Contradicti
     return NONE
 
 
-def _wheelbase_m(drive: DriveRows, speed: FloatArray) -> float:
+def _wheelbase_m(drive: SoundDrive, speed: FloatArray) -> float:
     """Return the wheelbase that the road wheels show, infinity if they show none."""
     angle = next((drive.signals[name] for name in ROAD_WHEELS if drive.has(name)), None)
     if angle is None:
@@ -452,7 +452,7 @@ def _wheelbase_m(drive: DriveRows, speed: FloatArray) -> float:
     return wheelbase_m if is_sure else math.inf
 
 
-def _fit_one_speed(drive: DriveRows, speed: FloatArray) -> tuple[float, float, float]:
+def _fit_one_speed(drive: SoundDrive, speed: FloatArray) -> tuple[float, float, float]:
     """Return the slope on the curvature in m, the mean squared speed and the explained share.
 
     At one speed the slope is the lever less the compliance times the squared speed.

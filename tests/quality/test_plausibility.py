@@ -16,7 +16,7 @@ from fleet_slip.errors import AlarmError
 from fleet_slip.ingest.measured_log import find_refusals, open_measured
 from fleet_slip.quality.checks import Fault
 from fleet_slip.quality.drive_signals import RADIUS_M, WHEELS
-from fleet_slip.quality.plausibility import DriveRows, check_plausibility, find_one_sided
+from fleet_slip.quality.plausibility import SoundDrive, check_plausibility, find_one_sided
 from tests.support.catalog import SIGNALS
 from tests.support.commands import run_on
 from tests.support.measured import MAPPING_TEXT, a_mapping, csv_text, good_columns
@@ -276,8 +276,8 @@ def test_a_car_on_an_oval_has_its_sign() -> None:
     turning = {"yaw_rate": np.full(9000, 0.2) + 0.05 * np.sin(np.arange(9000))}
     wheels = {"wheel_rl": np.full(9000, 40.0), "wheel_rr": np.full(9000, 42.0)}
     everywhere = np.ones(9000, dtype=np.bool_)
-    assert list(find_one_sided(DriveRows(turning, "sideslip", everywhere)))
-    assert not list(find_one_sided(DriveRows({**turning, **wheels}, "sideslip", everywhere)))
+    assert list(find_one_sided(SoundDrive(turning, "sideslip", everywhere)))
+    assert not list(find_one_sided(SoundDrive({**turning, **wheels}, "sideslip", everywhere)))
 
 
 def cars(number: int) -> list[pl.DataFrame]:
