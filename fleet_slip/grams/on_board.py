@@ -318,15 +318,13 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
     sets = onboard_feature_sets(warehouse.catalog)
     _require_possible(sets, file, table)
     new_rows = _gram_rows(sets, table, warehouse.grams.schema, f"{RECEIVED_FILES}{digest[:24]}")
-    numbered = _numbered(_with_digests(new_rows))
+    numbered = _with_digests(new_rows)
     _require_different(file, numbered)
 
     def attempt() -> None:
         grams = warehouse.grams.snapshot()
-        if (
-            grams.transaction_version(transaction.name) is not None
-        ):  # by another process in the meantime
-            return
+        if grams.transaction_version(transaction.name) is not None:
+            return  # another process has imported it in the meantime
         # Checked after the snapshot: an erasure from now on makes this commit a conflict.
         _require_allowed(file, warehouse, numbered)
         _require_new(file, grams, numbered)
@@ -578,7 +576,7 @@ def _numbered(table: pa.Table) -> pa.Table:
 
 def _with_digests(rows: pa.Table) -> pa.Table:
     digests, eventful = gram_digests(rows)
-    rows = rows.append_column("digest", pa.array(digests, pa.string()))
+    rows = _numbered(rows).append_column("digest", pa.array(digests, pa.string()))
     return rows.append_column("is_eventful", pa.array(eventful))
 
 

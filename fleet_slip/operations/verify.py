@@ -271,19 +271,19 @@ def verify_names(
     warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
 ) -> None:
     """Find files with rows of erased cars; with `full`, also of erased drives."""
-    columns = ("vehicle_id", "drive_id")
     all_files = [file for files in read.values() for file in files]
     cars, drives = (
-        frozenset().union(*(file.names.get(column, ()) for file in all_files)) for column in columns
+        {name for file in all_files for name in file.names.get(column, ())}
+        for column in ("vehicle_id", "drive_id")
     )
     try:
-        erased = ErasureLog(warehouse.root).erased(cars, drives if full else (), ended=True)
+        log = ErasureLog(warehouse.root)
+        erased = log.erased(cars, drives if full else (), ended=True).by_column
     except StorageError:  # a lost or damaged document, which is reported as such
         return
-    names = dict(zip(columns, (erased.vehicles, erased.drives), strict=True))
     for table, files in read.items():
         for file in files:
-            if any(not names[column].isdisjoint(file.names.get(column, ())) for column in columns):
+            if any(not file.names.get(c, frozenset()).isdisjoint(erased[c]) for c in erased):
                 problem = "has rows of a car or drive that was forgotten; give forget again"
                 report.note("name", f"{table}/{file.file.path}", problem)
 
@@ -383,7 +383,7 @@ def verify_grams(
             report.note("gram", f"grams/{file.path}", problem)
     computed_files, log_files = named_files(grams, PLAIN)[0], logs.files if logs else ()
     covered = [file for file in log_files if file.path in computed_files]
-    chosen = covered[:: 1 if full else max(1, len(covered) // SAMPLE)]
+    chosen = covered if full else _evenly(covered, SAMPLE, 0)
     task = partial(_compute_grams, warehouse)
     for start in range(0, len(chosen), FILES_IN_MEMORY):
         files = chosen[start : start + FILES_IN_MEMORY]
