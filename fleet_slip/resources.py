@@ -87,18 +87,9 @@ class Configs:
 
     def names(self, kind: str) -> list[str]:
         """Return the names of the files of one kind, such as `campaigns`, sorted."""
-        folders: list[Traversable] = [folder("configs") / kind]
-        if self.folder:
-            folders.append(self.folder / kind)
-        return sorted(
-            {
-                entry.name.removesuffix(".toml")
-                for place in folders
-                if place.is_dir()
-                for entry in place.iterdir()
-                if entry.name.endswith(".toml")
-            }
-        )
+        folders = [folder("configs") / kind, *([self.folder / kind] if self.folder else [])]
+        names = {e.name for place in folders if place.is_dir() for e in place.iterdir()}
+        return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
     def find(self, kind: str, name_or_path: str) -> Traversable:
         """Return a file by path or name. Raises `ConfigError` that lists the existing names."""
