@@ -425,8 +425,8 @@ def review_challenger(
     if _has_another_line(catalog, champion, selection.cohort.feature_set):
         return _review_another_line(champion, selection, thresholds, problems)
     best = registry.history(manifest.name).best_of(CHAMPION)
-    others = [] if best in (None, champion.version) else [registry.load(manifest.name, best)]
-    incumbents = [champion, *others]
+    earlier = [] if best in (None, champion.version) else [registry.load(manifest.name, best)]
+    incumbents = [champion, *earlier]
     try:
         evaluation = ChallengerEvaluation.prepare(selection, incumbents)
         groups = evaluation.groups_of(selection.cohort)
