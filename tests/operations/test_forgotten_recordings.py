@@ -12,7 +12,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fleet_slip.errors import StorageError
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import logs
 from fleet_slip.ingest.logs import BatchCommit, ingest_files
@@ -133,14 +132,6 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     again, other = write(tmp_path, recording()), a_mapping(name="other")
     (report,) = logs.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
-    assert is_empty(warehouse)
-
-
-def test_an_erasure_of_release_02_is_an_error(warehouse: Warehouse, tmp_path: Path) -> None:
-    old = {"kind": "vehicle", "subject": "00" * 32, "salt": "00" * 16, "event": "done"}
-    DocumentFolder(warehouse.root, FOLDER).append(old)
-    with pytest.raises(StorageError, match=r"release 0\.2.*into a new data root"):
-        ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     assert is_empty(warehouse)
 
 
