@@ -115,6 +115,12 @@ def change(report: ReportData, *scenarios: str) -> float:
     return largest_deg / float(report.errors(NOMINAL).rmse_deg)
 
 
+def close_to_nominal(report: ReportData, scenario: str, why: str) -> Finding:
+    """Return whether the RMSE of a drive is less than `SLIGHT` times that of the nominal drive."""
+    figure = f"{report.rmse(scenario)} against {report.rmse(NOMINAL)}"
+    return Finding(change(report, scenario) < SLIGHT, figure, why)
+
+
 def signal_count(report: ReportData) -> int:
     """Return the number of signals of the paper's choice."""
     return len(report.estimators[report.choice]["signals"])
@@ -302,12 +308,8 @@ def sensor_quality(_: ReportData) -> Finding:
 @claim("III.A, Figure 3", f"the root mean square error grows by less than a factor of {SLIGHT}")
 def noise_is_slight(report: ReportData) -> Finding:
     """More noise has only a slight effect on the prediction."""
-    ratio = change(report, "noise_doubled")
-    return Finding(
-        ratio < SLIGHT,
-        f"from {report.rmse(NOMINAL)} to {report.rmse('noise_doubled')}, {number(ratio, 1)} times",
-        "The mean error moves, because the intercept contains the former biases.",
-    )
+    why = "The mean error moves, because the intercept contains the former biases."
+    return close_to_nominal(report, "noise_doubled", why)
 
 
 @claim("III.B, Figure 4", f"root mean square errors at both masses below {SLIGHT} times nominal")
@@ -327,11 +329,8 @@ def mass_is_insignificant(report: ReportData) -> Finding:
 @claim("III.C, Figure 5", f"root mean square error below {SLIGHT} times nominal")
 def as_accurate_at_0_7(report: ReportData) -> Finding:
     """At an adhesion of 0.7 the model is as accurate as normally."""
-    return Finding(
-        change(report, "adhesion_0_7") < SLIGHT,
-        f"{report.rmse('adhesion_0_7')} against {report.rmse(NOMINAL)}",
-        "In the fast bends the tyres are nearer to their limit, and slip more.",
-    )
+    why = "In the fast bends the tyres are nearer to their limit, and slip more."
+    return close_to_nominal(report, "adhesion_0_7", why)
 
 
 @claim("III.C, Figure 5", f"correlation at least {MIN_CORRELATION} while the car is stable")
@@ -377,11 +376,8 @@ def accurate_elsewhere(report: ReportData) -> Finding:
 @claim("III.D, Figure 7", f"root mean square error below {SLIGHT} times nominal")
 def close_on_another_track(report: ReportData) -> Finding:
     """On another track the accuracy is close to normal."""
-    return Finding(
-        change(report, "melbourne") < SLIGHT,
-        f"{report.rmse('melbourne')} against {report.rmse(NOMINAL)}",
-        "To the model a track is a mixture of speeds, steering angles and lateral accelerations.",
-    )
+    why = "To the model a track is a mixture of speeds, steering and lateral accelerations."
+    return close_to_nominal(report, "melbourne", why)
 
 
 @claim(
