@@ -21,7 +21,7 @@ MAX_DRIVE_ROWS = 2**19
 
 
 @dataclass(frozen=True)
-class DriveRows:
+class DriveSamples:
     """The rows of one drive by time base, in chunks that are not copied together.
 
     Each of several bases has the signals with values in it.
@@ -99,7 +99,7 @@ class DriveCutter:
         self._last_placed_s = np.nan
         """Time of the last row that is not isolated; `_last_s` is that of any row."""
 
-    def cut(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+    def cut(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
         """Yield the drives that end in a block, in which the rows of each group are together."""
         if rows.is_empty():
             return
@@ -111,13 +111,13 @@ class DriveCutter:
                 self._begin_group(of_group["group"][0])
             yield from self._continue_group(of_group)
 
-    def end_group(self) -> Iterator[DriveRows]:
+    def end_group(self) -> Iterator[DriveSamples]:
         """Yield the open drive, after the last row of a group."""
         if self._waiting is not None:
             self._reject(describe_refused(self._waiting, "isolated"))
         yield from self._end_drive()
 
-    def _continue_group(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+    def _continue_group(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
         if self._waiting is not None:
             rows, self._waiting = pl.concat([self._waiting, rows]), None
         time_s = rows["time"].to_numpy()
@@ -155,7 +155,7 @@ class DriveCutter:
         self._reject(describe_refused(rows.filter(mask), reason))
         return rows.filter(~mask)
 
-    def _continue_drive(self, rows: pl.DataFrame) -> Iterator[DriveRows]:
+    def _continue_drive(self, rows: pl.DataFrame) -> Iterator[DriveSamples]:
         """Add rows that follow without a gap. Yields drives that would last too long."""
         if "base" not in rows.columns:  # the times of several bases are checked base by base
             time_s = rows["time"].to_numpy()
@@ -194,11 +194,11 @@ class DriveCutter:
             self._pieces[base].append(pl.DataFrame(filled))
             self._rows_by_base[base] += piece.height
 
-    def _end_drive(self) -> Iterator[DriveRows]:
+    def _end_drive(self) -> Iterator[DriveSamples]:
         if self._pieces:
             pieces = sorted(self._pieces.items())
             bases = {base: pl.concat(frames, how="diagonal") for base, frames in pieces}
-            yield DriveRows(self._group, bases)
+            yield DriveSamples(self._group, bases)
         self._pieces, self._rows_by_base = defaultdict(list), defaultdict(int)
 
 

@@ -23,7 +23,7 @@ from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.checked_columns import RowChecker, describe_refused, is_grouped
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
-from fleet_slip.ingest.drives import DriveCutter, DriveRows, sort_by_group
+from fleet_slip.ingest.drives import DriveCutter, DriveSamples, sort_by_group
 from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
 from fleet_slip.ingest.formats.source import Spool
 from fleet_slip.ingest.formats.tables import partition_keys
@@ -164,14 +164,14 @@ class MeasuredLog:
             yield rows
         self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
 
-    def _drives(self, segments: Iterable[DriveRows]) -> Iterator[MeasuredDrive]:
+    def _drives(self, segments: Iterable[DriveSamples]) -> Iterator[MeasuredDrive]:
         for rows in segments:
             if rows.end_s - rows.start_s < STEP_S - TIME_EPSILON_S:
                 self._rejected.add(describe_refused(rows.frame, "too_short"))
             else:
                 yield self._drive(rows)
 
-    def _drive(self, rows: DriveRows) -> MeasuredDrive:
+    def _drive(self, rows: DriveSamples) -> MeasuredDrive:
         group = rows.group
         self._drives_of_group[group] += 1
         name = drive_id(self.prefix, group, self._drives_of_group[group])

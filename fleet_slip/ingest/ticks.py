@@ -22,7 +22,7 @@ from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import MEASURED, SignalCatalog
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S, WHEEL_PREFIX, SignalColumn
-from fleet_slip.ingest.drives import DriveRows
+from fleet_slip.ingest.drives import DriveSamples
 from fleet_slip.ingest.formats.source import EARLIEST_S
 from fleet_slip.ingest.mapping import DriveMetadata, FromColumn, LabelSensor, Mapping
 from fleet_slip.quality.drive_signals import (
@@ -78,7 +78,7 @@ def drive_id(prefix: str, group: int, segment: int = 1) -> str:
 
 
 def to_ticks(
-    rows: DriveRows, mapping: Mapping, name: str, metadata_of_drive: dict[str, Any]
+    rows: DriveSamples, mapping: Mapping, name: str, metadata_of_drive: dict[str, Any]
 ) -> MeasuredDrive:
     """Convert a drive's signals, SI units at times in s, to counts at 100 Hz.
 
@@ -189,7 +189,7 @@ def choose_grid(time_s: FloatArray, interval_s: float, *, fill_gaps: bool = Fals
     return TickGrid(method, np.arange(number, dtype=np.int32), float(time_s[0] + margin_s))
 
 
-def _grid_of(rows: DriveRows, *, fill_gaps: bool) -> TickGrid:
+def _grid_of(rows: DriveSamples, *, fill_gaps: bool) -> TickGrid:
     """Return the ticks of a drive; those of several time bases are interpolated."""
     if len(rows.bases) > 1:
         return choose_grid(np.array([0.0, rows.end_s - rows.start_s]), np.inf)
@@ -197,7 +197,7 @@ def _grid_of(rows: DriveRows, *, fill_gaps: bool) -> TickGrid:
     return choose_grid(time_s, next(iter(rows.intervals_s.values())), fill_gaps=fill_gaps)
 
 
-def _resample(rows: DriveRows, signal: str, grid: TickGrid, mapping: Mapping) -> FloatArray:
+def _resample(rows: DriveSamples, signal: str, grid: TickGrid, mapping: Mapping) -> FloatArray:
     """Return a signal on the ticks of its drive; a value of t is in the file at t + delay."""
     source, samples = mapping.signals[signal], rows.samples(signal)
     time_s = samples["time"].to_numpy() - rows.start_s - source.delay_s
@@ -373,7 +373,7 @@ def _is_regular(fixes: NDArray[np.int32]) -> bool:
 
 
 def _fixes(
-    rows: DriveRows, grid: TickGrid, mapping: Mapping, counts: dict[str, pa.Array]
+    rows: DriveSamples, grid: TickGrid, mapping: Mapping, counts: dict[str, pa.Array]
 ) -> dict[str, pa.Array]:
     """Return the counts of course and speed over ground, null between fixes."""
     signals = mapping.signal_catalog

@@ -17,7 +17,7 @@ from fleet_slip.catalog.counts import as_arrow
 from fleet_slip.compute.tasks import AHEAD, read_ahead
 from fleet_slip.errors import InputError
 from fleet_slip.ingest import checked_columns, drives, logs, measured_log
-from fleet_slip.ingest.drives import DriveCutter, DriveRows
+from fleet_slip.ingest.drives import DriveCutter, DriveSamples
 from fleet_slip.ingest.formats import csv as csv_batches
 from fleet_slip.ingest.formats.csv import CsvSource
 from fleet_slip.ingest.formats.file_formats import CsvFormat, PlainNumbers
@@ -60,7 +60,7 @@ def cut(
             "time": [time for _, time in rows],
         }
     ).sort("group", maintain_order=True)
-    ended: list[DriveRows] = []
+    ended: list[DriveSamples] = []
     at = 0
     with mock.patch.object(drives, "MAX_DRIVE_S", longest_s):
         for size in [*sizes, len(rows)]:
