@@ -167,7 +167,9 @@ def frames_of(
 def _velocity(columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return vx and vy, from a speed and the reference angle if need be. Raises `DataError`."""
     wheels = np.ma.masked_invalid([columns[name] for name in WHEELS]).mean(axis=0) * RADIUS_M
-    speeds = columns["vx_mps"], np.ma.filled(wheels, np.nan), columns["vehicle_speed_mps"]
+    speeds = [columns["vx_mps"], np.ma.filled(wheels, np.nan)]
+    if "vehicle_speed_mps" in columns:
+        speeds.append(columns["vehicle_speed_mps"])
     vx = next((speed for speed in speeds if np.isfinite(speed).any()), None)
     if vx is None:
         raise DataError("the drive has neither a speed nor wheel speeds: nothing can be shown.")

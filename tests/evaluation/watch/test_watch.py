@@ -127,3 +127,16 @@ def test_a_measured_drive_is_found_by_its_file_and_has_a_reference(
     assert "true" not in page.partition("<script>")[0].partition("<h2>")[2]
     with pytest.raises(QuestionError, match="names 2 drives"):
         drive_frames(fleet.warehouse, "tuesday.csv", fleet.models.get("smoke"))
+
+
+def test_a_scenario_is_simulated_and_shown(smoke_root: Path, tmp_path: Path) -> None:
+    """Its drive has the signals of the catalog that estimators read, and no other speed."""
+    scenario = tmp_path / "brief.toml"
+    scenario.write_text('name = "brief"\ndescription = "x"\nbase = "nominal"\nlaps = 0.1\n')
+    page = fleet_slip.open(smoke_root).evaluation.watch(
+        str(scenario), "smoke", tmp_path / "page.html"
+    )
+    data = data_of(page.read_text())
+    assert "brief: x" in page.read_text()
+    assert len(data["t"]) == len(data["beta"]) > 100
+    assert len(data["track"][0]) > 100
