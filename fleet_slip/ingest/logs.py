@@ -595,16 +595,19 @@ def log_table(drives: Sequence[MeasuredDrive], mapping: Mapping) -> pa.Table:
     schema = pl.DataFrame(of_drive.empty_table()).schema
     named = pl.DataFrame(metadata, schema, strict=False).to_arrow().cast(of_drive)
     columns: dict[str, pa.ChunkedArray] = {}
+    place_of_drive = pl.Series(np.repeat(np.arange(len(drives), dtype=np.uint32), sizes))
     for column in of_drive:
         values = named[column.name].combine_chunks()
         is_text = pa.types.is_string(column.type)
         values = values.dictionary_encode() if is_text else values
         codes = pl.Series(values.indices if is_text else values)
-        chunks = [codes.new_from_index(i, size).to_arrow() for i, size in enumerate(sizes)]
-        if is_text:
-            texts = values.dictionary
-            chunks = [pa.DictionaryArray.from_arrays(c, texts, safe=False) for c in chunks]
-        columns[column.name] = pa.chunked_array(chunks, values.type)
+        rows = codes.gather(place_of_drive).to_arrow()
+        columns[column.name] = pa.chunked_array(
+            [pa.DictionaryArray.from_arrays(rows, values.dictionary, safe=False)]
+            if is_text
+            else [rows],
+            values.type,
+        )
     columns["tick"] = pa.chunked_array([as_arrow(drive.ticks) for drive in drives], pa.int32())
     for name in signals.signals:
         if name in measured:
