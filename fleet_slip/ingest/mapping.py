@@ -122,10 +122,6 @@ class FromColumn(Config):
     column: Name
 
 
-MAX_STARS = 2
-"""Stars of a pattern: the time to match a path grows as its length to the power of their number."""
-
-
 class FromPath(Config):
     """A drive's metadata in the path of its file, where the pattern has `{}`.
 
@@ -140,8 +136,6 @@ class FromPath(Config):
     def _has_one_place(cls, path: str) -> str:
         if path.count("{}") != 1:
             raise ValueError("write {} once, in place of the value: '{}/*' is the folder's name")
-        if path.count("*") > MAX_STARS:
-            raise ValueError(f"at most {MAX_STARS} * can be matched: one stands for any text")
         return path
 
     def find(self, file: Path) -> str:
@@ -153,16 +147,45 @@ class FromPath(Config):
         return match[1]
 
     def match(self, file: Path) -> tuple[Path, str] | None:
-        """Return the folder above the pattern, and the text at `{}`; None for another path.
-
-        A `*` takes as much as it can, and `{}` as little as it can, but one character.
-        """
-        meanings = {"{}": "([^/]+?)", "*": "[^/]*"}
-        parts = re.split(r"(\{\}|\*)", self.path)
-        pattern = "".join(meanings.get(part, re.escape(part)) for part in parts)
+        """Return the folder above the pattern, and the text at `{}`; None for another path."""
         path = os.path.abspath(file)  # noqa: PTH100 - follows no link
-        match = re.fullmatch(f"(.*/){pattern}", path, re.DOTALL)
-        return None if match is None else (Path(match[1]), match[2])
+        patterns, names = self.path.split("/"), path.split("/")[1:]
+        if len(names) < len(patterns):
+            return None
+        matches = list(map(match_name, patterns, names[-len(patterns) :]))
+        if None in matches:
+            return None
+        return Path("/", *names[: -len(patterns)]), "".join(filter(None, matches))
+
+
+def match_name(pattern: str, name: str) -> str | None:
+    """Return the text that `{}` matches in a file's name, empty without one; None if none matches.
+
+    The time is that of the product of both lengths. A `*` takes as much as it can, the first one
+    first, and `{}` as little as it can, but one character.
+    """
+    elements = [element for element in re.split(r"(\{\}|\*)", pattern) if element]
+    positions = {len(name)}  # where the elements after the present one can begin
+    starts = [positions]
+    for element in reversed(elements):
+        if element in {"*", "{}"}:
+            positions = set(range(max(positions, default=-1) + (element == "*")))
+        else:
+            ends = (end for end in positions if name.endswith(element, 0, end))
+            positions = {end - len(element) for end in ends}
+        starts.insert(0, positions)
+    if 0 not in positions:
+        return None
+    position, value = 0, ""
+    for element, following in zip(elements, starts[1:], strict=True):
+        if element == "*":
+            position = max(following)
+        elif element == "{}":
+            end = min(start for start in following if start > position)
+            position, value = end, name[position:end]
+        else:
+            position += len(element)
+    return value
 
 
 Elsewhere = FromColumn | FromPath
