@@ -277,6 +277,8 @@ MAX_FILE_BYTES = 2**28
 MAX_ROWS, MAX_DECODED_BYTES = 500_000, 2**30
 MAX_TEXT_BYTES = 2**28
 """Maximum size of the texts of a file; with `MAX_ROWS` rows some 300 bytes each."""
+MAX_PAGES = 2**18
+"""Maximum number of pages of a file; reading a header takes some 10 µs."""
 BATCH_ROWS_READ = 2**12
 """Rows per decoded batch; a row of 200 columns has 160,000 bytes."""
 MAX_ROWS_OF_A_DAY = 86_400 * round(1 / SAMPLE_TIME_S)
@@ -352,11 +354,7 @@ def _read(file: Path, content: bytes) -> pa.Table:
     try:
         _require_decodable(file, content)
         schema = pq.ParquetFile(stream).schema_arrow
-        columns = [name for name in COLUMNS.names if name in schema.names]
-        if missing := set(COLUMNS.names).difference(columns, OPTIONAL):
-            raise InputError(
-                f"{file}: not a table of Gram rows, column {min(missing)} is missing. {_SEE}"
-            )
+        columns = _documented_columns(file, schema)
         # Texts stay in dictionaries until their total length is known: one can be in every row.
         texts = [name for name in TEXTS if name in columns and schema.field(name).type != pa.null()]
         parquet = pq.ParquetFile(stream, read_dictionary=texts, page_checksum_verification=True)
@@ -366,6 +364,41 @@ def _read(file: Path, content: bytes) -> pa.Table:
     if not batches:
         raise InputError(f"{file}: has no Gram rows.")
     return pa.concat_tables(batches).combine_chunks()
+
+
+def _documented_columns(file: Path, schema: pa.Schema) -> list[str]:
+    """Return the columns of `COLUMNS` in a file.
+
+    Raises `InputError` for missing ones, and for those that decode to other values than counted.
+    """
+    columns = [name for name in COLUMNS.names if name in schema.names]
+    if missing := set(COLUMNS.names).difference(columns, OPTIONAL):
+        raise InputError(
+            f"{file}: not a table of Gram rows, column {min(missing)} is missing. {_SEE}"
+        )
+    for field in map(COLUMNS.field, columns):
+        indices = schema.get_all_field_indices(field.name)
+        if len(indices) > 1:
+            raise InputError(f"{file}: has two columns {field.name}. Leave one of them out.")
+        kind = schema.field(indices[0]).type
+        if not _is_convertible(kind, field.type):
+            raise InputError(
+                f"{file}: column {field.name} has the type {quote_name(kind)[:80]}; write it "
+                f"as {field.type} (docs/export.md)."
+            )
+    return columns
+
+
+def _is_convertible(kind: pa.DataType, to: pa.DataType) -> bool:
+    types = pa.types
+    if types.is_list(to):
+        is_list = types.is_list(kind) or types.is_large_list(kind)
+        return bool(is_list and types.is_integer(kind.value_type))
+    if to == pa.string():
+        kind = kind.value_type if types.is_dictionary(kind) else kind
+        return bool(types.is_string(kind) or types.is_large_string(kind) or types.is_null(kind))
+    is_same = types.is_date if types.is_date(to) else types.is_integer
+    return bool(is_same(kind) or types.is_null(kind))
 
 
 def _require_decodable(file: Path, content: bytes) -> None:
@@ -378,14 +411,14 @@ def _require_decodable(file: Path, content: bytes) -> None:
     if rows > MAX_ROWS:
         raise _too_large(file)
     decoded = 0
-    for page in (page for page in pages if page.column in COLUMNS.names):
+    for number, page in enumerate(page for page in pages if page.column in COLUMNS.names):
         if not page.has_checksum:
             raise InputError(
                 f"{file}: its pages have no checksums. Write it with them, as by "
                 "pyarrow.parquet.write_table(..., write_page_checksum=True)."
             )
         decoded += max(page.size_bytes, page.values * VALUE_BYTES)
-        if decoded > MAX_DECODED_BYTES:
+        if decoded > MAX_DECODED_BYTES or number >= MAX_PAGES:
             raise _too_large(file)
 
 
@@ -424,13 +457,17 @@ def _pages_of(content: bytes, chunk: dict[int, Any]) -> Iterator[Page]:
     column = bytes(_field(chunk, 3, list)[0]).decode()
     at = min(offset for offset in (chunk.get(11), _field(chunk, 9, int)) if offset)
     end = at + _field(chunk, 7, int)
+    remaining = _field(chunk, 5, int)
     while at < end:
         reader = _ThriftReader(memoryview(content)[at : at + _MAX_HEADER_BYTES])
         header = reader.struct()
         kind = next((kind for kind in (_DATA, _DICTIONARY, _DATA_V2) if kind in header), 0)
         values = _field(_field(header, kind, dict), 1, int)
+        remaining -= 0 if kind == _DICTIONARY else values
         yield Page(column, _field(header, 2, int), values, has_checksum=4 in header)
         at += reader.at + _field(header, 3, int)
+    if remaining:  # pyarrow can continue behind the pages
+        raise ValueError("the footer and the pages state different numbers of values")
 
 
 def _field(fields: Any, number: int, kind: type) -> Any:
@@ -517,14 +554,7 @@ def _decode(file: Path, batches: Iterable[pa.RecordBatch]) -> Iterator[pa.Table]
         for field in (field for field in COLUMNS if field.name in batch.schema.names):
             is_text = field.name in TEXTS
             kind = pa.dictionary(pa.int32(), pa.string()) if is_text else field.type
-            try:
-                column = batch[field.name].cast(kind)
-            except pa.ArrowException:
-                raise InputError(
-                    f"{file}: column {field.name} has the type "
-                    f"{quote_name(batch[field.name].type)[:80]}; write it as {field.type} "
-                    "(docs/export.md)."
-                ) from None
+            column = batch[field.name].cast(kind)
             if field.name in NAMES:
                 column = _normalize_names(file, batch, field.name, column, first)
             if is_text:

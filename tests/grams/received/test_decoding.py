@@ -64,8 +64,39 @@ def test_a_column_of_another_type_is_named(fleet: fleet_slip.Fleet, tmp_path: Pa
     with pytest.raises(InputError, match=r"column sums has the type list<"):
         fleet.import_onboard_grams(write(tmp_path / "texts", texts))
     twice = table.append_column("n", table["n"])
-    with pytest.raises(InputError, match="not a table of Gram rows"):
+    with pytest.raises(InputError, match="two columns n"):
         fleet.import_onboard_grams(write(tmp_path / "twice", twice))
+
+
+@pytest.mark.parametrize("name", ["n", "sums"])
+def test_texts_in_place_of_numbers_are_refused_before_they_are_decoded(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setattr(on_board, "_decode", lambda *_: pytest.fail("it was decoded"))
+    texts: pa.Array = repeated("x" * 500_000)
+    if name == "sums":
+        texts = pa.ListArray.from_arrays(pa.array(range(ROWS + 1), pa.int32()), texts)
+    table = with_column(rows_of_fleet(ROWS, START_S, seed=1), name, texts)
+    with pytest.raises(InputError, match=f"column {name} has the type"):
+        fleet.import_onboard_grams(write(tmp_path / "rows", table))
+
+
+def test_texts_that_repeat_prefixes_are_not_decoded(
+    fleet: fleet_slip.Fleet, tmp_path: Path
+) -> None:
+    path = tmp_path / "rows"
+    pq.write_table(
+        with_column(rows_of_fleet(20, START_S, seed=1), "signals", pa.array(["x" * 10**6] * 20)),
+        path,
+        write_page_checksum=True,
+        use_dictionary=False,
+        column_encoding={"signals": "DELTA_BYTE_ARRAY"},
+    )
+    assert path.stat().st_size < MEBIBYTE
+    before = pa.total_allocated_bytes(), pa.default_memory_pool().max_memory()
+    with pytest.raises(InputError, match="not a table of Gram rows"):
+        fleet.import_onboard_grams(path)
+    assert pa.default_memory_pool().max_memory() < max(before) + 10 * MEBIBYTE
 
 
 def test_what_other_programs_write_is_read(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
@@ -103,6 +134,21 @@ def test_headers_state_what_pages_hold(version: str) -> None:
     values = {name: sum(page.values for page in found) for name, found in by_column.items()}
     assert values == {"a": rows, "b": 2 * rows + 2, "c": rows}  # b has a dictionary of two texts
     assert all(len(found) > 1 for found in by_column.values())
+
+
+def test_many_pages_and_pages_behind_the_end_of_a_column_are_refused(
+    fleet: fleet_slip.Fleet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "rows", rows_of_fleet(20, START_S, seed=1))
+    with monkeypatch.context() as patch:
+        patch.setattr(on_board, "MAX_PAGES", 5)
+        with pytest.raises(InputError, match="decodes to more than"):
+            fleet.import_onboard_grams(path)
+    size = int.from_bytes(path.read_bytes()[-8:-4], "little")
+    footer = on_board._ThriftReader(memoryview(path.read_bytes())[-8 - size : -8]).struct()
+    chunk = footer[4][0][1][0][3]
+    with pytest.raises(ValueError, match="different numbers of values"):
+        list(on_board._pages_of(path.read_bytes(), {**chunk, 5: chunk[5] + 1}))
 
 
 def test_damaged_files_are_refused(fleet: fleet_slip.Fleet, tmp_path: Path) -> None:
