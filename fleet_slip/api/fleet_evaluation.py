@@ -83,6 +83,7 @@ class FleetEvaluation:
         )
         result = score(self.warehouse, version.manifest, rows if cohort else overlap.unseen)
         all_seen = overlap.trained == overlap.drives
+        trained_cohort = cohort or version.manifest.trained_on.cohort
         return replace(
             result,
             drives=overlap.drives,
@@ -91,6 +92,7 @@ class FleetEvaluation:
             examined=str(examined),
             model=version.reference,
             cohort=predicate,
+            measured_cohort=trained_cohort if overlap.measured else "",
         )
 
     @record_call

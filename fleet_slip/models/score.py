@@ -1,6 +1,7 @@
 """Evaluates a published model on the rows of a cohort."""
 
 import math
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.calibration.car_calibration import calibrate
-from fleet_slip.catalog.signals import RECEIVED, SAMPLE_TIME_S, SignalCatalog
+from fleet_slip.catalog.signals import MEASURED, RECEIVED, SAMPLE_TIME_S, SignalCatalog
 from fleet_slip.errors import DataError
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import hash_names
@@ -67,6 +68,8 @@ class Score(Answer):
     """Drives that are left out for faulty sensors, as a sentence."""
     model: str = ""
     cohort: str = ""
+    measured_cohort: str = ""
+    """Cohort for `evaluate`, if the training drives are measured."""
 
     def parts(self) -> Iterator[Part]:
         """Return the figures, and the drives and rows that are left out."""
@@ -86,10 +89,12 @@ class Score(Answer):
             count = pluralize(self.drives_left_out, "drive")
             yield Remark(f"left out: {count} of {self.drives:,} that {self.model} was trained on.")
         elif self.drives_trained:
+            measured = self.measured_cohort
+            options = f" --cohort {shlex.quote(measured)}" if measured else ""
             yield Remark(
                 f"{self.model} was trained on {self.drives_trained:,} of these "
                 f"{pluralize(self.drives, 'drive')}: its error there is a training error. On "
-                f"held-out drives: fleet-slip evaluate {self.model} (measured ones: --cohort)"
+                f"held-out drives: fleet-slip evaluate {self.model}{options}"
             )
 
 
@@ -215,11 +220,15 @@ def _figures(estimate_rad: FloatArray, truth_rad: FloatArray, rows: int) -> Scor
 
 @dataclass(frozen=True)
 class TrainingOverlap:
-    """Numbers of drives of a cohort and of training drives in it; predicate of the unseen ones."""
+    """Numbers of drives of a cohort and of training drives in it; predicate of the unseen ones.
+
+    `measured` is true if a training drive is measured.
+    """
 
     drives: int
     trained: int
     unseen: Predicate
+    measured: bool
 
 
 def find_training_overlap(
@@ -230,13 +239,15 @@ def find_training_overlap(
     cohort = cohort_of_rows(signals, predicate)
     view = "log" if cohort.columns - set(drive_columns(signals)) else "drives"
     logged = f"({cohort.sql}) AND source <> '{RECEIVED}'"
-    query = f"SELECT DISTINCT drive_id FROM {view} WHERE {logged} ORDER BY 1"
+    query = f"SELECT DISTINCT drive_id, source FROM {view} WHERE {logged} ORDER BY 1"
     with connect_tables(warehouse, query) as database, guarded_query(database, cohort):
-        names = database.sql(query).to_arrow_table()["drive_id"]
+        drives = database.sql(query).to_arrow_table()
+    names = drives["drive_id"]
     is_trained = registry.trained_drives(manifest).among(hash_names(names))
     trained = int(is_trained.sum())
+    measured = MEASURED in drives["source"].filter(pa.array(is_trained)).to_pylist()
     if trained in (0, len(names)):
-        return TrainingOverlap(len(names), trained, cohort)
+        return TrainingOverlap(len(names), trained, cohort, measured)
     unseen = ", ".join(map(sql_text, names.filter(pa.array(~is_trained)).to_pylist()))
     predicate = Predicate(cohort.text, f"({cohort.sql} AND drive_id IN ({unseen}))")
-    return TrainingOverlap(len(names), trained, predicate)
+    return TrainingOverlap(len(names), trained, predicate, measured)

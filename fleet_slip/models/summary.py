@@ -234,7 +234,7 @@ def summarize(selection: Selection, everything: bool = False, hint: str = "") ->
             f"without it the winner has {selection.beyond_label_noise_deg:.4f} deg."
         )
     for names, reason in group_reasons(selection.skipped):
-        yield Remark(f"Skipped {', '.join(names)}: {reason}")
+        yield Remark(f"Skipped {'models' if names[1:] else 'model'} {', '.join(names)}: {reason}")
     if (nested := selection.nested) is not None:
         yield Remark(
             f"RMSE of {winner.name}: {winner.pooled.rmse_deg:.4f} deg in the folds that chose it; "

@@ -46,6 +46,7 @@ def test_predictions_are_those_of_the_ingested_log(own: Path, tmp_path: Path) ->
     assert table.schema.metadata[b"model"] == b"own@1"
     fleet = fleet_slip.open(own / "data")
     score = fleet.evaluation.score("own", "true")
+    assert "evaluate own@1 --cohort true" in str(score), "its drives are measured"
     assert (document["model"], document["rows"]) == ("own@1", score.rows)
     assert document["rmse_deg"] == pytest.approx(score.rmse_deg, rel=1e-12)
     assert [drive["vehicle_id"] for drive in document["drives"]] == ["car-0", "car-1"]
