@@ -72,12 +72,12 @@ def evidence(folds: Folds, moments: DriveMoments, output: Path) -> None:
 
 def orders(folds: Folds, moments: DriveMoments, output: Path) -> None:
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
-    for name in RANKINGS:
+    for name, style in zip(RANKINGS, ("-", "-", ":"), strict=True):
         choice = choose_nested(folds, moments, NINE, LABEL, SCALES, Rule(name))
         print(f"  {name:<17} {' '.join(choice.order)}")
         sizes = range(1, len(choice.order) + 1)
         rmse = [model.pooled.rmse_deg for model in choice.models]
-        axes.plot(sizes, rmse, marker="o", markersize=3, label=name)
+        axes.plot(sizes, rmse, style, marker="o", markersize=3, label=name)
     axes.set_xlabel("number of signals")
     axes.set_ylabel("cross-validated RMSE, deg")
     axes.set_yscale("log")
