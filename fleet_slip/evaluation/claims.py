@@ -234,7 +234,7 @@ def order_is_crucial(report: ReportData) -> Finding:
         max(needed.values()) > best,
         f"signals needed to leave 0.1 % of the variance to the full model: {sizes}; best subset "
         f"{best}",
-        "The names are rankings. CIC and RIC are the covariance and the risk inflation criterion.",
+        "The names are rankings.",
     )
 
 
