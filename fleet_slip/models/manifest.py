@@ -5,6 +5,7 @@ A manifest may come from anywhere: texts and numbers are bounded, and SQL in it 
 
 import math
 import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
@@ -311,25 +312,33 @@ class CombinedWithFilter(Config):
         return self
 
     def __str__(self) -> str:
-        """Return which estimate is used, as a sentence."""
+        """Return which estimate is used where, as a sentence."""
         if self.reason:
             return f"The linear model alone: {self.reason}"
         figures = ", ".join(
             f"{name.replace('_', ' ')} {deg:.3f}" for name, deg in self.rmse_deg.items()
         )
-        return f"{_METHODS[self.method]}. RMSE in {self.groups} inner groups: {figures} deg."
+        return f"{self._parts()}. RMSE in {self.groups} inner groups: {figures} deg."
+
+    def _parts(self) -> str:
+        blend = self.term and self.term.definition and self.term.definition.made
+        if not isinstance(blend, Blend):
+            return "The linear model alone: the filter does not improve it"
+        if blend.line is None:
+            return "The filter in the identified car alone: the linear model does not improve it"
+        shares = _span(blend.shares, lambda share: f"{share / 2**16:.0%}")
+        limits = _span(blend.limits, lambda limit: f"{math.degrees(limit / 2**16):.2g}")
+        where = "" if blend.lateral is None else ", by lateral acceleration"
+        parts = {
+            "filter": f"The filter in the identified car, plus {shares} of the difference to the "
+            "linear model",
+            "line": f"The linear model, keeping {shares} of its difference to the filter",
+        }
+        return f"{parts[blend.anchor]}, clipped at {limits} deg{where}"
 
 
-_METHODS = {
-    "line": "The linear model alone: the filter does not improve it",
-    "filter": "The filter in the identified car alone: the linear model does not improve it",
-    "constant": "The filter in the identified car, plus a share of the difference to the linear "
-    "model",
-    "by_lateral": "The filter in the identified car, plus a share of the difference to the linear "
-    "model, by lateral acceleration",
-    "line_by_lateral": "The linear model, keeping a share of its difference to the filter, by "
-    "lateral acceleration",
-}
+def _span(values: Sequence[int], text: Callable[[int], str]) -> str:
+    return " to ".join(dict.fromkeys([text(min(values)), text(max(values))]))
 
 
 _MADE: TypeAdapter[Made] = TypeAdapter(Made)

@@ -79,6 +79,7 @@ def test_a_version_with_a_filter_is_used_as_any_other(
     assert "both@1: line = intercept" in shown
     assert "deg, of the linear model alone" in shown
     assert LINE_ALONE in done_on(smoke_copy, "diagnose", "both").stderr
+    assert "% of the difference to the linear model, clipped at" in " ".join(shown.split())
     assert "inner groups" in shown
     assert answer(smoke_copy, "score", "both")["rmse_deg"] < 1
     done_on(smoke_copy, "export", "both", "--to", "c", "--output", tmp_path / "c")
