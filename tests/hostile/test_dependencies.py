@@ -112,3 +112,18 @@ def test_every_licence_lets_us_use_the_package() -> None:
 
 
 UV = Path(sys.executable).with_name("uv")
+
+
+@pytest.mark.long  # asks a registry
+@pytest.mark.skipif(not UV.exists(), reason="uv is not here")
+@pytest.mark.parametrize("extra", PROJECT["project"]["optional-dependencies"])
+def test_an_extra_installs_under_the_constraints(tmp_path: Path, extra: str) -> None:
+    assert run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path)]).exit_code == 0
+    python = str(tmp_path / "bin/python")
+    constraints = ["--constraint", str(REPOSITORY / "constraints.txt")]
+    install = [str(UV), "pip", "install", "--python", python, *constraints]
+    done = run([*install, f"{REPOSITORY}[{extra}]"])
+    assert done.exit_code == 0, done.stderr
+    assert "yanked" not in done.stderr
+    assert run([str(UV), "pip", "check", "--python", python]).exit_code == 0
+    assert run([str(tmp_path / "bin/fleet-slip"), "--version"]).exit_code == 0
