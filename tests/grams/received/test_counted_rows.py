@@ -141,6 +141,16 @@ def test_a_row_that_cannot_be_keeps_the_whole_file_out(
     assert gram_rows(fleet) == []
 
 
+def test_a_drive_that_is_there_is_refused_under_any_name(fleet: Fleet, send: Send) -> None:
+    send([row_of(gram_of(1))])
+    for same in (row_of(gram_of(3)), row_of(gram_of(1), drive_id="renamed")):
+        with pytest.raises(RepeatedError, match=r"row 2 .* is stored already, as VIN1-2024"):
+            send([other(GRAM), same])
+    with pytest.raises(InputError, match=r"row 2 .* appears twice"):
+        send([other(GRAM), other(gram_of(5))])
+    assert len(gram_rows(fleet)) == 1
+
+
 @pytest.mark.parametrize(
     "change",
     [
