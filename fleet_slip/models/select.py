@@ -321,8 +321,9 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
             skipped[f"{search.title} (search)"] = str(error)
     models += [model for search_result in searched for model in search_result.models]
     if not models:
-        reasons = (f"{', '.join(names)}: {reason}" for names, reason in group_reasons(skipped))
-        raise DataError(f"no candidate model can be fitted. {' '.join(reasons)}")
+        groups = [(", ".join(names), text.rstrip(".")) for names, text in group_reasons(skipped)]
+        reasons = [text if len(groups) == 1 else f"{names}: {text}" for names, text in groups]
+        raise DataError(f"no candidate model can be fitted: {'; '.join(reasons)}.")
     winner = choose_by(compared, models)
     if winner.model.name in {candidate.name for candidate in rows.candidates}:
         winner = _refit(winner, folds, rows, catalog)

@@ -118,7 +118,7 @@ def test_a_model_of_other_drives_is_evaluated_as_published(own: Path) -> None:
     two = done_on(own, "evaluate", "own", "--cohort", "vehicle_id >= 'car-4'")
     assert "±: standard error over quarters" in two.stdout + two.stderr
     refused = run_on(own, "select", "--model", "ax,steering_wheel")
-    assert "can be fitted. given: these drives lack steering_wheel." in refused.stderr
+    assert "can be fitted: these drives lack steering_wheel." in refused.stderr
 
 
 def test_an_error_of_a_published_model_stops_the_evaluation(
