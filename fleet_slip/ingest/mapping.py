@@ -275,7 +275,6 @@ class Mapping(Config):
     """Where the label's sensor is, and whether it measures two velocities instead of an angle."""
     vehicle: VehicleMeasures | None = added(None)
     """Measured data of the car, for a filter beside the model: `fleet-slip learn`."""
-    """Measured data of the car, which no drive depends on."""
     where: tuple[RowCondition, ...] = added((), max_length=MAX_CONDITIONS)
     """Conditions on rows. A row that misses one is skipped and counted."""
 
