@@ -48,7 +48,10 @@ class DriveSamples:
     @cached_property
     def intervals_s(self) -> dict[int, float]:
         """The median time between two rows of each base; that of a tick for a single row."""
-        steps_s = {base: rows["time"].diff().median() for base, rows in self.bases.items()}
+        steps_s = {
+            base: pl.Series(np.diff(rows["time"].to_numpy())).median()
+            for base, rows in self.bases.items()
+        }
         return {b: step if isinstance(step, float) else STEP_S for b, step in steps_s.items()}
 
     def interval_of(self, signal: str) -> float:
@@ -177,7 +180,8 @@ class DriveCutter:
         begins = not self._pieces
         if begins:
             self._start_s = rows["time"][0]
-        fitting = max(int(rows["time"].search_sorted(self._start_s + MAX_DRIVE_S)), begins)
+        time_s = rows["time"].to_numpy()
+        fitting = max(int(np.searchsorted(time_s, self._start_s + MAX_DRIVE_S)), begins)
         if "base" not in rows.columns:
             return min(fitting, MAX_DRIVE_ROWS - self._rows_by_base[0])
         number = rows.select(pl.int_range(pl.len()).over("base")).to_series()
@@ -190,8 +194,8 @@ class DriveCutter:
         several = "base" in rows.columns
         pieces = rows.partition_by("base", as_dict=True) if several else {(0,): rows}
         for (base,), piece in pieces.items():
-            filled = [column for column in piece if column.null_count() < piece.height]
-            self._pieces[base].append(pl.DataFrame(filled))
+            empty = [column.name for column in piece if column.null_count() == piece.height]
+            self._pieces[base].append(piece.drop(empty) if empty else piece)
             self._rows_by_base[base] += piece.height
 
     def _end_drive(self) -> Iterator[DriveSamples]:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import BoolArray, FloatArray, IntArray
@@ -460,9 +461,8 @@ def place_label(mapping: Mapping, counts: Named[str, pa.Array]) -> dict[str, pa.
         angle = physical(signals, counts, label)
         vx, vy = speed * np.cos(angle), speed * np.sin(angle)
     else:
-        is_slow = pl.Series(speed < MOVING_MPS)
-        frame = pl.DataFrame({label: pl.Series(counts[label])})
-        return {label: frame.select(pl.when(~is_slow).then(label))[label].to_arrow()}
+        is_fast = pl.Series(~(speed < MOVING_MPS)).to_arrow()
+        return {label: pc.if_else(is_fast, counts[label], pa.scalar(None, pa.int16()))}
     if sensor.is_elsewhere:
         yaw_rate = physical(signals, counts, "yaw_rate")
         vx, vy = vx + yaw_rate * sensor.sensor_y_m, vy - yaw_rate * sensor.sensor_x_m

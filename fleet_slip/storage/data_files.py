@@ -197,6 +197,8 @@ def _only_used_values(column: pa.ChunkedArray) -> pa.ChunkedArray:
     array = column.combine_chunks()
     if len(array.dictionary) == 1 and array.null_count < len(array):
         return column
+    if array.indices.unique().drop_null().to_pylist() == list(range(len(array.dictionary))):
+        return column
     codes = array.indices.dictionary_encode()
     values = array.dictionary.take(codes.dictionary)
     return pa.chunked_array([pa.DictionaryArray.from_arrays(codes.indices, values)])
