@@ -1,5 +1,6 @@
 """What commands do, done in Python: on a folder and on an object store, with the same bits."""
 
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
@@ -181,3 +182,19 @@ def _measured(folder: Path) -> tuple[list[Path], str]:
         rows = "\n".join(f"{tick / 100:.2f},{number + tick / 1000}" for tick in range(300))
         file.write_text(f"t,ay\n{rows}\n")
     return files, str(mapping)
+
+
+def test_two_threads_publish_one_model(smoke_copy: Path) -> None:
+    fleet = fleet_slip.open(smoke_copy)
+    selection = fleet.cohort().select(models="table1")
+    made: list[object] = []
+    threads = [
+        threading.Thread(target=lambda: made.append(fleet.models.publish("slip", selection)))
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert len(made) == 2
+    assert fleet.models.versions("slip").num_rows == 1

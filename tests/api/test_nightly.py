@@ -23,7 +23,7 @@ from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.predicate import hash_drive, parse_predicate, without_drives
 from tests.support.cars import counts, drive
 from tests.support.catalog import SIGNALS
-from tests.support.commands import Finished, run_on
+from tests.support.commands import Finished, run_on, start_on, until
 from tests.support.counted_rows import START_S, row_of, write_counted
 from tests.support.landing import Landing
 from tests.support.logs import state
@@ -346,3 +346,20 @@ def test_drives_are_left_out_by_hashes_that_do_not_name_them() -> None:
         ).fetchall()
     assert left == [("c",)]
     assert without_drives("true", "fleet", []) == "true"
+
+
+@pytest.mark.long
+def test_a_process_that_is_killed_leaves_a_night_that_can_be_given_again(
+    place: Path, landing: Landing
+) -> None:
+    land(landing, 2)
+    commits = place / "data/grams/_delta_log"
+    before = len(list(commits.glob("*.json")))
+    process = start_on(place / "data", *command(place, 2))
+    until(lambda: len(list(commits.glob("*.json"))) > before)
+    process.kill()
+    process.communicate()
+    assert process.returncode < 0
+    again = give(place, 2)
+    assert (again.exit_code, again.drives, again.champion) == (0, 8, "smoke@3")
+    assert again.drives - again.before.drives == 2

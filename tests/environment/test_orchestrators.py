@@ -70,3 +70,12 @@ def test_dagster_makes_the_champion_an_asset(landing: Landing, tmp_path: Path) -
     assert done.exit_code == 0, done.stderr
     assert "RUN_SUCCESS" in done.stderr + done.stdout
     assert fleet_slip.open(tmp_path / "data").models.get("fleet").reference == "fleet@1"
+
+
+@pytest.mark.tools("dagster")
+def test_dagster_fails_at_once_where_the_night_fails(landing: Landing, tmp_path: Path) -> None:
+    done = materialize(landing, tmp_path, str(tmp_path / "no-such-mapping.toml"))
+    assert done.exit_code != 0
+    told = done.stderr + done.stdout
+    assert "exit code 3" in told
+    assert "STEP_UP_FOR_RETRY" not in told

@@ -263,3 +263,12 @@ def test_a_data_file_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     a_pipe(tmp_path / "file.parquet")
     with pytest.raises(StorageError, match="no such file"):
         LocalFolder(tmp_path).open("file.parquet")
+
+
+def test_a_pipe_given_to_a_command_is_refused_at_once(
+    tmp_path: Path, run_command: RunCommand
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    done = run_command("ingest", str(tmp_path / "pipe"))
+    assert done.exit_code == InputError.exit_code
+    assert "pipe" in done.stderr

@@ -21,6 +21,7 @@ from asammdf import MDF, Signal
 from fleet_slip.errors import ExtraError, InputError
 from fleet_slip.ingest.draft import draft_mapping, write_draft
 from fleet_slip.ingest.formats import matlab, mdf
+from fleet_slip.ingest.formats import source as budget
 from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import Budget
 from fleet_slip.ingest.logs import preview_logs
@@ -500,3 +501,22 @@ def test_groups_of_two_clocks_are_refused(tmp_path: Path, shift_s: float) -> Non
         log = Path(file.save(tmp_path / "log", overwrite=True))
     message = failure(log, mdf_mapping())
     assert "its signals have no time in common: 'a_x' begins at 1,717" in message
+
+
+@pytest.mark.parametrize(("offset", "value"), [(176, 0), (176, 15), (180, 2**31), (128, 99)])
+def test_a_damaged_matlab_file_does_not_bring_its_reader_down(
+    tmp_path: Path, offset: int, value: int
+) -> None:
+    file = tmp_path / "log.mat"
+    scipy.io.savemat(file, {"t": TIME_S, "Data": {"beta": BETA_DEG}})
+    data = bytearray(file.read_bytes())
+    data[offset : offset + 4] = value.to_bytes(4, "little")
+    file.write_bytes(data)
+    assert str(file) in failure(file, mat_mapping())
+
+
+def test_a_matlab_5_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "FREE_MEMORY", 2**26)
+    file = tmp_path / "log.mat"
+    scipy.io.savemat(file, {"t": np.zeros(2**24)}, do_compression=True)
+    assert "needs more than" in failure(file, mat_mapping())

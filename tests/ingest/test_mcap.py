@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import polars as pl
 import pytest
 from mcap.writer import CompressionType
@@ -16,7 +17,7 @@ from fleet_slip.ingest.formats.file_formats import FileFormats
 from fleet_slip.ingest.formats.source import OWN_TIME, Budget
 from fleet_slip.ingest.mapping import Mapping
 from tests.support.format_values import AX, AX_COUNTS, BETA_DEG, START, TIME_S, require_the_drive
-from tests.support.measured import own_clock, read_measured
+from tests.support.measured import failure, own_clock, read_measured
 
 HEADER = """std_msgs/Header header
 {}
@@ -147,3 +148,12 @@ def test_a_field_is_one_of_texts_or_of_numbers(tmp_path: Path) -> None:
             list(source.batches(["imu.b"]))
         with pytest.raises(InputError, match=r"no column 'imu.e'"):
             list(source.batches(["imu.e"]))
+
+
+def test_a_chunk_with_a_flipped_bit_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "log.mcap", CompressionType.NONE)
+    data = bytearray(file.read_bytes())
+    at = data.index(np.float64(AX[50]).tobytes())
+    data[at] ^= 1
+    file.write_bytes(data)
+    assert "crc validation failed" in failure(file, mapping())

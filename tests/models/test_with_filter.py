@@ -11,6 +11,7 @@ import fleet_slip
 from fleet_slip.evaluation import held_out as held_out_module
 from fleet_slip.evaluation import measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
+from fleet_slip.evaluation.held_out import MAX_GROUPS, QUARTERS, Segments, inner_groups
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.ingest.mapping import load_mapping
@@ -148,3 +149,19 @@ def test_every_estimate_of_a_group_comes_from_fits_without_it(
     whole, *inner = trained
     assert len(inner) >= len(pairs[0].groups) > 1
     assert all(names < whole for names in inner)
+
+
+def test_inner_groups_never_contain_what_is_held_out() -> None:
+    class Drive:
+        def __init__(self, name: str) -> None:
+            self.name, self.trip, self.kind = name, name, "kind"
+
+    drives = [Drive(f"drive {number}") for number in range(6)]
+    held_out: Segments = frozenset(("drive 0", quarter) for quarter in range(QUARTERS))
+    groups, kinds = inner_groups(drives, held_out)  # type: ignore[arg-type]
+    assert kinds == [], "all are of one kind"
+    assert len(groups) == MAX_GROUPS
+    assert not any(group & held_out for group in groups)
+    assert len(frozenset().union(*groups)) == 5 * QUARTERS
+    quarters, _ = inner_groups(drives[:1], frozenset([("drive 0", 3)]))  # type: ignore[arg-type]
+    assert quarters == [frozenset([("drive 0", quarter)]) for quarter in range(3)]

@@ -330,3 +330,21 @@ def test_an_erasure_that_left_rows_in_a_table_is_not_done(
     assert ErasureLog(warehouse.root).state(beta) == "begun"
     assert not forget(warehouse, beta, now=True).pending
     assert ErasureLog(warehouse.root).state(beta) == "done"
+
+
+def test_files_that_a_clock_ahead_has_replaced_go_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ahead_s = 2 * 86_400
+    warehouse = fill(tmp_path, *CARS)
+    with monkeypatch.context() as patch:
+        set_clock(patch, ahead_s)  # then the commits, too, are dated otherwise
+        compact(warehouse)
+        forget(warehouse, ErasureSubject("vehicle", "beta"))
+    for file in tmp_path.rglob("*.parquet"):
+        moment = time.time() + ahead_s
+        os.utime(file, (moment, moment))
+    report = forget(warehouse, ErasureSubject("vehicle", "beta"), now=True)
+    assert not report.pending
+    assert report.old_files_deleted
+    assert not mentions(tmp_path, "beta")

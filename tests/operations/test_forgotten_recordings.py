@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -16,6 +16,9 @@ from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import logs
 from fleet_slip.ingest.logs import BatchCommit, ingest_files
 from fleet_slip.ingest.mapping import Mapping
+from fleet_slip.ingest.measured_log import open_measured
+from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
+from fleet_slip.ingest.ticks import MeasuredDrive
 from fleet_slip.operations.forget import forget
 from fleet_slip.operations.verify import verify
 from fleet_slip.storage.documents import DocumentFolder
@@ -250,3 +253,33 @@ def test_rows_of_what_was_forgotten_are_found_if_a_copy_brings_them_back(
     assert {f.kind for f in verify(warehouse, full=True).damage} == {"name"}
     erasure_log.allow(ErasureSubject(kind, name))  # type: ignore[arg-type]
     assert not verify(warehouse, full=True).damage
+
+
+def two_cars(folder: Path) -> tuple[list[MeasuredDrive], pa.Table]:
+    """The drives of a log of the cars a and b, one each, and its refused rows: the last of each."""
+    columns = {name: values * 2 for name, values in good_columns(20).items()}
+    columns["car"] = ["a"] * 20 + ["b"] * 20
+    columns["ax"] = list(columns["ax"])
+    columns["ax"][19] = columns["ax"][39] = "broken"
+    mapping = a_mapping(drive={"vehicle_id": {"column": "car"}})
+    file = folder / "log.csv"
+    file.write_text(csv_text(columns))
+    with open_measured(file, mapping) as stream:
+        return list(stream.drives()), next(stream.quarantine())
+
+
+def cars(rows: pa.Table) -> set[str]:
+    return set(rows["vehicle_id"].cast(pa.string()).to_pylist())
+
+
+@pytest.mark.parametrize("kind", ["vehicle", "drive"])
+def test_the_rows_of_what_was_forgotten_are_left_out(
+    kind: Literal["vehicle", "drive"], tmp_path: Path
+) -> None:
+    drives, refused = two_cars(tmp_path)
+    of_a, of_b = drives
+    erasure_log = ErasureLog(LocalFolder(tmp_path / "data"))
+    erasure_log.begin(ErasureSubject(kind, "a" if kind == "vehicle" else of_a.drive_id), 1, [], {})
+    assert drop_erased_drives(drives, erasure_log) == [of_b]
+    assert cars(refused) == {"a", "b"}
+    assert cars(drop_erased_rejects(refused, erasure_log)) == {"b"}

@@ -205,3 +205,23 @@ def test_drives_without_gram_rows_are_reduced_and_examined_before_they_train(
     assert done.exit_code == 0, done.stderr
     assert "computing Gram rows of signals from 2 log files" in done.stderr
     assert fleet.models.get("m").manifest.trained_on.drives == 4
+
+
+def test_labels_that_are_late_on_new_drives_are_seen_beside_a_champion(
+    tmp_path: Path, smoke_root: Path
+) -> None:
+    landing = Landing(tmp_path / "landing", smoke_root)
+    landing.prepare()
+    fleet, drives = fleet_slip.open(tmp_path / "data"), landing.drives()
+    late = "coalesce(lag(sideslip_rad, 60) OVER (PARTITION BY drive_id ORDER BY time_s), 0)"
+    for name, some, changes in (("a", drives[:4], {}), ("b", drives[4:], {"sideslip_rad": late})):
+        day = date(2026, 10, 5 + (name == "b"))
+        fleet.ingest(landing.land(name, some, day, **changes), str(landing.mapping))
+        fleet.gram()
+        if name == "a":
+            assert fleet.models.publish("m", fleet.cohort()).new
+    assert fleet.cohort().examine().faults == {"late sideslip": 4}
+    chosen = fleet.cohort(include_faulty=True).select()
+    with pytest.raises(RefusedError, match=r"of 4 inspected drives .*late sideslip\? it is \+0\.6"):
+        fleet.models.publish("m", chosen)
+    assert fleet.models.publish("m", chosen, candidate=True).candidate

@@ -2,10 +2,12 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from highway_env.vehicle.dynamics import BicycleVehicle
 
@@ -15,14 +17,18 @@ from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, Campaign, load_campaign
 from fleet_slip.simulation.simulate import (
     SimulationReport,
+    lane_drive,
+    simulate_batch,
     simulate_batches,
     simulate_campaign,
 )
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.highway import FourWheelVehicle
+from fleet_slip.vehicle.highway import FourWheelVehicle, HighwayLanes
 from fleet_slip.warehouse.warehouse import Warehouse
+from tests.support.catalog import SIGNALS
 from tests.support.commands import RunCommand, run_on
+from tests.support.rolling import simulate_drives
 
 DAYS = 5
 
@@ -159,3 +165,24 @@ def test_a_campaign_that_highway_env_drives_has_the_same_logs(
     )
     assert logs
     assert logs == by_kernel
+
+
+def test_highway_env_drives_whole_drives_as_the_kernel() -> None:
+    """Within 2e-11: its action is an angle of the road wheels, whose tangent is rounded.
+
+    One car and its road are imperfect; both drives are longer than a lap.
+    """
+    plan = load_campaign("fleet_realistic", SHIPPED_CONFIGS)
+    smoke = load_campaign("smoke", SHIPPED_CONFIGS)
+    specs = [*plan.drives(plan.first_day)[:1], *smoke.drives(smoke.first_day)[:1]]
+    drives = [lane_drive(replace(spec, laps=min(spec.laps, 1.1))) for spec in specs]
+    by_kernel = simulate_drives(drives)
+    by_highway_env = simulate_drives(drives, simulate_lanes=HighwayLanes(drives))
+    for expected, truth in zip(by_kernel, by_highway_env, strict=True):
+        assert truth.lost_control_tick == expected.lost_control_tick
+        for name in batch_kernel.CHANNELS:
+            values = getattr(truth, name)
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=2e-11, atol=2e-11)
+    batch = Batch("smoke", smoke.first_day, 0, (replace(specs[1], laps=0.1),))
+    logs = simulate_batch(SIGNALS, batch, "highway-env")
+    assert logs.equals(simulate_batch(SIGNALS, batch))

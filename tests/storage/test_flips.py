@@ -195,3 +195,16 @@ def test_gram_rows_are_not_made_of_flipped_logs(server: Server, stored: Warehous
         update_grams(stored, feature_set="motion")
     assert load_cohort(stored).drive_count == 16
     assert not verify(stored).damage
+
+
+def test_single_flipped_answers_among_many_change_nothing(
+    server: Server, stored: Warehouse
+) -> None:
+    usual, _ = ask_all(stored)
+    refusals = 0
+    for _ in range(4):
+        with flipping(server, "/(grams/[^_]|logs/day=|models/)", 0.2):
+            found, refused = ask_all(stored)
+        refusals += refused
+        assert found == {name: usual[name] for name in found}
+    assert refusals

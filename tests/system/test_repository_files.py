@@ -175,3 +175,22 @@ def test_the_examples_of_the_operations_page_are_documents_with_commands_that_ex
     action = load("action.yml")["inputs"]
     assert isinstance(action, dict)
     assert workflow["jobs"]["gate"]["steps"][1]["with"].keys() <= action.keys()
+
+
+@pytest.mark.long
+def test_the_image_runs_as_a_user_without_rights(tmp_path: Path) -> None:
+    builder = next(filter(shutil.which, ("podman", "docker")), None)
+    if builder is None or run([builder, "info"]).exit_code:
+        pytest.skip("no builder of images runs on this machine")
+    base = re.findall(r"^FROM (\S+:\S+) AS", (CHECKOUT / "Containerfile").read_text(), re.M)[0]
+    if run([builder, "pull", base]).exit_code:
+        pytest.skip(f"{base} cannot be pulled")
+    build = [builder, "build", "--file", "Containerfile", "--target", "slim", "--tag"]
+    built = run([*build, "fleet-slip:test", "."], cwd=CHECKOUT, patience_s=1800)
+    assert built.exit_code == 0, built.stderr
+    size = run([builder, "image", "inspect", "--format", "{{.Size}}", "fleet-slip:test"])
+    assert int(size.stdout) < MAX_IMAGE_BYTES
+    shell = [builder, "run", "--rm", "--entrypoint", "sh", "fleet-slip:test", "-c"]
+    done = run([*shell, "id --user && fleet-slip run --campaign smoke && fleet-slip status"])
+    assert done.exit_code == 0, done.stderr
+    assert done.stdout.startswith("10001\n")

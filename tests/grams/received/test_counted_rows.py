@@ -365,3 +365,10 @@ def test_what_no_counts_have_is_told(field: str, place: int, change: int, reason
     table = table_of([DRIVE])
     getattr(table, field).reshape(-1)[place] += np.int64(change)
     assert find_impossible(table, RANGES) == {0: reason}
+
+
+def test_names_are_stored_without_spaces_and_composed(fleet: Fleet, send: Send) -> None:
+    row = row_of(gram_of(1), " Zoe\u0308 ", drive_id="d1\n")
+    send([row])
+    ((stored),) = gram_rows(fleet)
+    assert (stored["vehicle_id"], stored["drive_id"]) == ("Zo\u00eb", "d1")

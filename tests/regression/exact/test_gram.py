@@ -131,3 +131,11 @@ def test_moments_about_an_origin_survive_wrapping() -> None:
 def test_absent_signals_are_named_of_many_the_first(wanted: str, told: str) -> None:
     with pytest.raises(DataError, match=f"{told}$".replace(".", r"\.")):
         require_signals("a", wanted)
+
+
+def test_blas_is_exact_at_the_largest_counts_over_many_blocks() -> None:
+    rows = 2**19 + 3
+    counts = np.full((rows, 2), -(2**15), dtype=np.int16)
+    gram = Gram.from_counts(("a", "b"), counts)
+    assert gram.products == (rows * 2**30,) * 3
+    assert gram.sums == (-rows * 2**15,) * 2
