@@ -11,9 +11,9 @@ import fleet_slip
 from fleet_slip.evaluation import held_out as held_out_module
 from fleet_slip.evaluation import measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
-from fleet_slip.evaluation.held_out import MAX_GROUPS, QUARTERS, Segments, inner_groups
+from fleet_slip.evaluation.held_out import MAX_GROUPS, inner_groups
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import LabelledDrive
+from fleet_slip.evaluation.labelled_drives import QUARTERS, LabelledDrive, Segments
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations
 from fleet_slip.models.manifest import LINE_ALONE
