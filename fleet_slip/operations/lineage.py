@@ -144,7 +144,8 @@ def _emitter(target: str) -> Callable[[Any], object]:
             f"--lineage {hide_passwords(target, to_end=True)}: name a file in a folder that "
             "exists, or a URL of a server such as http://HOST:PORT."
         )
-    return get_default_factory().create(config).emit
+    emit: Callable[[Any], object] = get_default_factory().create(config).emit
+    return emit
 
 
 def _table_versions(warehouse: "Warehouse") -> dict[str, int]:
