@@ -180,6 +180,22 @@ def data_needed() -> int:
     return DATA_BYTES + DATA_THREAD_BYTES * len(os.sched_getaffinity(0))
 
 
+def find_low_limit() -> str | None:
+    """Return a text about a limit of the shell under which libraries abort or hang, else None."""
+    needed = {
+        "-v": (resource.RLIMIT_AS, LIBRARIES_BYTES + THREAD_BYTES * len(os.sched_getaffinity(0))),
+        "-d": (resource.RLIMIT_DATA, data_needed()),
+    }
+    for option, (limit, least) in needed.items():
+        hard = resource.getrlimit(limit)[1]
+        if hard != resource.RLIM_INFINITY and hard < least:
+            return (
+                f"ulimit {option} is {hard // 2**10} KiB, and the libraries need "
+                f"{least // 2**10} KiB. Raise the limit, or limit the control group instead."
+            )
+    return None
+
+
 def _cgroup_limits() -> Iterator[int]:
     """Yield the memory limits of this process's control group (version 2) and its parents.
 

@@ -9,7 +9,7 @@ import sys
 from typing import Any
 
 from fleet_slip.errors import INTERRUPTED, StorageError, is_lack_of_memory
-from fleet_slip.resources import memory_bytes
+from fleet_slip.resources import find_low_limit, memory_bytes
 
 
 def _leave(_signal: int, _frame: Any) -> None:
@@ -22,6 +22,9 @@ def main() -> None:
     """Run the command line, and end with its exit code."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)
+    if low_limit := find_low_limit():
+        _tell(f"error: {low_limit}")
+        sys.exit(StorageError.exit_code)
     try:
         _prepare_imports()
         from fleet_slip.cli.app import run_app

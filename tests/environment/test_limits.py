@@ -38,6 +38,16 @@ def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None
 
 
 @pytest.mark.parametrize(
+    "limit", [f"-v {ENOUGH_KIB - 1}", f"-d {ENOUGH_DATA_KIB - 1}", "-d 600000"]
+)
+def test_a_limit_under_which_libraries_abort_is_refused(tmp_path: Path, limit: str) -> None:
+    done = run(["bash", "-c", f"ulimit {limit} && {COMMAND} --root {tmp_path / 'data'} status"])
+    assert done.exit_code == StorageError.exit_code
+    assert done.stderr.startswith(f"error: ulimit {limit[:2]} is")
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
     ("membership", "file"),
     [
         ("0::/system.slice/fleet-slip.service", "system.slice/fleet-slip.service/memory.max"),
