@@ -1,4 +1,4 @@
-"""What is measured instead of asserted. A missing package is one sentence, not a traceback."""
+"""Measurements of speed, scale and accuracy. A missing package ends in one sentence."""
 
 import sys
 from types import TracebackType

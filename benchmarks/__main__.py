@@ -51,10 +51,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="by default all")
     parser.add_argument("--records", type=Path, default=RECORDS)
-    given = parser.parse_args()
-    chosen = [one for one in COMMANDS if not given.names or one.split()[0] in given.names]
-    if told := [*filter(None, (run(command, given.records) for command in chosen))]:
-        sys.exit("\n".join(told))
+    arguments = parser.parse_args()
+    chosen = [
+        command_line
+        for command_line in COMMANDS
+        if not arguments.names or command_line.split()[0] in arguments.names
+    ]
+    if messages := [*filter(None, (run(command, arguments.records) for command in chosen))]:
+        sys.exit("\n".join(messages))
 
 
 if __name__ == "__main__":

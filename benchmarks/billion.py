@@ -54,7 +54,7 @@ class Steps:
     begun: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, file: Path) -> "Steps":
+    def load(cls, file: Path) -> "Steps":
         """Read what was done before, if anything."""
         if not file.exists():
             return cls(file)
@@ -66,10 +66,10 @@ class Steps:
             interrupted = name in self.begun
             self.begun.append(name)
             self._save()
-            usage, told = work()
+            usage, result = work()
             figures = asdict(usage)
             del figures["output"]
-            self.done[name] = {**figures, "told": told, "interrupted": interrupted}
+            self.done[name] = {**figures, "told": result, "interrupted": interrupted}
             self._save()
             print(
                 f"  {name:<28} {usage.seconds:9.2f} s  {usage.cpu_s:9.2f} CPU-s "
@@ -102,15 +102,15 @@ def run_size(rows: int, folder: Path) -> dict[str, Any]:
     """Do every step at one size and return its figures."""
     folder.mkdir(parents=True, exist_ok=True)
     root = folder / "data"
-    steps = Steps.of(folder / "steps.json")
+    steps = Steps.load(folder / "steps.json")
     require_space(rows, folder, root)
     history, day = campaigns.history(rows), campaigns.new_day(rows)
-    paths = {one.name: str(campaigns.write(one, folder)) for one in (history, day)}
+    paths = {campaign.name: str(campaigns.write(campaign, folder)) for campaign in (history, day)}
     print(f"{rows:,} rows: {history.days} days of {history.drives_per_day} drives", flush=True)
     simulated = steps.do("simulate", lambda: fleet_slip(root, "simulate", paths["history"]))
     gram = steps.do("gram", lambda: fleet_slip(root, "gram"))
-    whole = "source <> 'scenario'"
-    selected = steps.do("select", lambda: fleet_slip(root, "select", "--cohort", whole))
+    predicate = "source <> 'scenario'"
+    selected = steps.do("select", lambda: fleet_slip(root, "select", "--cohort", predicate))
     steps.do("publish", lambda: fleet_slip(root, "publish", MODEL))
     added = steps.do("new day: simulate", lambda: fleet_slip(root, "simulate", paths["new_day"]))
     steps.do("new day: gram", lambda: fleet_slip(root, "gram"))
@@ -118,11 +118,11 @@ def run_size(rows: int, folder: Path) -> dict[str, Any]:
     steps.do("cohort: select", lambda: fleet_slip(root, "select", "--cohort", COHORT))
     steps.do("cohort: in process", lambda: refitted(root))
     steps.do("forget a car", lambda: forgotten(root))
-    made = simulated["told"]["rows"]
-    assert gram["told"]["rows_read"] == made == selected["told"]["rows"]
-    assert again["told"]["rows"] == made + added["told"]["rows"]
+    row_count = simulated["told"]["rows"]
+    assert gram["told"]["rows_read"] == row_count == selected["told"]["rows"]
+    assert again["told"]["rows"] == row_count + added["told"]["rows"]
     return {
-        "rows": made,
+        "rows": row_count,
         "new_rows": added["told"]["rows"],
         "days": history.days,
         "files": simulated["told"]["batches_written"],
@@ -141,8 +141,8 @@ def _without_answer(name: str, step: dict[str, Any]) -> dict[str, Any]:
 def require_space(rows: int, folder: Path, root: Path) -> None:
     """Exit if the disk cannot hold what is still to be written."""
     needed = BYTES_PER_ROW * rows * (1 + campaigns.NEW_SHARE + REWRITTEN_SHARE) + SLACK_BYTES
-    there = sum(file.stat().st_size for file in root.rglob("*.parquet")) if root.is_dir() else 0
-    free = shutil.disk_usage(folder).free + there
+    present = sum(file.stat().st_size for file in root.rglob("*.parquet")) if root.is_dir() else 0
+    free = shutil.disk_usage(folder).free + present
     if free < needed:
         sys.exit(
             f"{folder}: {rows:,} rows need {needed / 1e9:.1f} GB and {free / 1e9:.1f} GB are free. "

@@ -58,14 +58,14 @@ def write(sized: Sized, folder: Path) -> Path:
 
 
 def _sized(name: str, first_day: date, days: int, rows: int) -> Sized:
-    wanted = rows / days
+    daily_rows = rows / days
     at_first = Sized(name, first_day, 1, PROBED_DRIVES, LAPS)
     per_drive = _mean_rows(at_first)
-    laps = LAPS * min(1.0, wanted / (DRIVES_MIN * per_drive))
-    drives = max(DRIVES_MIN, round(wanted / per_drive))
+    laps = LAPS * min(1.0, daily_rows / (DRIVES_MIN * per_drive))
+    drives = max(DRIVES_MIN, round(daily_rows / per_drive))
     probed = Sized(name, first_day, 1, min(PROBED_DRIVES, days * drives), laps)
     return Sized(
-        name, first_day, days, drives, round(laps * wanted / drives / _mean_rows(probed), 4)
+        name, first_day, days, drives, round(laps * daily_rows / drives / _mean_rows(probed), 4)
     )
 
 
@@ -98,6 +98,6 @@ def _text(sized: Sized) -> str:
         "rows_per_file": str(ROWS_PER_FILE),
     }
     for key, value in values.items():
-        text, found = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
-        assert found == 1, key
+        text, count = re.subn(rf"^{key} = .*$", f"{key} = {value}", text, flags=re.MULTILINE)
+        assert count == 1, key
     return text

@@ -57,20 +57,20 @@ def main() -> None:
     campaign = load_campaign("fleet", SHIPPED_CONFIGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        here, there = folder / "here", folder / "there"
+        local_folder, cluster_folder = folder / "here", folder / "there"
         with LocalThreads(arguments.workers) as threads:
-            local = measure(here, campaign, arguments.days, threads, None)
+            local = measure(local_folder, campaign, arguments.days, threads, None)
         with dask_processes(folder, arguments.workers) as dask:
             dask.wait_for_workers(arguments.workers)
             with cluster_executor(dask.address, LocalFolder(folder)) as executor:
-                cluster = measure(there, campaign, arguments.days, executor, executor)
+                cluster = measure(cluster_folder, campaign, arguments.days, executor, executor)
             memory = max(peak_bytes(process.pid) for process in dask.processes[1:])
-        assert data_files(here) == data_files(there), "the bits differ"
-        rows = Warehouse(LocalFolder(here)).logs.snapshot().rows
+        assert data_files(local_folder) == data_files(cluster_folder), "the bits differ"
+        rows = Warehouse(LocalFolder(local_folder)).logs.snapshot().rows
     print(f"{rows:,} rows; the same bits from {arguments.workers} threads and from Dask workers")
-    for what, ours, theirs in zip(("simulate", "gram"), local, cluster, strict=True):
+    for step, ours, theirs in zip(("simulate", "gram"), local, cluster, strict=True):
         print(
-            f"{what:10s} threads {ours:6.2f} s, {rows / ours / 1e6:6.2f} Mrows/s   "
+            f"{step:10s} threads {ours:6.2f} s, {rows / ours / 1e6:6.2f} Mrows/s   "
             f"cluster {theirs:6.2f} s, {rows / theirs / 1e6:6.2f} Mrows/s   "
             f"ratio {ours / theirs:.2f}"
         )

@@ -198,12 +198,12 @@ class Harness:
             return None
 
         def look_and_repeat() -> list[Any]:
-            found = [] if self.command.damaged else damage(root)
+            findings = [] if self.command.damaged else damage(root)
             repeat(root, self.arguments)
-            return [found, state(root)]
+            return [findings, state(root)]
 
-        found, after = forked(look_and_repeat).result
-        assert not found, f"{self.command.name}: after a kill {where}: {found}"
+        faults, after = forked(look_and_repeat).result
+        assert not faults, f"{self.command.name}: after a kill {where}: {faults}"
         assert after == self.expected, (
             f"{self.command.name}: after a kill {where}\n{after}\ninstead of\n{self.expected}"
         )

@@ -51,14 +51,14 @@ def ratios(columns: int) -> dict[str, float]:
         seconds(lambda: np.linalg.solve(matrix[:-1, :-1], matrix[:-1, -1])) for _ in range(9)
     )
     scales = dict.fromkeys((*names, "y"), Fraction(1))
-    found = {"solve_float_ms": 1e3 * unit, "fit": seconds(lambda: fit(total, names, "y")) / unit}
+    results = {"solve_float_ms": 1e3 * unit, "fit": seconds(lambda: fit(total, names, "y")) / unit}
     if columns <= MAX_VALIDATED:
         procedure = least_squares(names, "y")
         validation = seconds(lambda: cross_validate("all", folds, procedure, scales))
-        found["cross_validate"] = validation / unit
+        results["cross_validate"] = validation / unit
     if columns <= MAX_NESTED:
-        found["nested"] = seconds(lambda: nested_fits(total, names, "y")) / unit
-    return {name: float(f"{value:.3g}") for name, value in found.items()}
+        results["nested"] = seconds(lambda: nested_fits(total, names, "y")) / unit
+    return {name: float(f"{value:.3g}") for name, value in results.items()}
 
 
 def main(columns: tuple[int, ...]) -> None:

@@ -73,10 +73,10 @@ UNDAMAGED = (0, 5, 7, 10)
 
 @dataclass
 class Counts:
-    """What came of the flips of one kind of file: flips, and commands after them."""
+    """Results for one kind of file: flips, and outcomes of the commands after them."""
 
     flips: int = 0
-    found: int = 0
+    detected: int = 0
     """Flips that `verify` found."""
     refused: int = 0
     same: int = 0
@@ -98,18 +98,18 @@ def write(root: Path, arguments: Sequence[str], flip: Flip | None) -> Ended:
         return Ended(ended.exit_code, "", ended.remarks, meaning)
 
 
-def judge(counts: Counts, what: str, ended: Ended, usual: Ended) -> None:
+def judge(counts: Counts, title: str, ended: Ended, usual: Ended) -> None:
     """Count how a command ended after a flip."""
     if ended.is_bug:
         counts.bugs += 1
         counts.examples.append(
-            f"BUG {what}: exit {ended.exit_code}: {ended.remarks.strip()[-600:]}"
+            f"BUG {title}: exit {ended.exit_code}: {ended.remarks.strip()[-600:]}"
         )
     elif ended.exit_code != usual.exit_code:
         counts.refused += 1
     elif ended.exit_code == 0 and ended.answer != usual.answer:
         counts.wrong += 1
-        counts.examples.append(f"WRONG {what}: {_difference(usual, ended)}")
+        counts.examples.append(f"WRONG {title}: {_difference(usual, ended)}")
     else:
         counts.same += 1
 
@@ -119,7 +119,7 @@ def _difference(usual: Ended, ended: Ended) -> str:
     (before, meant), (after, means) = usual.answer, ended.answer
     if before == after:
         return f"the root means something else ({meant.strip()[:80]}, {means.strip()[:80]})"
-    alike = (one == other for one, other in zip(before, after, strict=False))
+    alike = (line == other for line, other in zip(before, after, strict=False))
     place = next((n for n, same in enumerate(alike) if not same), min(len(before), len(after)))
     begin = max(0, place - 60)
     return f"{before[begin : place + 60]!r} became {after[begin : place + 60]!r}"
@@ -134,23 +134,23 @@ def choose(root: Path, number: int, seed: int, kinds: Sequence[str]) -> Iterator
         yield kind, Flip(file.relative_to(root), rng.randrange(file.stat().st_size * 8))
 
 
-def run(root: Path, chosen: Sequence[tuple[str, Flip]], found: dict[str, Counts]) -> None:
+def run(root: Path, chosen: Sequence[tuple[str, Flip]], counts_by_kind: dict[str, Counts]) -> None:
     """Flip bits one after the other; count what commands make of each, by kind of file."""
     reading = {arguments: command(root, *arguments) for arguments in READING}
     writing = {arguments: write(root, arguments, None) for arguments in WRITING}
     for arguments, usual in (reading | writing).items():
         assert usual.exit_code in UNDAMAGED, (arguments, usual)
     for number, (kind, flip) in enumerate(chosen, 1):
-        counts, shown = found[kind], len(found[kind].examples)
+        counts, shown = counts_by_kind[kind], len(counts_by_kind[kind].examples)
         counts.flips += 1
         with flipped(root, flip):
-            told = command(root, *VERIFY).exit_code == 9
-            counts.found += told
-            if told and kind in FOR_VERIFY:
+            detected = command(root, *VERIFY).exit_code == 9
+            counts.detected += detected
+            if detected and kind in FOR_VERIFY:
                 continue
             for arguments, usual in reading.items():
-                what = f"{flip}: {' '.join(arguments)}"
-                judge(counts, what, command(root, *arguments), usual)
+                title = f"{flip}: {' '.join(arguments)}"
+                judge(counts, title, command(root, *arguments), usual)
         for arguments, usual in writing.items():
             judge(counts, f"{flip}: {' '.join(arguments)}", write(root, arguments, flip), usual)
         for example in counts.examples[shown:]:
@@ -159,9 +159,11 @@ def run(root: Path, chosen: Sequence[tuple[str, Flip]], found: dict[str, Counts]
             print(f"{number} flips", file=sys.stderr, flush=True)
 
 
-def show(found: dict[str, Counts]) -> int:
+def show(counts_by_kind: dict[str, Counts]) -> int:
     """Print the counts; return how many results were wrong, or bugs."""
-    rows = {kind: [getattr(counts, name) for name in FIGURES] for kind, counts in found.items()}
+    rows = {
+        kind: [getattr(counts, name) for name in FIGURES] for kind, counts in counts_by_kind.items()
+    }
     rows["all"] = [sum(column) for column in zip(*rows.values(), strict=True)]
     print(f"{'kind':<26}" + "".join(f"{name:>9}" for name in FIGURES))
     for kind, figures in rows.items():
@@ -182,11 +184,11 @@ def main() -> None:
         load_code("smoke")
         fill(root)
         kinds = options.kind or list(KINDS)
-        found: dict[str, Counts] = collections.defaultdict(Counts)
+        counts_by_kind: dict[str, Counts] = collections.defaultdict(Counts)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with contextlib.suppress(KeyboardInterrupt):
-            run(root, list(choose(root, options.flips, options.seed, kinds)), found)
-    bad = show(found)
+            run(root, list(choose(root, options.flips, options.seed, kinds)), counts_by_kind)
+    bad = show(counts_by_kind)
     print(f"{time.monotonic() - started:.0f} s")
     sys.exit(bool(bad))
 

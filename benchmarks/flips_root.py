@@ -56,7 +56,7 @@ PASSING = re.compile(
     r'"(seconds|at|host|process|run_id|sha256'
     r'|[a-z_]*(_at|hours|age|bytes|fraction)[a-z_]*)": [^,}\]]*'
 )
-"""What differs from run to run."""
+"""Parts of an output that differ from run to run."""
 
 NUMBER = re.compile(r"-?\d+\.\d+(e-?\d+)?")
 """Averages of floating-point numbers have other last digits on other threads."""
@@ -73,13 +73,13 @@ class Ended:
 
     @property
     def answer(self) -> tuple[str, str]:
-        """What must be the same wherever it ended well."""
+        """Return the parts of the output that must be equal in all successful runs."""
         printed = PASSING.sub("", self.printed)
-        return NUMBER.sub(lambda found: f"{float(found[0]):.9g}", printed), self.meaning
+        return NUMBER.sub(lambda match: f"{float(match[0]):.9g}", printed), self.meaning
 
     @property
     def is_bug(self) -> bool:
-        """Whether it ended as nothing may end: exit 1, a signal, or a traceback."""
+        """Return True if the command crashed: exit code 1, a signal, or a traceback."""
         return self.exit_code == 1 or self.exit_code < 0 or "Traceback" in self.remarks
 
 
@@ -161,12 +161,12 @@ def write_short_lists(configs: Path) -> None:
     """Write sets and searches of few columns into a new folder; choose them."""
     (configs / "models").mkdir(parents=True)
     estimator = _replace(SHIPPED_CONFIGS.find("models", "estimator").read_text(), _SEARCH)
-    anything, found = _INPUTS.subn("", estimator)
-    assert found == 1
+    anything, replaced = _INPUTS.subn("", estimator)
+    assert replaced == 1
     (configs / "models" / "estimator.toml").write_text(anything)
     features = (folder("configs") / "features.toml").read_text(encoding="utf-8")
-    fewer, found = _WINDOWS.subn(r'\1"ay_mean", "yaw_rate_bias"]', features)
-    assert found == 1
+    fewer, replaced = _WINDOWS.subn(r'\1"ay_mean", "yaw_rate_bias"]', features)
+    assert replaced == 1
     (configs / "features.toml").write_text(fewer)
     os.environ[CONFIG_VARIABLE] = str(configs)
 
@@ -180,16 +180,16 @@ def _replace(text: str, pairs: tuple[tuple[str, str], ...]) -> str:
 
 def fill(root: Path) -> None:
     """Make a small data root with every kind of file, and a day of logs without Gram rows."""
-    given = str(campaign(root))
+    campaign_path = str(campaign(root))
     models = str(Path(__file__).parent / "lists" / "ay_yaw_rate.toml")
     for step in (
-        ("run", "--campaign", given, "--days", "8", "--threads", "1"),
+        ("run", "--campaign", campaign_path, "--days", "8", "--threads", "1"),
         ("publish", "smoke", "--force", "--models", models),
         ("forget", "--drive", "smoke-2024-05-01-0000", "--now"),
     ):
         _require_done(command(root, *step))
     forked(lambda: _add_what_is_rare(root))
-    _require_done(command(root, "simulate", given, "--threads", "1"))
+    _require_done(command(root, "simulate", campaign_path, "--threads", "1"))
     for kind, pattern in KINDS.items():
         assert any(root.glob(pattern)), f"no {kind}"
 
@@ -216,7 +216,7 @@ def digest(root: Path) -> str:
 
     def work() -> str:
         warehouse = Warehouse(LocalFolder(root))
-        found = hashlib.sha256()
+        digest = hashlib.sha256()
         for table, order in ((warehouse.logs, "tick"), (warehouse.grams, "feature_set")):
             names = [name for name in table.schema.names if name not in ("file", "day")]
             parts = [
@@ -228,13 +228,13 @@ def digest(root: Path) -> str:
             )
             with pa.ipc.new_stream(sink := pa.BufferOutputStream(), rows.schema) as writer:
                 writer.write_table(rows.combine_chunks())
-            found.update(sink.getvalue())
+            digest.update(sink.getvalue())
         for file in sorted(root.glob("models/*/*/*.json")):
             content = json.loads(file.read_text())["content"]
             for varying in ("at", "trained_on"):
                 content.pop(varying, None)
-            found.update(json.dumps(content, sort_keys=True).encode())
-        return found.hexdigest()
+            digest.update(json.dumps(content, sort_keys=True).encode())
+        return digest.hexdigest()
 
     try:
         return str(forked(work).result)

@@ -52,7 +52,7 @@ class Kind:
     adhesion: float = 1.0
     friction_use: float = 0.5
     """Planned lateral acceleration over adhesion times g, of a driver who sees the road."""
-    others: Mapping[str, Any] = field(default_factory=dict)
+    overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
 def kinds() -> dict[str, Kind]:
@@ -63,20 +63,20 @@ def kinds() -> dict[str, Kind]:
     return {
         "country": Kind(0.035, ("country",)),
         "hill": Kind(0.046, ("hill",)),
-        LADEN: Kind(0.16, others=load),
+        LADEN: Kind(0.16, overrides=load),
         "adhesion .55": Kind(0.105, adhesion=0.55, friction_use=0.7),
         "adhesion .5": Kind(0.105, adhesion=0.5, friction_use=0.7),
         "adhesion .4": Kind(0.105, adhesion=0.4, friction_use=0.7),
         "limit of grip": Kind(0.14, friction_use=0.82),
-        "banked": Kind(0.058, others={"imperfections": leaning.model_dump()}),
+        "banked": Kind(0.058, overrides={"imperfections": leaning.model_dump()}),
     }
 
 
-def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]:
+def scenarios(kind: str, parameters: Kind, seed: int, roads: int) -> Iterator[Scenario]:
     """Yield the drives of a kind."""
     drivers = load_config(SHIPPED_CONFIGS.file("blind.toml"), BlindSet, SHIPPED_CONFIGS).drivers
     for number in range(roads):
-        road = one.roads[number % len(one.roads)]
+        road = parameters.roads[number % len(parameters.roads)]
         drawn = random_generator(seed, "goals", kind, str(number))
         track = draw_road(road, int(drawn.integers(2**60)))
         yield Scenario.model_validate(
@@ -86,22 +86,22 @@ def scenarios(kind: str, one: Kind, seed: int, roads: int) -> Iterator[Scenario]
                 "base": "nominal",
                 "pace": [],
                 "track": drivers.line(track, road, drawn),
-                "adhesion": one.adhesion,
+                "adhesion": parameters.adhesion,
                 "seed": number,
                 "limits": {
-                    "lateral_mps2": one.friction_use * one.adhesion * GRAVITY_MPS2,
-                    "acceleration_mps2": 2.5 * one.adhesion,
-                    "braking_mps2": 4.0 * one.adhesion,
+                    "lateral_mps2": parameters.friction_use * parameters.adhesion * GRAVITY_MPS2,
+                    "acceleration_mps2": 2.5 * parameters.adhesion,
+                    "braking_mps2": 4.0 * parameters.adhesion,
                     "top_speed_mps": TOP_SPEED_MPS,
                 },
-                **one.others,
+                **parameters.overrides,
             },
             context=SHIPPED_CONFIGS,
         )
 
 
 def errors_deg(
-    some: Sequence[Scenario],
+    scenarios: Sequence[Scenario],
     estimators: Mapping[str, DriveEstimator[TestDrive]],
     *,
     laden: bool = False,
@@ -110,7 +110,11 @@ def errors_deg(
 
     `laden`: judged at the centre of gravity of the loaded car instead of the empty one.
     """
-    drives = [one for one in simulate_drives(SIGNALS, some) if one.lost_control_s is None]
+    drives = [
+        simulated
+        for simulated in simulate_drives(SIGNALS, scenarios)
+        if simulated.lost_control_s is None
+    ]
     if laden:
         drives = [_laden(drive) for drive in drives]
     errors = pooled_statistics(evaluate(drives, estimators))
@@ -125,16 +129,20 @@ def _laden(drive: TestDrive) -> TestDrive:
 
 def print_nights(version: ModelVersion, seed: int) -> None:
     """Print the error of each drive's first and second minute, by what is remembered."""
-    every = {kind: one for kind, one in kinds().items() if kind in ("country", LADEN)}
+    selected = {
+        kind: parameters for kind, parameters in kinds().items() if kind in ("country", LADEN)
+    }
     order = ["country"] * 3 + [LADEN] * 3 + ["country"] * 3
-    some = [next(scenarios(kind, every[kind], seed + i, 1)) for i, kind in enumerate(order)]
-    drives = [drive for one in some for drive in simulate_drives(SIGNALS, [one])]  # all of one name
+    sequence = [next(scenarios(kind, selected[kind], seed + i, 1)) for i, kind in enumerate(order)]
+    drives = [
+        drive for parameters in sequence for drive in simulate_drives(SIGNALS, [parameters])
+    ]  # all of one name
     print("| remembered |", " | ".join(f"{i}: {kind}" for i, kind in enumerate(order, 1)), "|")
     print("| --- " * (len(order) + 1) + "|")
-    for kept in (0, 128, 200, 240, 256):
-        estimator, found = Estimator(CATALOG, version.manifest), []
+    for retained in (0, 128, 200, 240, 256):
+        estimator, errors = Estimator(CATALOG, version.manifest), []
         for drive in drives:
-            estimator.restart(kept)
+            estimator.restart(retained)
             rows = min(2 * MINUTE_TICKS, len(drive.time_s))
             columns = [drive.signals[name][:rows].tolist() for name in estimator.columns]
             angles = [
@@ -143,8 +151,8 @@ def print_nights(version: ModelVersion, seed: int) -> None:
             ]
             error = np.array(angles, dtype=float) - drive.sideslip_rad[:rows]
             parts = (error[:MINUTE_TICKS], error[MINUTE_TICKS:])
-            found.append(", ".join(f"{np.degrees(np.sqrt(np.nanmean(e**2))):.3f}" for e in parts))
-        print(f"| {kept} | {' | '.join(found)} |", flush=True)
+            errors.append(", ".join(f"{np.degrees(np.sqrt(np.nanmean(e**2))):.3f}" for e in parts))
+        print(f"| {retained} | {' | '.join(errors)} |", flush=True)
 
 
 def main() -> None:
@@ -163,26 +171,28 @@ def main() -> None:
         return
     with ThreadPoolExecutor(2) as executor:
         _, bank = train_competitors(fleet.warehouse, versions[0], versions[1:], executor)
-    wanted = [one.reference for one in versions] + [name for name in bank if name.startswith("ekf")]
-    estimators = {name: bank[name][0] for name in wanted}
+    names = [item.reference for item in versions] + [
+        name for name in bank if name.startswith("ekf")
+    ]
+    estimators = {name: bank[name][0] for name in names}
     drives = {"nominal": (0.014, [load_scenario("nominal", SHIPPED_CONFIGS)])} | {
-        kind: (one.goal_deg, list(scenarios(kind, one, seed, options.roads)))
-        for kind, one in kinds().items()
+        kind: (item.goal_deg, list(scenarios(kind, item, seed, options.roads)))
+        for kind, item in kinds().items()
     }
     print("| | goal |", " | ".join(estimators), "|")
     print("| --- " * (len(estimators) + 2) + "|")
-    for kind, (goal_deg, some) in drives.items():
-        found = " | ".join(f"{error:.3f}" for error in errors_deg(some, estimators))
-        print(f"| {kind} | {goal_deg:.3f} | {found} |", flush=True)
-        if some[0].load_position_m is not None:
-            found = " | ".join(f"{e:.3f}" for e in errors_deg(some, estimators, laden=True))
-            print(f"| the same, at the laden centre of gravity | | {found} |", flush=True)
+    for kind, (goal_deg, cases) in drives.items():
+        cells = " | ".join(f"{error:.3f}" for error in errors_deg(cases, estimators))
+        print(f"| {kind} | {goal_deg:.3f} | {cells} |", flush=True)
+        if cases[0].load_position_m is not None:
+            cells = " | ".join(f"{e:.3f}" for e in errors_deg(cases, estimators, laden=True))
+            print(f"| the same, at the laden centre of gravity | | {cells} |", flush=True)
     for number in range(options.draws):
         drawn = sha256(f"{versions[0].sha256} {number}".encode()).hexdigest()
-        found = " | ".join(
+        cells = " | ".join(
             f"{e:.3f}" for e in errors_deg(blind_scenarios(drawn, SHIPPED_CONFIGS), estimators)
         )
-        print(f"| 24 blind drives, draw {number + 1} | | {found} |", flush=True)
+        print(f"| 24 blind drives, draw {number + 1} | | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What each command costs as a warehouse's history grows: log files, Gram rows or model versions.
+"""The cost of each command as a data root grows: log files, Gram rows or model versions.
 
     python -m benchmarks.growth --root FOLDER [--part files gram-rows ...] [--sizes 1e3 1e4]
 
@@ -104,7 +104,7 @@ def command(root: Path, arguments: Sequence[str]) -> Usage:
 def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, list[Usage]]:
     """Measure every command of a part at every size."""
     part = PARTS[name]
-    found: dict[str, list[Usage]] = {}
+    usages_by_command: dict[str, list[Usage]] = {}
     for size in sizes:
         root = folder / f"{name}-{size}" / "data"
         root.mkdir(parents=True)
@@ -115,17 +115,17 @@ def grow(name: str, sizes: Sequence[int], folder: Path) -> dict[str, list[Usage]
             text = " ".join(arguments)
             seen[text] = seen.get(text, 0) + 1
             text += " (again)" * (seen[text] - 1)
-            found.setdefault(text, []).append(usage)
+            usages_by_command.setdefault(text, []).append(usage)
             print(f"{name} {size:>9,}  {text:<70} {usage.cpu_s:8.2f} CPU-s", file=sys.stderr)
         shutil.rmtree(root.parent)
-    return found
+    return usages_by_command
 
 
-def markdown(name: str, sizes: Sequence[int], found: dict[str, list[Usage]]) -> str:
+def markdown(name: str, sizes: Sequence[int], usages_by_command: dict[str, list[Usage]]) -> str:
     """Return a part's figures as a Markdown table."""
     head = [f"{name}: processor seconds", *(f"{n:,}" for n in sizes), "slope", "peak MiB"]
     lines = [" | ".join(head), " | ".join(["---", *["---:"] * (len(head) - 1)])]
-    for text, usages in found.items():
+    for text, usages in usages_by_command.items():
         times = [usage.cpu_s for usage in usages]
         cells = [f"`{text}`", *(f"{s:.2f}" for s in times)]
         rise = math.nan

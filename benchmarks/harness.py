@@ -1,4 +1,4 @@
-"""What benchmarks share: rows to measure on, clocks, commands in forked processes, tables in pages.
+"""Shared parts of benchmarks: sample rows, clocks, commands in forked processes, tables in pages.
 
 A process that has imported everything forks for every command, which takes a tenth of the time.
 """
@@ -72,12 +72,12 @@ def durations(
     function: Callable[[], object], rounds: int, clock: Callable[[], float] = time.perf_counter
 ) -> list[float]:
     """Return how long each of some calls takes, in s."""
-    found = []
+    results = []
     for _ in range(rounds):
         start = clock()
         function()
-        found.append(clock() - start)
-    return found
+        results.append(clock() - start)
+    return results
 
 
 def peak_bytes(process: int | str = "self") -> int:
@@ -146,9 +146,9 @@ def call(root: object, arguments: tuple[str, ...]) -> int:
 
 def load_code(campaign: str) -> None:
     """Load in this process what commands load when they are called, so that its forks need not."""
-    for found in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
+    for module in pkgutil.walk_packages(fleet_slip.__path__, "fleet_slip."):
         with contextlib.suppress(ImportError):  # an extra that is not there
-            importlib.import_module(found.name)
+            importlib.import_module(module.name)
     for name in ("pandas", "pyarrow.dataset"):
         importlib.import_module(name)
     plan = load_campaign(campaign, SHIPPED_CONFIGS)
@@ -162,12 +162,12 @@ def insert(document: Path, name: str, text: str) -> None:
     """Replace what stands between `<!-- NAME -->` and `<!-- end of NAME -->` in a document."""
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     old = document.read_text("utf-8")
-    new, found = re.subn(
+    new, replaced = re.subn(
         f"({re.escape(begin)}\n).*?({re.escape(end)})",
         lambda match: f"{match[1]}{text}\n{match[2]}",
         old,
         flags=re.DOTALL,
     )
-    if found != 1:
-        raise ValueError(f"{document} has {found} places called {name}")
+    if replaced != 1:
+        raise ValueError(f"{document} has {replaced} places called {name}")
     document.write_text(new, encoding="utf-8")

@@ -42,7 +42,7 @@ CHECKED_ROWS, RECORDED_RATIOS = 500_000, {"parquet": 3.5, "csv": 2.6}
 """Processor time of an ingest over that of Polars; half a second of it does not grow with rows."""
 MAX_GROWTH, ATTEMPTS = 1.5, 2
 STORED_BYTES_A_ROW = 30
-"""What becomes of a row, at most."""
+"""Maximum stored bytes of a row, for the space that a run needs."""
 SIGNALS = {
     "ax": "m/s^2", "ay": "m/s^2", "yaw_rate": "rad/s", "steering_wheel": "rad",
     "wheel_fl": "rad/s", "wheel_fr": "rad/s", "wheel_rl": "rad/s", "wheel_rr": "rad/s",
@@ -156,10 +156,12 @@ def _write_mf4(file: Path, tables: Iterable[pl.DataFrame]) -> None:
             time_s = table["t"].to_numpy()
             counts = [np.rint(table[n].to_numpy() * 1000).astype("i2") for n in SIGNALS]
             if number:
-                mdf.extend(0, [(time_s, None), *((one, None) for one in counts)])
+                mdf.extend(0, [(time_s, None), *((values, None) for values in counts)])
             else:
                 named = zip(SIGNALS, counts, strict=True)
-                mdf.append([Signal(one, time_s, name=n, conversion=factor) for n, one in named])
+                mdf.append(
+                    [Signal(values, time_s, name=n, conversion=factor) for n, values in named]
+                )
         mdf.save(file, compression=2)
 
 

@@ -31,26 +31,26 @@ def main() -> None:
     parser.add_argument("--files", type=int, default=2000)
     parser.add_argument("--rows", type=int, default=1000, help="of each file")
     parser.add_argument("--format", choices=("csv", "parquet"), default="csv")
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     with TemporaryDirectory() as name:
         base = Path(name)
         os.environ["XDG_CACHE_HOME"] = str(base / "cache")
         folder, mapping = base / "landing", base / "mapping.toml"
         folder.mkdir()
-        write_folder(folder, given.files + 1, given.rows, given.format)
-        late = folder / f"drive_{given.files:06}.{given.format}"
+        write_folder(folder, arguments.files + 1, arguments.rows, arguments.format)
+        late = folder / f"drive_{arguments.files:06}.{arguments.format}"
         later = late.rename(base / late.name)
-        write_mapping(mapping, given.format)
+        write_mapping(mapping, arguments.format)
         fleet = fleet_slip.open(base / "data")
         Path("/proc/self/clear_refs").write_text("5")  # the peak of writing does not count
-        for what in ("all new", "nothing new", "one new"):
-            if what == "one new":
+        for title in ("all new", "nothing new", "one new"):
+            if title == "one new":
                 later.rename(late)
             start, cpu = time.perf_counter(), time.process_time()
             reports = fleet.ingest(folder, str(mapping))
             took, cpu = time.perf_counter() - start, time.process_time() - cpu
             print(
-                f"{what:12} {len(reports):7,} files {took:8.2f} s {cpu:8.2f} CPU s "
+                f"{title:12} {len(reports):7,} files {took:8.2f} s {cpu:8.2f} CPU s "
                 f"{1e3 * cpu / max(len(reports), 1):7.2f} CPU ms a file "
                 f"{peak_bytes() / 2**20:6.0f} MiB",
                 flush=True,

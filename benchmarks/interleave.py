@@ -42,37 +42,37 @@ def run(options: argparse.Namespace, folder: Path, roots: Any) -> dict[str, list
     inputs = write_inputs(folder / "inputs")
     load_code(inputs.files["campaign"])
     rng = random.Random(options.seed)  # noqa: S311
-    found: dict[str, list[Schedule]] = defaultdict(list)
+    failures: dict[str, list[Schedule]] = defaultdict(list)
     pairs = list(itertools.product(options.first, options.second))
     done, started = 0, time.monotonic()
     for number, (first, second) in enumerate(pairs):
         if options.only and (first, second) != tuple(options.only.split("/")[:2]):
             continue
         pair = Pair(first, second, inputs, folder, roots)
-        every = list(schedules(pair, FATES))
+        candidates = list(schedules(pair, FATES))
         if options.only:
-            every = [one for one in every if str(one) == options.only]
+            candidates = [candidate for candidate in candidates if str(candidate) == options.only]
         elif options.schedules:
             share = (options.schedules * (number + 1)) // len(pairs) - (
                 options.schedules * number
             ) // len(pairs)
-            every = rng.sample(every, min(share, len(every)))
+            candidates = rng.sample(candidates, min(share, len(candidates)))
         for finding in pair.alone:
-            found[f"{first} | {second}: {finding}"].append(Schedule(first, second, 0, FATES[0]))
-        for schedule in every:
+            failures[f"{first} | {second}: {finding}"].append(Schedule(first, second, 0, FATES[0]))
+        for schedule in candidates:
             for finding in sorted(set(pair.run(schedule))):
-                found[f"{first} | {second}: {finding}"].append(schedule)
-        done += len(every)
+                failures[f"{first} | {second}: {finding}"].append(schedule)
+        done += len(candidates)
         pair.remove()
         worst = Counter(
-            {k: len(v) for k, v in found.items() if k.startswith(f"{first} | {second}:")}
+            {k: len(v) for k, v in failures.items() if k.startswith(f"{first} | {second}:")}
         )
         print(
-            f"{first:11s} {second:11s} {len(every):4d} schedules {worst.total():4d} findings",
+            f"{first:11s} {second:11s} {len(candidates):4d} schedules {worst.total():4d} findings",
             flush=True,
         )
     print(f"{done} schedules, {time.monotonic() - started:.0f} s")
-    return found
+    return failures
 
 
 def main() -> None:
@@ -87,13 +87,13 @@ def main() -> None:
     with quick_folder() as folder:
         if options.store:
             with serving() as server:
-                found = run(options, folder, StoredRoots(*server))
+                failures = run(options, folder, StoredRoots(*server))
         else:
-            found = run(options, folder, LocalRoots(folder))
-    for finding, by in sorted(found.items()):
+            failures = run(options, folder, LocalRoots(folder))
+    for finding, by in sorted(failures.items()):
         print(f"{len(by):4d} x {finding}\n       --only '{by[0]}'")
-    print(f"{sum(map(len, found.values()))} findings of {len(found)} kinds")
-    sys.exit(bool(found))
+    print(f"{sum(map(len, failures.values()))} findings of {len(failures)} kinds")
+    sys.exit(bool(failures))
 
 
 if __name__ == "__main__":

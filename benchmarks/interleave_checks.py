@@ -1,4 +1,4 @@
-"""What must be so whatever commands meet: nothing lost or doubled, nothing forgotten comes back."""
+"""Invariants of concurrent commands: no row is lost or doubled, and no erased row returns."""
 
 import contextlib
 import hashlib
@@ -28,7 +28,7 @@ from tests.support.catalog import CATALOG, SIGNALS
 
 @dataclass(frozen=True)
 class Drive:
-    """What is known of a drive."""
+    """The facts of a drive."""
 
     day: str
     vehicle_id: str
@@ -45,16 +45,16 @@ def warehouse_at(root: str) -> Warehouse:
 
 def drives_of(warehouse: Warehouse) -> tuple[dict[str, Drive], list[str]]:
     """Return the drives that the logs have, and those that they have twice."""
-    found: dict[str, Drive] = {}
+    drives: dict[str, Drive] = {}
     twice = []
     for file in warehouse.logs.snapshot().files:
         rows = warehouse.logs.read(file.path)
         for drive in rows["drive_id"].unique().to_pylist():
             part = rows.filter(pc.equal(rows["drive_id"].cast(pa.string()), drive))
-            if drive in found:
+            if drive in drives:
                 twice.append(drive)
-            found[drive] = _described(part.sort_by("tick"), str(file.day))
-    return found, twice
+            drives[drive] = _described(part.sort_by("tick"), str(file.day))
+    return drives, twice
 
 
 def _described(rows: pa.Table, day: str) -> Drive:
@@ -98,45 +98,45 @@ def grams_of(warehouse: Warehouse) -> Iterator[str]:
                 yield row["drive_id"]
 
 
-def readers_findings(root: str, committed: Drives, gone: str) -> list[str]:
+def readers_findings(root: str, committed: Drives, erased: str) -> list[str]:
     """Return what a reader sees that is no whole state.
 
     Args:
         root: a data root, on which a command may have stopped.
         committed: those whose rows and Gram rows were there before.
-        gone: what may be missing of them: "car", "day", "both" or "".
+        erased: what may be missing of them: "car", "day", "both" or "".
     """
-    found = []
+    findings = []
     drives, twice = drives_of(warehouse_at(root))
-    found += [f"doubled: rows of {name}" for name in twice]
-    found += [
+    findings += [f"doubled: rows of {name}" for name in twice]
+    findings += [
         f"damaged: rows of {name}"
-        for name, one in drives.items()
-        if committed.get(name, one) != one
+        for name, contents in drives.items()
+        if committed.get(name, contents) != contents
     ]
-    needed = {name for name, drive in committed.items() if not may_be_missing(drive, gone)}
-    found += [f"lost: rows of {name}" for name in sorted(needed - drives.keys())]
+    needed = {name for name, drive in committed.items() if not may_be_missing(drive, erased)}
+    findings += [f"lost: rows of {name}" for name in sorted(needed - drives.keys())]
     with fleet_slip.connect(root) as database:
         seen = database.execute(
             "SELECT drive_id, count(*), sum(row_count)::BIGINT FROM grams WHERE feature_set = $set "
             "GROUP BY ALL",
             {"set": CATALOG.identity(PLAIN)},
         ).fetchall()
-    found += [f"doubled: Gram row of {name}" for name, count, _ in seen if count > 1]
-    found += [
+    findings += [f"doubled: Gram row of {name}" for name, count, _ in seen if count > 1]
+    findings += [
         f"partial: Gram row of {name}"
         for name, count, n in seen
         if name in committed and n != count * committed[name].rows
     ]
     missing = {n for n in needed if committed[n].rows} - {name for name, _, _ in seen}
-    found += [f"unseen: Gram row of {name}" for name in sorted(missing)]
-    return found
+    findings += [f"unseen: Gram row of {name}" for name in sorted(missing)]
+    return findings
 
 
-def may_be_missing(drive: Drive, gone: str) -> bool:
-    """Whether a drive is one that a command forgets."""
-    by_car = gone in ("car", "both") and drive.vehicle_id == CAR
-    return by_car or (gone in ("day", "both") and drive.day == str(FIRST_DAY))
+def may_be_missing(drive: Drive, erased: str) -> bool:
+    """Return True if a command erases the drive."""
+    by_car = erased in ("car", "both") and drive.vehicle_id == CAR
+    return by_car or (erased in ("day", "both") and drive.day == str(FIRST_DAY))
 
 
 def forgotten_findings(root: str, unsaid: bool) -> list[str]:
@@ -145,7 +145,7 @@ def forgotten_findings(root: str, unsaid: bool) -> list[str]:
     In files that no reader sees it may be, unless `unsaid`, if it has said so.
     """
     warehouse = warehouse_at(root)
-    found = []
+    findings = []
     for table in warehouse.tables:
         active = {file.path for file in table.snapshot().files}
         for file in table.folder.files():
@@ -153,7 +153,7 @@ def forgotten_findings(root: str, unsaid: bool) -> list[str]:
                 continue
             where = "readable" if file.path in active else "unsaid"
             if (where == "readable" or unsaid) and _has_car(table, file.path):
-                found.append(f"{where}: {table.folder.name} has rows of the forgotten car")
+                findings.append(f"{where}: {table.folder.name} has rows of the forgotten car")
     registry = Registry(warehouse.root, CATALOG)
     marked = marked_models(warehouse)
     for name in registry.names():
@@ -161,8 +161,8 @@ def forgotten_findings(root: str, unsaid: bool) -> list[str]:
             version = registry.load(name, number)
             trained_on_car = version.manifest.trained_on.rows % ROWS != 0
             if trained_on_car and version.reference not in marked:
-                found.append("unmarked: a version that was trained on the forgotten car")
-    return found
+                findings.append("unmarked: a version that was trained on the forgotten car")
+    return findings
 
 
 def _has_car(table: Table, path: str) -> bool:
@@ -175,7 +175,7 @@ def version_findings(root: str) -> list[str]:
     """Return the versions that do not follow from the Gram rows that they name."""
     warehouse = warehouse_at(root)
     registry = Registry(warehouse.root, CATALOG)
-    found = []
+    findings = []
     for name in registry.names():
         for number in registry.versions(name):
             version = registry.load(name, number)
@@ -184,8 +184,8 @@ def version_findings(root: str) -> list[str]:
             except FleetSlipError:
                 continue  # its files are gone, as they must be after a while
             if problem := _problem(version, rows):
-                found.append(f"other bits: a version {problem}")
-    return found
+                findings.append(f"other bits: a version {problem}")
+    return findings
 
 
 def _trained_on(warehouse: Warehouse, version: ModelVersion) -> list[Mapping[str, Any]]:

@@ -24,7 +24,7 @@ UNHARMED = {0, 5, 6, 7, 8, 12}
 
 @dataclass(frozen=True)
 class Schedule:
-    """Which commands meet, where the first stops, and what becomes of it."""
+    """A pair of commands, the point where the first stops, and its fate."""
 
     first: str
     second: str
@@ -37,7 +37,7 @@ class Schedule:
 
     @property
     def die_after(self) -> int | None:
-        """So many points after the stop the first command dies; None if it goes on."""
+        """Points after the stop until the first command is killed; None if it continues."""
         if self.fate == FATES[0]:
             return None
         return FATES.index(self.fate) - 1
@@ -51,14 +51,14 @@ class Pair:
         self._both = {first, second}
         self._before = prepare(folder / f"{first}-{second}", inputs, first, second)
         self._root = ""
-        whole = inputs.environment(*self._both)
+        environment = inputs.environment(*self._both)
         quiet = roots.copy(self._before)
         ended = self._run(quiet, first)
         self.points = ended.points
-        found = forked(lambda: _base(str(self._before), inputs.environment())).result
-        self._committed = {name: Drive(**one) for name, one in found.items()}
+        drives = forked(lambda: _base(str(self._before), inputs.environment())).result
+        self._committed = {name: Drive(**fields) for name, fields in drives.items()}
         self._settle(quiet)
-        self._expected = forked(lambda: _state(quiet, whole)).result
+        self._expected = forked(lambda: _state(quiet, environment)).result
         self.alone = [f"alone: {finding}" for finding in self._expected["damage"]]
         self._expected["damage"] = []
 
@@ -68,41 +68,41 @@ class Pair:
     def run(self, schedule: Schedule) -> list[str]:
         """Return what is wrong after a schedule."""
         root = self._root = self._roots.copy(self._before)
-        first = Running(root, *self._given(self.first), stop_at=schedule.point)
+        first = Running(root, *self._arguments(self.first), stop_at=schedule.point)
         if not first.stopped():
             first.end()
             return []
         second = self._run(root, self.second)
         migrated = self.second == "migrate"
-        found = self._look(root, second, self.second, migrated, "while the first had stopped")
+        findings = self._look(root, second, self.second, migrated, "while the first had stopped")
         first.go_on(schedule.die_after)
         ended = first.end()
         done = _done(self.second, second) + _done(self.first, ended)
-        found += _harm(self.first, ended) + _harm(self.second, second)
+        findings += _harm(self.first, ended) + _harm(self.second, second)
         if "repair" not in self._both:
             migrated |= self.first == "migrate" and "migrate" in done
             if schedule.die_after != 0:  # else nothing has changed since
-                found += self._look_again(root, done, migrated)
-        found += self._settle(root)
-        whole = self._inputs.environment(*self._both)
+                findings += self._look_again(root, done, migrated)
+        findings += self._settle(root)
+        environment = self._inputs.environment(*self._both)
         forgotten = "forget" in self._both
-        final = forked(lambda: _final(root, whole, self._expected, forgotten)).result
-        return [*found, *map(str, final)]
+        final = forked(lambda: _final(root, environment, self._expected, forgotten)).result
+        return [*findings, *map(str, final)]
 
     def _run(self, root: str, name: str) -> Outcome:
-        return Running(root, *self._given(name)).end()
+        return Running(root, *self._arguments(name)).end()
 
-    def _given(self, name: str) -> tuple[tuple[str, ...], Environment]:
+    def _arguments(self, name: str) -> tuple[tuple[str, ...], Environment]:
         return self._inputs.arguments(name), self._inputs.environment(name)
 
     def _look(self, root: str, outcome: Outcome, name: str, migrated: bool, when: str) -> list[str]:
         if "repair" in self._both:
             return []
         done = _done(name, outcome)
-        return [f"{one} ({when})" for one in self._look_again(root, done, migrated)]
+        return [f"{finding} ({when})" for finding in self._look_again(root, done, migrated)]
 
     def _look_again(self, root: str, done: Sequence[str], migrated: bool) -> list[str]:
-        gone = {(True, True): "both", (True, False): "car", (False, True): "day"}.get(
+        erased = {(True, True): "both", (True, False): "car", (False, True): "day"}.get(
             ("forget" in self._both, "retain" in self._both), ""
         )
         environments = [
@@ -114,32 +114,32 @@ class Pair:
         pending = PENDING in done and "forget" in self._both
         forgotten = "all" if "forget" in done else "readable" if pending else ""
         return [
-            str(one)
-            for one in forked(
-                lambda: _findings(root, environments, committed, gone, forgotten)
+            str(finding)
+            for finding in forked(
+                lambda: _findings(root, environments, committed, erased, forgotten)
             ).result
         ]
 
     def _settle(self, root: str) -> list[str]:
         """Give both commands again until both are done; return what keeps failing."""
         order = [name for name in (*SETTLING, "gram", *FORGETTING) if name in self._both]
-        whole = self._inputs.environment(*self._both)
+        environment = self._inputs.environment(*self._both)
         before = self._inputs.environment("repair")  # what was simulated before it is migrated
-        given = [
-            (name, self._inputs.arguments(name), before if name == "repair" else whole)
+        commands = [
+            (name, self._inputs.arguments(name), before if name == "repair" else environment)
             for name in (*order, "gram")
         ]
-        code, said = forked(lambda: _repeat(root, given)).result
-        return [f"keeps failing: {said}"] if code else []
+        code, output = forked(lambda: _repeat(root, commands)).result
+        return [f"keeps failing: {output}"] if code else []
 
 
 def _repeat(
-    root: str, given: Sequence[tuple[str, tuple[str, ...], Environment]]
+    root: str, commands: Sequence[tuple[str, tuple[str, ...], Environment]]
 ) -> tuple[int, str]:
     failed: dict[str, int] = {}
     let_temporary_files_age(root)
     for _ in range(ROUNDS):
-        codes = {name: command(root, words, environment) for name, words, environment in given}
+        codes = {name: command(root, words, environment) for name, words, environment in commands}
         failed = {n: code for n, code in codes.items() if code}
         if not failed:
             break
@@ -156,8 +156,8 @@ def _base(root: str, environment: Environment) -> dict[str, Any]:
 
 
 def _damaged(warehouse: Any) -> bool:
-    there = {file.path for file in warehouse.logs.folder.files()}
-    return any(file.path not in there for file in warehouse.logs.snapshot().files)
+    present = {file.path for file in warehouse.logs.folder.files()}
+    return any(file.path not in present for file in warehouse.logs.snapshot().files)
 
 
 def _state(root: str, environment: Environment) -> dict[str, Any]:
@@ -169,19 +169,19 @@ def _findings(
     root: str,
     environments: Sequence[Environment],
     committed: dict[str, Drive],
-    gone: str,
+    erased: str,
     forgotten: str,
 ) -> list[str]:
     for environment in environments:
         use(environment)
         try:
-            found = checks.readers_findings(root, committed, gone)
+            findings = checks.readers_findings(root, committed, erased)
         except RefusedError:
             continue
-        found += checks.version_findings(root)
+        findings += checks.version_findings(root)
         if forgotten:
-            found += checks.forgotten_findings(root, forgotten == "all")
-        return found
+            findings += checks.forgotten_findings(root, forgotten == "all")
+        return findings
     return ["unreadable: in the scales of either catalog"]
 
 
@@ -189,12 +189,12 @@ def _final(
     root: str, environment: Environment, expected: dict[str, Any], forgotten: bool
 ) -> list[str]:
     use(environment)
-    found = checks.state(root)
-    left = checks.forgotten_findings(root, unsaid=True) if forgotten else []
-    return [f"{one} (at the end)" for one in left] + [
-        f"other end: {key} {found[key] if key == 'damage' else ''}"
+    state = checks.state(root)
+    remaining = checks.forgotten_findings(root, unsaid=True) if forgotten else []
+    return [f"{finding} (at the end)" for finding in remaining] + [
+        f"other end: {key} {state[key] if key == 'damage' else ''}"
         for key in expected
-        if found[key] != expected[key]
+        if state[key] != expected[key]
     ]
 
 
@@ -206,4 +206,4 @@ def _done(name: str, outcome: Outcome) -> list[str]:
 def _harm(name: str, outcome: Outcome) -> list[str]:
     if outcome.exit_code is None or outcome.exit_code in UNHARMED:
         return []
-    return [f"ends with {outcome.exit_code}: {name}: {outcome.said[-2000:]}"]
+    return [f"ends with {outcome.exit_code}: {name}: {outcome.output[-2000:]}"]

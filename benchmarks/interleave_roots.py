@@ -82,7 +82,7 @@ class Inputs:
 
     @property
     def files(self) -> Mapping[str, str]:
-        """Where each file is, by its name without the ending."""
+        """Paths of the files, by their names without suffix."""
         return {path.stem: str(path) for path in self.folder.iterdir()}
 
     def arguments(self, name: str) -> tuple[str, ...]:
@@ -122,9 +122,9 @@ def write_inputs(where: Path) -> Inputs:
     (where / "retention.toml").write_text(retention, encoding="utf-8")
     signals = (folder("configs") / "signals.toml").read_text(encoding="utf-8")
     configs_with(where / "old_configs", signals=signals)
-    before, found, after = signals.partition("[drive.drive_id]")
-    assert found
-    configs_with(where / "new_configs", signals=before + NEW_SIGNAL + found + after)
+    before, section, after = signals.partition("[drive.drive_id]")
+    assert section
+    configs_with(where / "new_configs", signals=before + NEW_SIGNAL + section + after)
     return Inputs(where)
 
 
@@ -159,24 +159,24 @@ def prepare(root: Path, inputs: Inputs, first: str, second: str) -> Path:
 
 def _fill(root: Path, inputs: Inputs) -> None:
     """Give the commands that come before all others."""
-    known = inputs.files
+    files = inputs.files
     for arguments in (
-        ("simulate", known["campaign"], "--days", "2", "--threads", "1"),
-        ("ingest", known["old"], "--mapping", known["mapping"]),
+        ("simulate", files["campaign"], "--days", "2", "--threads", "1"),
+        ("ingest", files["old"], "--mapping", files["mapping"]),
         ("gram",),
         PUBLISH,
         (*TRAINING, str(LISTS / "ax_by_vehicle.toml")),
-        ("ingest", known["later"], "--mapping", known["mapping"]),
+        ("ingest", files["later"], "--mapping", files["mapping"]),
     ):
         ended = Running(root, arguments, inputs.environment()).end()
-        assert ended.exit_code == 0, ended.said
+        assert ended.exit_code == 0, ended.output
 
 
 def _leave_what_killed_jobs_leave(root: Path, inputs: Inputs) -> None:
     for name in LEFT_BY_KILLED:
         arguments, environment = inputs.arguments(name), inputs.environment()
         ended = Running(root, arguments, environment, die_before="create_write_transaction").end()
-        assert ended.exit_code is None, ended.said
+        assert ended.exit_code is None, ended.output
     let_time_pass(root)
 
 
@@ -239,10 +239,10 @@ def serving(**faults: float) -> Iterator[tuple[str, str]]:
     `faults` says how it misbehaves, as `tests.support.s3_server.Faults`.
     """
     methods = multiprocessing.get_context("spawn")
-    here, there = methods.Pipe()
-    process = methods.Process(target=_serve, args=(there, faults), daemon=True)
+    parent_end, child_end = methods.Pipe()
+    process = methods.Process(target=_serve, args=(child_end, faults), daemon=True)
     process.start()
-    environment, bucket = here.recv()
+    environment, bucket = parent_end.recv()
     os.environ.update(environment)
     yield environment["AWS_ENDPOINT_URL"], bucket
     process.terminate()

@@ -51,15 +51,15 @@ class Outcome:
     """How a command ended: its exit code, None if it was killed, and what it said."""
 
     exit_code: int | None
-    said: str
+    output: str
     points: int = 0
 
 
 class _Gate:
     """Counts the points of this process. At one it tells the parent, waits, and does as told."""
 
-    def __init__(self, stop_at: int, die_before: str, tell: int, told: int) -> None:
-        self._stop_at, self._die_before, self._tell, self._told = stop_at, die_before, tell, told
+    def __init__(self, stop_at: int, die_before: str, tell: int, reply: int) -> None:
+        self._stop_at, self._die_before, self._tell, self._reply = stop_at, die_before, tell, reply
         self._fatal = 0
         self._one_at_a_time = threading.Lock()  # all threads stop together
         self.passed = 0
@@ -69,7 +69,7 @@ class _Gate:
             self.passed += 1
             if self.passed == self._stop_at:
                 os.write(self._tell, b"s")
-                after = int(os.read(self._told, 8) or b"0")
+                after = int(os.read(self._reply, 8) or b"0")
                 self._fatal = self.passed + after if after >= 0 else 0
             if self.passed == self._fatal or name == self._die_before:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -96,11 +96,11 @@ class Running:
         """Start it. It stops at a point, if there are as many, or dies before a call."""
         self._folder = tempfile.TemporaryDirectory(prefix="interleave-")
         self._answer, self._noise = (Path(self._folder.name) / name for name in ("a", "n"))
-        self._told, tell = os.pipe()
+        self._reply, tell = os.pipe()
         listen, self._tell = os.pipe()
         self._process = os.fork()
         if not self._process:
-            os.close(self._told)
+            os.close(self._reply)
             os.close(self._tell)
             gate = _Gate(stop_at, die_before, tell, listen)
             in_child(lambda: _give(root, arguments, environment, gate), self._answer, self._noise)
@@ -109,10 +109,10 @@ class Running:
 
     def stopped(self) -> bool:
         """Wait until it stops, and return True; or ends, and return False."""
-        if not select.select([self._told], [], [], HANGS_S)[0]:
+        if not select.select([self._reply], [], [], HANGS_S)[0]:
             self._kill()
             return False
-        return os.read(self._told, 1) == b"s"
+        return os.read(self._reply, 1) == b"s"
 
     def go_on(self, die_after: int | None = None) -> None:
         """Let it go on; or die, so many points later."""
@@ -120,20 +120,20 @@ class Running:
 
     def end(self) -> Outcome:
         """Wait for the end."""
-        if not select.select([self._told], [], [], HANGS_S)[0]:
+        if not select.select([self._reply], [], [], HANGS_S)[0]:
             self._kill()
         status = os.waitpid(self._process, 0)[1]
-        os.close(self._told)
+        os.close(self._reply)
         os.close(self._tell)
-        said = self._noise.read_text() if self._noise.exists() else ""
+        output = self._noise.read_text() if self._noise.exists() else ""
         answer = self._answer.read_text() if self._answer.exists() else ""
         self._folder.cleanup()
         if os.WIFSIGNALED(status):
-            return Outcome(None, said)
+            return Outcome(None, output)
         if os.WEXITSTATUS(status):
-            return Outcome(1, said)
+            return Outcome(1, output)
         code, points = map(int, answer.strip("[]").split(","))
-        return Outcome(code, said, points)
+        return Outcome(code, output, points)
 
     def _kill(self) -> None:
         os.kill(self._process, signal.SIGKILL)

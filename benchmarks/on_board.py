@@ -1,4 +1,4 @@
-"""What a published version costs on board: its exported C on this machine, and the same in Python.
+"""The cost of a published version on board: its exported C on this machine, and the same in Python.
 
     python -m benchmarks.on_board ROOT MODEL... [--seconds 2]
 
@@ -67,11 +67,12 @@ def main() -> None:
     parser.add_argument("root")
     parser.add_argument("models", nargs="+")
     parser.add_argument("--seconds", type=float, default=2.0)
-    given = parser.parse_args()
-    fleet = fleet_slip.open(given.root)
+    arguments = parser.parse_args()
+    fleet = fleet_slip.open(arguments.root)
     print(
         json.dumps(
-            [measure(fleet, fleet.models.get(m), given.seconds) for m in given.models], indent=2
+            [measure(fleet, fleet.models.get(m), arguments.seconds) for m in arguments.models],
+            indent=2,
         )
     )
 
@@ -92,13 +93,13 @@ def measure(fleet: fleet_slip.Fleet, version: ModelVersion, seconds: float) -> d
     estimator.step(rows[0])
     steps = best_of(lambda: [estimator.step(row) for row in rows], seconds) / len(rows)
     version.predict(drive)
-    whole = best_of(lambda: version.predict(drive), seconds) / len(rows)
+    drive_s = best_of(lambda: version.predict(drive), seconds) / len(rows)
     return {
         "model": version.reference,
         "terms": len(version.manifest.terms),
         **board,
         "python_step_us": round(1e6 * steps, 2),
-        "predict_samples_per_s": round(1 / whole),
+        "predict_samples_per_s": round(1 / drive_s),
     }
 
 
@@ -115,13 +116,13 @@ def best_of(call: Any, seconds: float) -> float:
 def in_c(folder: Path, fleet: fleet_slip.Fleet, version: ModelVersion) -> dict[str, Any]:
     """Compile a version and run it; return its time and sizes."""
     program, prefix = compile_program(CATALOG, version.manifest), c_prefix(version)
-    names = ", ".join(one.name for one in program.signals)
+    names = ", ".join(signal.name for signal in program.signals)
     counts = fleet.sql(
         f"SELECT {names} FROM log_counts "
         "WHERE drive_id = (SELECT min(drive_id) FROM log_counts) ORDER BY tick"
     ).fetchall()
-    known = len(program.facts) + len(program.numbers)
-    start = UNKNOWN.replace("CAR", ", ".join(["INT32_MIN"] * known)) if known else ""
+    constants = len(program.facts) + len(program.numbers)
+    start = UNKNOWN.replace("CAR", ", ".join(["INT32_MIN"] * constants)) if constants else ""
     driver = DRIVER.replace("START", start or "PREFIX_start(&state);")
     for word, value in (("PREFIX", prefix), ("ROWS", len(counts)), ("ROUNDS", ROUNDS)):
         driver = driver.replace(word, str(value))
@@ -129,24 +130,24 @@ def in_c(folder: Path, fleet: fleet_slip.Fleet, version: ModelVersion) -> dict[s
     (folder / f"{prefix}.c").write_text(c_source(version, program))
     (folder / "driver.c").write_text(driver)
     run(folder, "cc", "-std=c99", "-O2", f"{prefix}.c", "driver.c", "-o", "driver")
-    values = [-(2**15) if one is None else one for row in counts for one in row]
-    told = run(folder, "./driver", given=struct.pack(f"{len(values)}h", *values)).split()
+    values = [-(2**15) if signal is None else signal for row in counts for signal in row]
+    output = run(folder, "./driver", data=struct.pack(f"{len(values)}h", *values)).split()
     run(folder, "cc", "-std=c99", "-Os", "-fstack-usage", "-c", f"{prefix}.c")
     sections = run(folder, "size", "-A", f"{prefix}.o")
     sizes = {name: int(size) for name, size in re.findall(r"^(\.\w+)\S*\s+(\d+)", sections, re.M)}
     stack = max(int(line.split()[1]) for line in (folder / f"{prefix}.su").read_text().splitlines())
     return {
-        "c_step_ns": round(float(told[0]), 1),
-        "state_bytes": int(told[1]),
+        "c_step_ns": round(float(output[0]), 1),
+        "state_bytes": int(output[1]),
         "code_bytes": sizes.get(".text", 0),
         "constant_bytes": sizes.get(".rodata", 0),
         "stack_bytes": stack,
     }
 
 
-def run(folder: Path, *words: str, given: bytes | None = None) -> str:
+def run(folder: Path, *words: str, data: bytes | None = None) -> str:
     done = subprocess.run(
-        words, cwd=folder, input=given, capture_output=True, check=True, timeout=120
+        words, cwd=folder, input=data, capture_output=True, check=True, timeout=120
     )
     return done.stdout.decode()
 

@@ -153,13 +153,15 @@ def polars_streaming(_threads: int, *, physical: bool = False) -> Fit:
     import polars as pl  # noqa: PLC0415
 
     x = [pl.col(name).cast(pl.Float64) * _scale(name, physical=physical) for name in COLUMNS]
-    every = [pl.len()] + [a.sum().alias(f"s{i}") for i, a in enumerate(x)]
-    every += [
+    aggregates = [pl.len()] + [a.sum().alias(f"s{i}") for i, a in enumerate(x)]
+    aggregates += [
         (a * b).sum().alias(f"p{i}_{j}") for i, a in enumerate(x) for j, b in enumerate(x[: i + 1])
     ]
 
     def run(paths: list[str]) -> Coefficients:
-        return _unpacked(pl.scan_parquet(paths).select(every).collect(engine="streaming").row(0))
+        return _unpacked(
+            pl.scan_parquet(paths).select(aggregates).collect(engine="streaming").row(0)
+        )
 
     return run
 
@@ -223,15 +225,19 @@ def peak_bytes() -> int:
 def main() -> None:
     way, threads, runs, *paths = sys.argv[1:]
     fit = WAYS[way].prepare(int(threads))
-    found: list[Coefficients] = []
+    coefficients: list[Coefficients] = []
     times: list[float] = []
     processor: list[float] = []
     for _ in range(int(runs)):
         start, used = time.perf_counter(), time.process_time()
-        found.append(fit(paths))
+        coefficients.append(fit(paths))
         times.append(time.perf_counter() - start)
         processor.append(time.process_time() - used)
-    result: dict[str, Any] = {"coefficients": found, "s": min(times), "peak_bytes": peak_bytes()}
+    result: dict[str, Any] = {
+        "coefficients": coefficients,
+        "s": min(times),
+        "peak_bytes": peak_bytes(),
+    }
     result["processor_s"] = min(processor)
     print(json.dumps(result), flush=True)
 

@@ -42,7 +42,7 @@ MOST_DIGITS = 16.0
 
 @dataclass(frozen=True)
 class Result:
-    """What a program did with some rows."""
+    """The result of a program: coefficients, time and memory."""
 
     name: str
     rows_per_s: float
@@ -62,12 +62,12 @@ def exact_model(paths: Sequence[str]) -> LinearModel:
     return fit(total, INPUTS, LABEL).model
 
 
-def digits(found: Sequence[float], model: LinearModel) -> float:
+def digits(coefficients: Sequence[float], model: LinearModel) -> float:
     """Return the correct decimal digits of the worst of the coefficients and the intercept."""
     exact = [*model.coefficients, model.intercept]
     worst = max(
         Fraction(0) if value == float(truth) else abs(Fraction(value) / truth - 1)
-        for value, truth in zip(found, exact, strict=True)
+        for value, truth in zip(coefficients, exact, strict=True)
     )
     return min(MOST_DIGITS, -math.log10(worst)) if worst else MOST_DIGITS
 
@@ -87,18 +87,18 @@ def in_process(way: str, threads: int, runs: int, paths: Sequence[str]) -> dict[
 
 def measure(way: str, paths: Sequence[str], rows: int, exact: LinearModel) -> Result:
     """Run a way three times and compare."""
-    one = in_process(way, 2, 2, paths)
+    result = in_process(way, 2, 2, paths)
     other = in_process(way, 1, 1, paths[::-1])
-    every = [*one["coefficients"], *other["coefficients"]]
+    results = [*result["coefficients"], *other["coefficients"]]
     truth = exact.physical(CATALOG.input_scales) if WAYS[way].physical else exact
     return Result(
         WAYS[way].name,
-        rows / one["s"],
-        # What a Java machine uses is not this process's.
-        None if way == "spark" else rows / min(one["processor_s"], other["processor_s"]),
-        one["peak_bytes"],
-        min(digits(found, truth) for found in every),
-        all(found == every[0] for found in every),
+        rows / result["s"],
+        # The memory of a Java machine is not that of this process.
+        None if way == "spark" else rows / min(result["processor_s"], other["processor_s"]),
+        result["peak_bytes"],
+        min(digits(coefficients, truth) for coefficients in results),
+        all(coefficients == results[0] for coefficients in results),
     )
 
 
@@ -124,7 +124,7 @@ def draw(results: Sequence[Result], path: Path) -> None:
     with mpl.rc_context({**STYLE, "svg.hashsalt": "peers"}):
         figure = Figure(figsize=(9.0, 0.34 * len(ordered) + 0.9), layout="constrained")
         axes = figure.subplots(1, len(panels), sharey=True)
-        colours = [PALETTE["model_4" if one.same_bits else "above_1"].light for one in ordered]
+        colours = [PALETTE["model_4" if entry.same_bits else "above_1"].light for entry in ordered]
         for axis, (title, values, form) in zip(axes, panels, strict=True):
             bars = axis.barh([result.name for result in ordered], values, color=colours)
             axis.bar_label(bars, [form.format(value) for value in values], padding=3)

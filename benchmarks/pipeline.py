@@ -43,9 +43,9 @@ def best(function: Callable[[], object]) -> float:
     return min(durations(function, ROUNDS))
 
 
-def line(what: str, seconds: float, rows: int, remark: str = "") -> None:
+def line(title: str, seconds: float, rows: int, remark: str = "") -> None:
     """Print one measurement."""
-    print(f"{what:44s} {seconds * 1e3:9.1f} ms {rows / seconds / 1e6:8.2f} Mrows/s  {remark}")
+    print(f"{title:44s} {seconds * 1e3:9.1f} ms {rows / seconds / 1e6:8.2f} Mrows/s  {remark}")
 
 
 def absent_from(warehouse: Warehouse) -> tuple[str, ...]:
@@ -71,17 +71,17 @@ def gram_query(warehouse: Warehouse, threads: int) -> None:
     bare = f"SELECT {sums} FROM {source}"
     absent = absent_from(warehouse)
     logged = ["tick", *(name for name in CATALOG.signals.signals if name not in absent)]
-    every = ", ".join(f"sum({name})" for name in logged)
+    sums_of_logged = ", ".join(f"sum({name})" for name in logged)
     grouped = f"SELECT drive_id, {sums} FROM {source} GROUP BY drive_id"
     gram = job_statement(warehouse)
     bare_s = best(lambda: database.execute(bare).fetchall())
-    every_s = best(lambda: database.execute(f"SELECT {every} FROM {source}").fetchall())
+    logged_s = best(lambda: database.execute(f"SELECT {sums_of_logged} FROM {source}").fetchall())
     grouped_s = best(lambda: database.execute(grouped).fetchall())
     gram_s = best(lambda: database.execute(gram, {"feature_set": "signals"}).fetchall())
     line(f"bare sum of {len(SIGNALS)} columns, {threads} thread(s)", bare_s, snapshot.rows)
     line("  the same sums by drive", grouped_s, snapshot.rows, f"{bare_s / grouped_s:.2f} of it")
-    line(f"  bare sum of all {len(logged)} columns", every_s, snapshot.rows)
-    ratios = f"{bare_s / gram_s:.2f} of the bare sum of its columns, {every_s / gram_s:.2f} of all"
+    line(f"  bare sum of all {len(logged)} columns", logged_s, snapshot.rows)
+    ratios = f"{bare_s / gram_s:.2f} of the bare sum of its columns, {logged_s / gram_s:.2f} of all"
     line("  Gram query: 77 sums by drive", gram_s, snapshot.rows, ratios)
 
 
@@ -96,14 +96,14 @@ def operators(warehouse: Warehouse) -> None:
         answer = database.execute(explain, {"feature_set": "signals"}).fetchone()
         assert answer is not None
         profiles.append(json.loads(answer[1]))
-    profile = min(profiles, key=lambda one: float(one["query"]["total_time"]))
+    profile = min(profiles, key=lambda item: float(item["query"]["total_time"]))
     planning_s = sum(profile[part]["total_time"] for part in ("planner", "optimizer"))
     line("  planning", planning_s, snapshot.rows)
-    for operator in sorted(_flat(profile["operator"]), key=lambda one: -one["timing"]):
+    for operator in sorted(_flat(profile["operator"]), key=lambda item: -item["timing"]):
         if operator["timing"] > 0.001:
-            what = f"  {operator['type'].lower()}, {operator['intermediate_rows']:,} rows out"
+            title = f"  {operator['type'].lower()}, {operator['intermediate_rows']:,} rows out"
             size = f"{operator['intermediate_size_bytes'] / 2**20:,.0f} MiB out"
-            line(what, operator["timing"], snapshot.rows, size)
+            line(title, operator["timing"], snapshot.rows, size)
 
 
 def _flat(tree: list[dict[str, Any]]) -> Iterator[dict[str, Any]]:
@@ -149,20 +149,22 @@ def repeat_drives(root: Path, drives: int, feature_set: str) -> Warehouse:
     parts = [grams.table.read(file.path) for file in grams.files]
     usual = grams.table.usual_schema  # without what few files have
     rows = pa.concat_tables(part.select(usual.names).cast(usual) for part in parts)
-    known = rows.filter(pc.equal(rows["feature_set"], identity))
-    at = known.schema.get_field_index("drive_id")
+    original = rows.filter(pc.equal(rows["feature_set"], identity))
+    at = original.schema.get_field_index("drive_id")
 
     def renamed(copy: int) -> pa.Table:
-        names = pc.binary_join_element_wise(known["drive_id"].cast(pa.string()), str(copy), "-")
-        return known.set_column(at, known.schema.field(at), names.cast(known.schema.field(at).type))
+        names = pc.binary_join_element_wise(original["drive_id"].cast(pa.string()), str(copy), "-")
+        return original.set_column(
+            at, original.schema.field(at), names.cast(original.schema.field(at).type)
+        )
 
-    left, copy = drives - len(known), 0
-    while left > 0:
+    remaining, copy = drives - len(original), 0
+    while remaining > 0:
         parts = []
-        while left > 0 and sum(map(len, parts)) < AT_ONCE:
+        while remaining > 0 and sum(map(len, parts)) < AT_ONCE:
             copy += 1
-            parts.append(renamed(copy).slice(0, left))
-            left -= len(parts[-1])
+            parts.append(renamed(copy).slice(0, remaining))
+            remaining -= len(parts[-1])
         change = Change(add=write_rows(warehouse, parts), note={"job": "gram"})
         warehouse.grams.snapshot().commit(change)
     return warehouse

@@ -138,7 +138,7 @@ class Score:
     """How an examination did."""
 
     faulty: int
-    found: int
+    detected: int
     right_signal: int
     right_kind: int
     clean: int
@@ -181,8 +181,8 @@ def inject(
     for drive in chosen.tolist():
         rows = counts[ids[drive]].copy()
         rows[:, at] = fault.change(rows[:, at], rng)
-        whole = np.clip(np.rint(rows), -COUNT_MAX, COUNT_MAX).astype(np.int64)
-        gram = Gram.from_counts(table.signals, whole)
+        rounded = np.clip(np.rint(rows), -COUNT_MAX, COUNT_MAX).astype(np.int64)
+        gram = Gram.from_counts(table.signals, rounded)
         for part, value in zip(parts, (gram.n, gram.sums, gram.products), strict=True):
             part[drive] = value
     return replace(cohort, tables=(GramTable(table.signals, *parts),))
@@ -192,16 +192,16 @@ def score(cohort: Cohort, report: QualityReport, chosen: Sequence[int], fault: I
     """Compare what was found with what was injected."""
     ids = cohort.drives["drive_id"].to_pylist()
     faulty = {ids[drive] for drive in chosen}
-    found = {finding.drive_id: finding.fault for finding in report.findings}
-    hits = [found[drive] for drive in faulty if drive in found]
-    right = [one for one in hits if set(one.signals) & set(fault.signals)]
+    findings = {finding.drive_id: finding.fault for finding in report.findings}
+    hits = [findings[drive] for drive in faulty if drive in findings]
+    right = [hit for hit in hits if set(hit.signals) & set(fault.signals)]
     return Score(
         faulty=len(faulty),
-        found=len(hits),
+        detected=len(hits),
         right_signal=len(right),
-        right_kind=sum(one.kind in fault.kinds for one in right),
+        right_kind=sum(hit.kind in fault.kinds for hit in right),
         clean=len(ids) - len(faulty),
-        false_alarms=len(found.keys() - faulty),
+        false_alarms=len(findings.keys() - faulty),
     )
 
 
@@ -221,10 +221,12 @@ def main() -> None:
     for fault in FAULTS:
         faulty = inject(cohort, chosen, counts, fault, rng)
         report = examine(faulty, find_wrong_labels(faulty))
-        one = score(cohort, report, chosen.tolist(), fault)
+        result = score(cohort, report, chosen.tolist(), fault)
         print(
-            f"| {fault.name} | {one.found / one.faulty:.0%} | {one.right_signal / one.faulty:.0%} "
-            f"| {one.right_kind / one.faulty:.0%} | {1000 * one.false_alarms / one.clean:.1f} |",
+            f"| {fault.name} | {result.detected / result.faulty:.0%} "
+            f"| {result.right_signal / result.faulty:.0%} "
+            f"| {result.right_kind / result.faulty:.0%} "
+            f"| {1000 * result.false_alarms / result.clean:.1f} |",
             flush=True,
         )
 

@@ -92,9 +92,9 @@ def print_precision(drives: list[LaneDrive], seconds: float) -> None:
     print(f"\n{'step, ms':>10}{'largest error of side-slip, deg':>34}{'samples/s':>14}")
     for steps in (2, 3, 4, 5, 10, 20, 40):
         error = max(
-            float(np.abs(one.sideslip_rad[:n] - other.sideslip_rad[:n]).max())
-            for one, other in zip(exact, simulate_drives(drives, steps), strict=True)
-            for n in [min(len(one.vx_mps), len(other.vx_mps))]
+            float(np.abs(expected.sideslip_rad[:n] - other.sideslip_rad[:n]).max())
+            for expected, other in zip(exact, simulate_drives(drives, steps), strict=True)
+            for n in [min(len(expected.vx_mps), len(other.vx_mps))]
         )
         rate = max(lanes_rate(drives, seconds, 1, steps) for _ in range(ROUNDS))
         print(f"{1000 * SAMPLE_S / steps:10.2f}{np.degrees(error):34.5f}{rate:14,.0f}")

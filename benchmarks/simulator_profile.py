@@ -1,4 +1,4 @@
-"""Where the time of `simulate` goes, stage by stage.
+"""The time of `simulate` by stage.
 
     python -m benchmarks.simulator_profile [--campaign fleet_realistic]
 
@@ -60,8 +60,8 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     def distort() -> None:
         sensors = [spec.distortion() for spec in batch.drives]
         for drive, truth in blocks:
-            if one := sensors[drive]:
-                one.apply(truth)
+            if sensor := sensors[drive]:
+                sensor.apply(truth)
 
     noise = np.empty(len(rows), dtype=np.float32)
     generator = batch.drives[0].generator()
@@ -69,7 +69,7 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     encoded = warehouse.logs.encode(rows)
     draw_s = noisy * best(lambda: generator.standard_normal(out=noise, dtype=np.float32))
     distort_s = best(distort)
-    others = [name for name in rows.schema.names if name not in signals]
+    remaining = [name for name in rows.schema.names if name not in signals]
     return len(rows), {
         "plan a day: cars, roads, speeds": best(
             lambda: load_campaign(batch.campaign, SHIPPED_CONFIGS).batches(batch.day)
@@ -81,7 +81,7 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
         "sensors: add it, round, clip": best(measure) - draw_s - distort_s,
         "tabulate": best(lambda: tabulate(SIGNALS, batch, logs)),
         "encode: signals": best(lambda: warehouse.logs.encode(rows.select(signals))),
-        "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(others))),
+        "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(remaining))),
         "checksum (again in encode)": best(lambda: checksum_of(encoded.content)),
     }
 

@@ -50,14 +50,14 @@ SETTLING = 5
 """So often everything is given again at the end."""
 DELETED = "a file was deleted during a look"
 GONE = r"\.parquet.* is gone|No such file|No files found"
-"""What a reader may meet, and what errors say of it: it asks again."""
+"""Errors that a reader may get, with their messages; it repeats the query."""
 
 Arguments = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Soak:
-    """Where it happens, and until when."""
+    """The data root of the run, and its end."""
 
     root: str
     inputs: Inputs
@@ -144,20 +144,20 @@ def settle(soak: Soak) -> list[str]:
     """Give everything again until it is done; return what is wrong then."""
     use(soak.environment)
     cars = sorted({f"gone-{n // 4}" for n in range(1, 10_000)} & _cars(soak.inputs))
-    given: list[Arguments] = [("compact",), ("gram",)]
-    given += [("forget", "--vehicle", car, "--now") for car in cars]
+    commands: list[Arguments] = [("compact",), ("gram",)]
+    commands += [("forget", "--vehicle", car, "--now") for car in cars]
     let_temporary_files_age(soak.root)
     for _ in range(SETTLING):
-        codes = [command(soak.root, arguments, soak.environment) for arguments in given]
+        codes = [command(soak.root, arguments, soak.environment) for arguments in commands]
         if not set(codes) - {0, 5}:
             break
-    found = [f"keeps failing: {codes}"] if set(codes) - {0, 5} else []
-    found += checks.readers_findings(soak.root, {}, "both")
-    found += [f"damage: {one}" for one in checks.state(soak.root)["damage"]]
-    left = {
+    findings = [f"keeps failing: {codes}"] if set(codes) - {0, 5} else []
+    findings += checks.readers_findings(soak.root, {}, "both")
+    findings += [f"damage: {damage}" for damage in checks.state(soak.root)["damage"]]
+    remaining = {
         drive.vehicle_id for drive in checks.drives_of(checks.warehouse_at(soak.root))[0].values()
     }
-    return found + [f"readable: {car}" for car in left & set(cars)]
+    return findings + [f"readable: {car}" for car in remaining & set(cars)]
 
 
 def _cars(inputs: Inputs) -> set[str]:
@@ -206,17 +206,17 @@ def run(options: argparse.Namespace, folder: Path, url: str) -> int:
         counts.update(
             json.loads(answer.read_text()) if answer.exists() else {f"{answer.stem}: died": 1}
         )
-    for what, count in sorted(counts.items()):
-        print(f"{count:6d} x {what}")
+    for title, count in sorted(counts.items()):
+        print(f"{count:6d} x {title}")
     sound = ("reader: looks", f"reader: {DELETED}")
-    found = [what for what in counts if what.startswith("reader: ") and what not in sound]
-    found += [what for what in counts if what.endswith((": died", "exit 1"))]
-    found += forked(lambda: settle(soak)).result
-    print("\n".join(found))
+    findings = [title for title in counts if title.startswith("reader: ") and title not in sound]
+    findings += [title for title in counts if title.endswith((": died", "exit 1"))]
+    findings += forked(lambda: settle(soak)).result
+    print("\n".join(findings))
     print(
-        f"{counts.total()} commands and looks in {options.minutes} minutes, {len(found)} findings"
+        f"{counts.total()} commands and reads in {options.minutes} min, {len(findings)} findings"
     )
-    return bool(found)
+    return bool(findings)
 
 
 def main() -> None:

@@ -48,8 +48,8 @@ def main() -> None:
             for name, command in cases.items():
                 times[name].append(seconds(command))
     python = statistics.median(times["python"])
-    for name, found in times.items():
-        middle = statistics.median(found)
+    for name, durations in times.items():
+        middle = statistics.median(durations)
         print(f"{name:20s} {middle * 1e3:6.0f} ms  {middle / python:5.1f} times Python itself")
 
 

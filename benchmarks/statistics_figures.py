@@ -48,15 +48,15 @@ def evidence(folds: Folds, moments: DriveMoments, output: Path) -> None:
     for name, a, b in zip(order, rows.contributions, drives.contributions, strict=True):
         print(f"  {name:<10} A by rows {a:14.1f}   A by drives {b:12.1f}")
     for name in PRICES:
-        sizes = [int(np.argmin(criterion_values(name, known))) for known in (rows, drives)]
+        sizes = [int(np.argmin(criterion_values(name, measured))) for measured in (rows, drives)]
         print(f"  {name:<15} keeps {sizes[0]} by rows, {sizes[1]} by drives")
     naive, robust = (
         infer(fits[-1], SCALES),
         infer(fits[-1], SCALES, moments),
     )
-    for one, other in zip(naive.estimates, robust.estimates, strict=True):
-        errors = f"{one.standard_error:.2g} or {other.standard_error:.2g}"
-        print(f"  {one.name:<10} {one.value:12.6f} +- {errors}")
+    for naive_estimate, other in zip(naive.estimates, robust.estimates, strict=True):
+        errors = f"{naive_estimate.standard_error:.2g} or {other.standard_error:.2g}"
+        print(f"  {naive_estimate.name:<10} {naive_estimate.value:12.6f} +- {errors}")
     figure, axes = plt.subplots(figsize=(6.4, 3.4))
     at = np.arange(len(order))
     axes.bar(at - 0.2, rows.contributions, 0.4, label="rows taken for independent")
@@ -116,13 +116,13 @@ def main() -> None:
     parser.add_argument("root")
     parser.add_argument("campaign", nargs="?", default="waterford")
     parser.add_argument("--output", type=Path, default=Path(), help="folder of the pictures")
-    given = parser.parse_args()
-    folds, moments = load(given.root, given.campaign)
-    given.output.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    folds, moments = load(arguments.root, arguments.campaign)
+    arguments.output.mkdir(parents=True, exist_ok=True)
     print(f"{folds.drives} drives, {folds.total.n} rows")
-    evidence(folds, moments, given.output)
-    orders(folds, moments, given.output)
-    subsets(folds, given.output)
+    evidence(folds, moments, arguments.output)
+    orders(folds, moments, arguments.output)
+    subsets(folds, arguments.output)
 
 
 if __name__ == "__main__":

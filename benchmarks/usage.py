@@ -17,7 +17,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process took.
+    """The resources that a process used.
 
     Attributes:
         seconds: from its start to its end, interpreter and imports included.
@@ -49,12 +49,12 @@ def _launch(answer: str, command: Sequence[str]) -> int:
     started = time.monotonic()
     process = os.posix_spawnp(command[0], list(command), os.environ)
     _, status, usage = os.wait4(process, 0)
-    told = {
+    result = {
         "seconds": time.monotonic() - started,
         "cpu_s": usage.ru_utime + usage.ru_stime,
         "peak_bytes": usage.ru_maxrss * 1024,
     }
-    Path(answer).write_text(json.dumps(told), encoding="ascii")
+    Path(answer).write_text(json.dumps(result), encoding="ascii")
     return os.waitstatus_to_exitcode(status)
 
 

@@ -102,19 +102,19 @@ def constant_radius(car: VehicleParameters, flaws: CarImperfections = PERFECT) -
         )
         for speed in speeds
     ]
-    kept = []
+    steady = []
     for truth in simulate_drives(drives):
         end = slice(-300, None)
         if truth.lost_control_tick is not None or np.abs(truth.lateral_offset_m[end]).max() > 2:
             break
-        kept.append(
+        steady.append(
             [
                 truth.ay_mps2[end].mean(),
                 np.degrees(truth.steering_wheel_rad[end].mean()) / car.steering.ratio,
                 np.degrees(truth.sideslip_rad[end].mean()),
             ]
         )
-    return Circle(*np.array(kept).T)
+    return Circle(*np.array(steady).T)
 
 
 @dataclass(frozen=True)
@@ -209,8 +209,8 @@ def _within(truth: Truth) -> bool:
     bounds = 50.0 + np.cumsum((0.0, *SECTIONS_M))
     margins = {0: 0.1, 2: 0.2, 4: 0.3}
     for section, share in margins.items():
-        here = (truth.station_m >= bounds[section]) & (truth.station_m <= bounds[section + 1])
-        if np.abs(truth.lateral_offset_m[here]).max() > (share * CAR_WIDTH_M + 0.25) / 2:
+        inside = (truth.station_m >= bounds[section]) & (truth.station_m <= bounds[section + 1])
+        if np.abs(truth.lateral_offset_m[inside]).max() > (share * CAR_WIDTH_M + 0.25) / 2:
             return False
     return True
 
@@ -226,14 +226,14 @@ def row(name: str, car: VehicleParameters, flaws: CarImperfections) -> tuple[str
     """Return what is measured of one car, as text."""
     circle, step = constant_radius(car, flaws), step_steer(car, flaws)
     linear = LinearBicycle.of(car, STEP_SPEED_MPS, compliance(flaws))
-    known = handling(car, compliance(flaws))
+    expected = handling(car, compliance(flaws))
     understeer = np.radians(circle.understeer_deg_per_g) / GRAVITY_MPS2
     return (
         name,
-        f"{circle.understeer_deg_per_g:.2f} ({np.degrees(known.understeer) * GRAVITY_MPS2:.2f})",
-        f"{3.6 * np.sqrt(known.wheelbase / understeer):.0f}"
+        f"{circle.understeer_deg_per_g:.2f} ({np.degrees(expected.understeer) * GRAVITY_MPS2:.2f})",
+        f"{3.6 * np.sqrt(expected.wheelbase / understeer):.0f}"
         f" ({3.6 * linear.characteristic_speed_mps:.0f})",
-        f"{circle.sideslip_deg_per_g:.2f} ({-np.degrees(known.rear_slip) * GRAVITY_MPS2:.2f})",
+        f"{circle.sideslip_deg_per_g:.2f} ({-np.degrees(expected.rear_slip) * GRAVITY_MPS2:.2f})",
         f"{circle.largest_ay_mps2:.1f}",
         f"({linear.natural_frequency_hz:.2f})",
         f"({linear.damping:.2f})",
@@ -247,20 +247,20 @@ def row(name: str, car: VehicleParameters, flaws: CarImperfections) -> tuple[str
 def plot(folder: Path) -> None:
     """Draw the three manoeuvres of all cars."""
     mpl.rcParams["svg.hashsalt"] = "validation"
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.6))
+    figure, (first, middle, right) = plt.subplots(1, 3, figsize=(11, 3.6))
     for colour, (kind, file) in zip(("C0", "C1", "C2"), CARS.items(), strict=True):
         car = load_vehicle(file, SHIPPED_CONFIGS)
         for flaws, style, label in ((PERFECT, "--", None), (imperfections(), "-", kind)):
             circle = constant_radius(car, flaws)
-            left.plot(circle.ay_mps2, circle.steering_deg, style, color=colour, label=label)
+            first.plot(circle.ay_mps2, circle.steering_deg, style, color=colour, label=label)
             step = step_steer(car, flaws)
             rate = step.response.yaw_rate_rad_s / step.steady_yaw_rate_rad_s
             middle.plot(step.response.time_s - 0.5, rate, style, color=colour)
             lane = double_lane_change(car, 60 / 3.6, flaws)
             right.plot(lane.station_m, np.degrees(lane.sideslip_rad), style, color=colour)
-    left.set(xlabel="lateral acceleration, m/s²", ylabel="steering wheel / ratio, °")
-    left.set_title("ISO 4138: circle of 100 m")
-    left.legend(frameon=False)
+    first.set(xlabel="lateral acceleration, m/s²", ylabel="steering wheel / ratio, °")
+    first.set_title("ISO 4138: circle of 100 m")
+    first.legend(frameon=False)
     middle.set(xlabel="time, s", ylabel="yaw rate / steady yaw rate", xlim=(-0.2, 2))
     middle.set_title("ISO 7401: step to 4 m/s² at 80 km/h")
     right.set(xlabel="station, m", ylabel="side-slip angle, °")

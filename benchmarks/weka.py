@@ -86,16 +86,16 @@ def by_weka(jar: Path, arff: Path, *, plain: bool) -> tuple[list[float], float, 
     start = time.perf_counter()
     model.buildClassifier(data)
     fit_s = time.perf_counter() - start
-    found = [float(b) for b in model.coefficients()]
+    coefficients = [float(b) for b in model.coefficients()]
     peak = peak_bytes(process.pid)
     gateway.shutdown()
     process.stdin.close()
     process.wait()
-    return [*found[: len(INPUTS)], found[-1]], read_s, fit_s, peak
+    return [*coefficients[: len(INPUTS)], coefficients[-1]], read_s, fit_s, peak
 
 
 def print_row(name: str, seconds: Sequence[float], peak_bytes: int, fit: str) -> None:
-    cells = " | ".join(f"{one:.2f}" for one in seconds)
+    cells = " | ".join(f"{value:.2f}" for value in seconds)
     print(f"| {name} | {cells} | {peak_bytes / 2**20:,.0f} | {fit} |", flush=True)
 
 
@@ -106,14 +106,14 @@ def measure(warehouse: Warehouse, jar: Path, count: int, folder: Path) -> None:
     write_arff(rows, arff)
     path = write_parquet(warehouse, rows, folder)
     exact: LinearModel = exact_model([path])
-    sizes = [Path(one).stat().st_size / 2**20 for one in (arff, path)]
+    sizes = [Path(file).stat().st_size / 2**20 for file in (arff, path)]
     print(f"{len(rows):,} rows: ARFF {sizes[0]:,.0f} MiB, log file {sizes[1]:,.0f} MiB\n")
     print("| program | all, s | fit alone, s | peak MiB | inputs used; correct digits |")
     print("| --- | ---: | ---: | ---: | --- |", flush=True)
     for name, plain in (("WEKA, its defaults", False), ("WEKA, all inputs, no ridge", True)):
-        found, read_s, fit_s, peak = by_weka(jar, arff, plain=plain)
-        used = sum(b != 0 for b in found[:-1])
-        fit = f"{used} of {len(INPUTS)}; {max(0.0, digits(found, exact)):.1f}"
+        coefficients, read_s, fit_s, peak = by_weka(jar, arff, plain=plain)
+        used = sum(b != 0 for b in coefficients[:-1])
+        fit = f"{used} of {len(INPUTS)}; {max(0.0, digits(coefficients, exact)):.1f}"
         print_row(name, (read_s + fit_s, fit_s), peak, fit)
     for threads in (1, 2):
         ours = in_process("fleet_slip", threads, 3, [path])

@@ -35,8 +35,8 @@ def _(fleet_slip, mo, pluralize):
     with fleet.session() as session:
         drives = session.sql("SELECT * FROM drives ORDER BY drive_id").pl()
         trained = session.sql("SELECT DISTINCT name FROM models ORDER BY 1").pl()["name"].to_list()
-    found = f"{pluralize(drives.height, 'drive')}, {pluralize(len(trained), 'model')}"
-    mo.md(f"# Drives and models of {fleet.root}\n\n{found}")
+    summary = f"{pluralize(drives.height, 'drive')}, {pluralize(len(trained), 'model')}"
+    mo.md(f"# Drives and models of {fleet.root}\n\n{summary}")
     return drives, fleet, trained
 
 
@@ -80,18 +80,18 @@ def _(FleetSlipError, chart, fleet, mo, pluralize, pl, training):
         results = pl.DataFrame(
             [
                 {
-                    "model": one.name,
-                    "signals": " ".join(one.signals),
-                    "correlation": round(one.pooled.correlation, 4),
-                    "RMSE deg": round(one.pooled.rmse_deg, 4),
+                    "model": item.name,
+                    "signals": " ".join(item.signals),
+                    "correlation": round(item.pooled.correlation, 4),
+                    "RMSE deg": round(item.pooled.rmse_deg, 4),
                 }
-                for one in compared.models
+                for item in compared.models
             ]
         )
-        told = mo.vstack([mo.md(f"{compared.winner.reason}"), mo.ui.table(results)])
+        display = mo.vstack([mo.md(f"{compared.winner.reason}"), mo.ui.table(results)])
     except FleetSlipError as error:
-        told = mo.callout(str(error), kind="warn")
-    mo.vstack([mo.md(f"**{pluralize(chosen['drive_id'].n_unique(), 'drive')}**"), told])
+        display = mo.callout(str(error), kind="warn")
+    mo.vstack([mo.md(f"**{pluralize(chosen['drive_id'].n_unique(), 'drive')}**"), display])
     return
 
 
@@ -171,16 +171,20 @@ def _(FleetSlipError, alt, fleet, mo, name, pl):
     days = [day for (day,) in fleet.sql("SELECT DISTINCT day FROM drives ORDER BY 1").fetchall()]
     try:
         _since = days[len(days) // 2] if len(days) > 8 else None
-        _found = fleet.maintenance.monitor(name.value, since=_since)
+        _chart = fleet.maintenance.monitor(name.value, since=_since)
         drift = alt.vconcat()
-        for _figure, _limits in (("mean", _found.mean_limits), ("std", _found.std_limits)):
+        for _figure, _limits in (("mean", _chart.mean_limits), ("std", _chart.std_limits)):
             _points = pl.DataFrame(
                 {
-                    "day": [str(one.day) for one in _found.days],
-                    "error": [getattr(one, f"error_{_figure}_deg") for one in _found.days],
+                    "day": [str(item.day) for item in _chart.days],
+                    "error": [getattr(item, f"error_{_figure}_deg") for item in _chart.days],
                     "kind": [
-                        "training" if one.training else "beyond" if _figure in one.alarms else "new"
-                        for one in _found.days
+                        "training"
+                        if item.training
+                        else "beyond"
+                        if _figure in item.alarms
+                        else "new"
+                        for item in _chart.days
                     ],
                 }
             )

@@ -28,7 +28,7 @@ PROCESSES = 2
 
 @dataclass
 class Outcome:
-    """What became of a target's cases."""
+    """The outcomes of a target's cases."""
 
     answers: Counter[str] = field(default_factory=Counter)
     bugs: list[str] = field(default_factory=list)

@@ -61,13 +61,13 @@ LEARNERS: dict[str, Fit] = {
     "anfis": fit_anfis,
     "grnn": fit_general_regression,
 }
-FILTER = next(one for one in FILTERS if one.name == "ekf_class")
+FILTER = next(item for item in FILTERS if item.name == "ekf_class")
 TREE = "ekf_tree"
 T = TypeVar("T")
 
 
 class Rival(NamedTuple):
-    """What was trained, and what is known of it beside its errors on test drives."""
+    """A trained rival, with figures beside its errors on test drives."""
 
     estimate: Estimator[TestDrive]
     size_bytes: int | None = None
@@ -78,7 +78,9 @@ class Rival(NamedTuple):
 
 def all_signals() -> tuple[str, ...]:
     """Return the signals of model 4 of Table I, which the paper settles on."""
-    return next(one.signals for one in load_model_list(CATALOG, TABLE_ONE).model if one.name == "4")
+    return next(
+        item.signals for item in load_model_list(CATALOG, TABLE_ONE).model if item.name == "4"
+    )
 
 
 def timed(work: Callable[[], T]) -> tuple[T, float]:
@@ -88,17 +90,17 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 def learn(fit: Fit, sample: RowSample, inputs: Inputs) -> Rival:
     """Fit and cross-validate a learner."""
-    rows = sample.of(inputs.names)
+    rows = sample.columns(inputs.names)
     fitted, training_s = timed(lambda: fit(rows, sample.sideslip_rad, sample.trip))
     _, many_s = timed(lambda: fitted.predict(rows[:10_000]))
-    found = sample.cross_validated(fit, inputs.names)
+    predictions = sample.cross_validated(fit, inputs.names)
     each_us = 1e6 * many_s / len(rows[:10_000])
     estimate = LearnedEstimate(inputs, fitted)
-    return Rival(estimate, fitted.size_bytes, training_s, each_us, found.rmse_deg)
+    return Rival(estimate, fitted.size_bytes, training_s, each_us, predictions.rmse_deg)
 
 
 def train(
-    fleet: fleet_slip.Fleet, manifest: Manifest, rows: int, wanted: Callable[[str], bool]
+    fleet: fleet_slip.Fleet, manifest: Manifest, rows: int, is_wanted: Callable[[str], bool]
 ) -> Iterator[tuple[str, Rival]]:
     """Yield each rival by name."""
     yield (
@@ -115,9 +117,9 @@ def train(
     sets = {"2": Inputs.of_signals(TWO_SIGNALS), "8": Inputs.of_signals(all_signals())}
     for suffix, inputs in {**sets, "windows": windows}.items():
         for name, fit in LEARNERS.items():
-            if wanted(f"{name}_{suffix}"):
+            if is_wanted(f"{name}_{suffix}"):
                 yield f"{name}_{suffix}", learn(fit, sample, inputs)
-    if not (wanted(FILTER.name) or wanted(TREE)):
+    if not (is_wanted(FILTER.name) or is_wanted(TREE)):
         return
     car = load_scenario("nominal", SHIPPED_CONFIGS).car
     drives = TuningDrives.choose(fleet.warehouse, cohort, with_mass=False)
@@ -125,7 +127,7 @@ def train(
         best, took_s = timed(partial(FILTER.tune, drives.drives, car, executor))
         estimate = FilterEstimate(FILTER, best.parameters)
         yield FILTER.name, Rival(estimate, training_s=took_s)
-        if wanted(TREE):
+        if is_wanted(TREE):
             tree, took_s = timed(partial(fit_tree_filter, estimate, car, drives.drives, executor))
             yield TREE, Rival(tree, tree.size_bytes, took_s)
 
@@ -137,15 +139,16 @@ def main() -> None:
     parser.add_argument("--rivals", default="", help="by default all")
     parser.add_argument("--rows", type=int, default=60_000)
     parser.add_argument("--drives", default=",".join(DRIVES))
-    given = parser.parse_args()
-    names, asked = given.drives.split(","), given.rivals.split(",")
-    fleet = fleet_slip.open(given.root)
-    manifest = fleet.models.get(given.model).manifest
+    arguments = parser.parse_args()
+    names, rivals = arguments.drives.split(","), arguments.rivals.split(",")
+    fleet = fleet_slip.open(arguments.root)
+    manifest = fleet.models.get(arguments.model).manifest
     drives = simulate_drives(SIGNALS, [load_scenario(name, SHIPPED_CONFIGS) for name in names])
 
     def show(*cells: Any) -> None:
         texts = (
-            "" if one is None else f"{one:.4g}" if isinstance(one, float) else one for one in cells
+            "" if item is None else f"{item:.4g}" if isinstance(item, float) else item
+            for item in cells
         )
         print("|", " | ".join(map(str, texts)), "|", flush=True)
 
@@ -153,7 +156,7 @@ def main() -> None:
     show(*["---"] * (5 + len(names)))
     with one_thread():
         for name, (estimate, *costs) in train(
-            fleet, manifest, given.rows, lambda name: not given.rivals or name in asked
+            fleet, manifest, arguments.rows, lambda name: not arguments.rivals or name in rivals
         ):
             runs = evaluate(drives, {name: estimate})
             show(name, *costs, *(run.statistics[name].rmse_deg for run in runs))

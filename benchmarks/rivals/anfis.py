@@ -39,7 +39,7 @@ BLOCK = 8192
 """Rows that are worked on at once."""
 
 RIDGE = 1e-9
-"""Of the least squares, over the rows: keeps rules that no row follows from running off."""
+"""Ridge of the least squares, per row: bounds the conclusions of rules that no row activates."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Premises:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives of half the mean squared error by centres and log widths."""
         share = self.firing(z)
-        each = x @ conclusions.T
-        estimate = (share * each).sum(axis=1, keepdims=True)
-        pull = (estimate - label[:, None]) * share * (each - estimate) / len(z)
+        outputs = x @ conclusions.T
+        estimate = (share * outputs).sum(axis=1, keepdims=True)
+        pull = (estimate - label[:, None]) * share * (outputs - estimate) / len(z)
         width = np.exp(self.log_width)
         distance = (z[:, None, :] - self.centre) / width
         by_centre = np.einsum("nr,nrj->rj", pull, distance) / width
@@ -128,8 +128,8 @@ def learn(
 
 def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearner:
     """Fit rules to rows; centres and widths are those that estimate drives held back best."""
-    scaling, of_label = Scaling.of(inputs), Scaling.of(label)
-    scaled, wanted = scaling(inputs), of_label(label)
+    scaling, label_scaling = Scaling.fit(inputs), Scaling.fit(label)
+    scaled, targets = scaling(inputs), label_scaling(label)
     axes = np.linalg.svd(scaled[:: max(1, len(scaled) // LEARNING_ROWS)], full_matrices=False)[2].T
     leading = axes[:, :LEARNING_COLUMNS]
     axes = axes[:, :PREMISES]
@@ -143,17 +143,17 @@ def fit_anfis(inputs: FloatArray, label: FloatArray, trip: Names) -> FittedLearn
     held = hold_back(trip)
     thin = np.flatnonzero(~held)[:: max(1, int((~held).sum()) // LEARNING_ROWS)]
     parts = [
-        (premises(scaled[part]), with_one(scaled[part] @ leading), wanted[part])
+        (premises(scaled[part]), with_one(scaled[part] @ leading), targets[part])
         for part in (thin, np.flatnonzero(held))
     ]
-    found = learn(scatter(parts[0][0]), parts[0], parts[1])
-    conclusions = conclude(found.firing(premises(scaled)), with_one(scaled), wanted)
+    parameters = learn(scatter(parts[0][0]), parts[0], parts[1])
+    conclusions = conclude(parameters.firing(premises(scaled)), with_one(scaled), targets)
 
     def predict(rows: FloatArray) -> FloatArray:
         x = scaling(rows)
-        estimate = infer(found.firing(premises(x)), with_one(x), conclusions)
-        return estimate * of_label.std + of_label.mean
+        estimate = infer(parameters.firing(premises(x)), with_one(x), conclusions)
+        return estimate * label_scaling.std + label_scaling.mean
 
-    arrays = (found.centre, found.log_width, conclusions, axes)
-    size = sum(array.nbytes for array in arrays) + scaling.size_bytes + of_label.size_bytes
+    arrays = (parameters.centre, parameters.log_width, conclusions, axes)
+    size = sum(array.nbytes for array in arrays) + scaling.size_bytes + label_scaling.size_bytes
     return FittedLearner(predict, int(size))

@@ -1,4 +1,4 @@
-"""What a learned rival sees: logged signals, a model's columns, and a sample of a cohort's rows."""
+"""Inputs of learned rivals: logged signals, a model's columns, and a sample of a cohort's rows."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -54,18 +54,18 @@ class Inputs:
         definitions: dict[str, Definition] = {}
         for term in manifest.terms:
             scale = float(SIGNALS[term.signal].scale if term.logged else term.scale)
-            one = term.definition
-            if one is None:
+            definition = term.definition
+            if definition is None:
                 scales.setdefault(term.signal, scale)
                 continue
-            for part in one.components:
+            for part in definition.components:
                 if part not in definitions.values():
                     behind = f"{part.of}_{part.over or 'now'}_{part.ticks}"  # a gate only
                     if behind in scales:
                         behind = f"{behind}_{len(scales)}"
-                    name = term.signal if part == one else behind
+                    name = term.signal if part == definition else behind
                     definitions[name] = part
-                    scales[name] = 1.0 if one.gate and part == one.gate.by else scale
+                    scales[name] = 1.0 if definition.gate and part == definition.gate.by else scale
         return cls(scales, manifest.features, definitions)
 
     @property
@@ -75,7 +75,7 @@ class Inputs:
 
     @cached_property
     def plan(self) -> ColumnPlan:
-        """What to compute of a drive."""
+        """The columns to compute for a drive."""
         return ColumnPlan.from_definitions(self.names, self.features, self.definitions)
 
     def beside(self, signal: str) -> "Inputs":
@@ -126,7 +126,7 @@ class RowSample:
     sideslip_rad: FloatArray
     trip: Names
 
-    def of(self, names: tuple[str, ...]) -> FloatArray:
+    def columns(self, names: tuple[str, ...]) -> FloatArray:
         """Return some of the inputs, shape (rows, inputs)."""
         return self.inputs[:, [self.names.index(name) for name in names]]
 
@@ -136,7 +136,7 @@ class RowSample:
 
     def cross_validated(self, fit: Fit, names: tuple[str, ...]) -> ErrorStatistics:
         """Return the figures of a learner on rows that each fold's fit has not seen."""
-        inputs, folds = self.of(names), self.folds()
+        inputs, folds = self.columns(names), self.folds()
         estimates = np.full(len(inputs), np.nan)
         for fold in range(len(folds.names)):
             test = folds.fold == fold
@@ -160,13 +160,13 @@ def draw_sample(
     parts: list[FloatArray] = []
     names: list[str] = []
     files = cohort_files(warehouse, cohort.predicate)
-    for file in (one for one in warehouse.logs.snapshot().files if one.path in files):
+    for file in (item for item in warehouse.logs.snapshot().files if item.path in files):
         for drive in read_drives(warehouse, file, plan):
             name = str(drive.facts["drive_id"])
             if name not in trips:
                 continue
-            told = (numbers or {}).get(str(drive.facts["vehicle_id"]), {})
-            values = with_label.values(replace(drive, numbers=told))
+            calibration = (numbers or {}).get(str(drive.facts["vehicle_id"]), {})
+            values = with_label.values(replace(drive, numbers=calibration))
             values = values[drive.ticks % stride == 0]
             parts.append(values[np.isfinite(values).all(axis=1)])
             names.extend([name] * len(parts[-1]))
@@ -175,6 +175,6 @@ def draw_sample(
             f"no row of {cohort.predicate.text!r} has all of {', '.join(with_label.names)}."
         )
     order = np.argsort(np.array(names), kind="stable")
-    found = np.concatenate(parts)[order]
+    sample = np.concatenate(parts)[order]
     trip = np.array([trips[names[at]] for at in order])
-    return RowSample(inputs.names, found[:, :-1], found[:, -1], trip)
+    return RowSample(inputs.names, sample[:, :-1], sample[:, -1], trip)

@@ -39,7 +39,7 @@ class Scaling:
     std: FloatArray
 
     @classmethod
-    def of(cls, values: FloatArray) -> "Scaling":
+    def fit(cls, values: FloatArray) -> "Scaling":
         """Return the scaling of a sample."""
         return cls(values.mean(axis=0), np.maximum(values.std(axis=0), np.finfo(float).tiny))
 
@@ -61,8 +61,8 @@ def hold_back(trip: Names) -> BoolArray:
     """Return which rows to stop by: those of whole drives; with one drive its last tenth."""
     drives = np.unique(trip)
     if len(drives) > 1:
-        every = min(HELD_BACK, len(drives))
-        return np.isin(trip, drives[every // 2 :: every])
+        step = min(HELD_BACK, len(drives))
+        return np.isin(trip, drives[step // 2 :: step])
     return np.arange(len(trip)) >= 0.9 * len(trip)
 
 
@@ -90,8 +90,8 @@ def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted
         hidden_layer_sizes=LAYERS, activation="tanh", batch_size=BATCH_ROWS,
         max_iter=PASSES_AT_ONCE, tol=0.0, warm_start=True, random_state=SEED,
     )  # fmt: skip
-    scaling, of_label = Scaling.of(inputs), Scaling.of(label)
-    scaled, wanted = scaling(inputs).astype(np.float32), of_label(label).astype(np.float32)
+    scaling, label_scaling = Scaling.fit(inputs), Scaling.fit(label)
+    scaled, targets = scaling(inputs).astype(np.float32), label_scaling(label).astype(np.float32)
     held = hold_back(trip)
     least, best, passes = np.inf, None, 0
     for rate in RATES:
@@ -99,11 +99,11 @@ def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted
         better = True
         while better and passes < PASSES:
             with warnings.catch_warnings():
-                # That a few passes do not converge is no news.
+                # A few passes are not expected to converge.
                 warnings.simplefilter("ignore")
-                network.fit(scaled[~held], wanted[~held])
+                network.fit(scaled[~held], targets[~held])
             passes += PASSES_AT_ONCE
-            error = float(np.mean((network.predict(scaled[held]) - wanted[held]) ** 2))
+            error = float(np.mean((network.predict(scaled[held]) - targets[held]) ** 2))
             better = error < least
             if better:
                 least = error
@@ -114,11 +114,13 @@ def fit_perceptron(inputs: FloatArray, label: FloatArray, trip: Names) -> Fitted
             network.intercepts_ = [array.copy() for array in best[layers:]]
 
     def predict(rows: FloatArray) -> FloatArray:
-        found: FloatArray = network.predict(scaling(rows).astype(np.float32)).astype(np.float64)
-        return found * of_label.std + of_label.mean
+        predictions: FloatArray = network.predict(scaling(rows).astype(np.float32)).astype(
+            np.float64
+        )
+        return predictions * label_scaling.std + label_scaling.mean
 
     parameters = sum(array.nbytes for array in (*network.coefs_, *network.intercepts_))
-    return FittedLearner(predict, int(parameters) + scaling.size_bytes + of_label.size_bytes)
+    return FittedLearner(predict, int(parameters) + scaling.size_bytes + label_scaling.size_bytes)
 
 
 CENTRES = 1000
@@ -134,15 +136,15 @@ def fit_general_regression(inputs: FloatArray, label: FloatArray, trip: Names) -
     Each remembered row counts with exp(−d²/2h²), d its distance in scaled inputs. The width h is
     the one that estimates drives best which are not remembered.
     """
-    scaling = Scaling.of(inputs)
+    scaling = Scaling.fit(inputs)
     held = hold_back(trip)
     order = np.random.default_rng(SEED).permutation(len(inputs))
-    kept, others = order[~held[order]][:CENTRES], order[held[order]][:CENTRES]
-    centres, labels = scaling(inputs[kept]), label[kept]
+    training, validation = order[~held[order]][:CENTRES], order[held[order]][:CENTRES]
+    centres, labels = scaling(inputs[training]), label[training]
 
     def error(width: float) -> float:
-        estimate = kernel_mean(scaling(inputs[others]), centres, labels, width)
-        return float(np.mean((estimate - label[others]) ** 2))
+        estimate = kernel_mean(scaling(inputs[validation]), centres, labels, width)
+        return float(np.mean((estimate - label[validation]) ** 2))
 
     width = min(BANDWIDTHS, key=error)
     return FittedLearner(

@@ -31,7 +31,7 @@ from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6
 LEAST_SHARE = 0.01
-"""Of the rows, in each leaf."""
+"""Minimum share of the rows in each leaf."""
 
 LAG = 0.05
 """Share of a new sample in the inertial signals that the tree sees: they follow within 0.2 s."""
@@ -54,23 +54,23 @@ class LeafNoise(Config):
 
 
 @kernel
-def _filter(given: ekf.Inputs, factors: FloatArray) -> FloatArray:
+def _filter(inputs: ekf.Inputs, factors: FloatArray) -> FloatArray:
     """Return vx and vy as `ekf` does, the model's variances of each row times a factor."""
-    found = np.empty((2, len(given.ax_mps2)))
+    states = np.empty((2, len(inputs.ax_mps2)))
     x, (q_vx, q_vy, q_r, q_bias) = (
-        independent_state(given.first_mean, given.first_variances),
-        given.q,
+        independent_state(inputs.first_mean, inputs.first_variances),
+        inputs.q,
     )
-    for k in range(len(given.ax_mps2)):
-        loaded, steer, factor = given.axles[:, k], given.steer_rad[k], factors[k]
+    for k in range(len(inputs.ax_mps2)):
+        loaded, steer, factor = inputs.axles[:, k], inputs.steer_rad[k], factors[k]
         axles = Axles(loaded[0], loaded[1], loaded[2], loaded[3])
         if k > 0:
             q = q_vx, factor * q_vy, factor * q_r, q_bias
-            ekf.predict(x, given.ax_mps2[k], steer, STEP_S, axles, given.constants, q)
-        measured = given.vx_mps[k], given.yaw_rate_rad_s[k], given.ay_mps2[k]
-        ekf.update(x, *measured, steer, axles, given.constants, given.variances)
-        found[:, k] = x.mean[:2]
-    return found
+            ekf.predict(x, inputs.ax_mps2[k], steer, STEP_S, axles, inputs.constants, q)
+        measured = inputs.vx_mps[k], inputs.yaw_rate_rad_s[k], inputs.ay_mps2[k]
+        ekf.update(x, *measured, steer, axles, inputs.constants, inputs.variances)
+        states[:, k] = x.mean[:2]
+    return states
 
 
 def kinds(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
@@ -127,15 +127,18 @@ def fit_tree_filter(
     seen_kinds = np.concatenate([kinds(drive.signals, car) for drive, car in pairs])
     parameters = ekf.EkfNoise.model_validate(base.parameters.model_dump())
     errors = np.concatenate(
-        [ekf.estimate(one.signals, car, parameters) - one.sideslip_rad for one, car in pairs]
+        [
+            ekf.estimate(labelled.signals, car, parameters) - labelled.sideslip_rad
+            for labelled, car in pairs
+        ]
     )
-    known = np.isfinite(errors)
+    finite = np.isfinite(errors)
     tree = DecisionTreeRegressor(
         max_leaf_nodes=LEAVES, min_samples_leaf=LEAST_SHARE, random_state=SEED
     )
-    tree.fit(seen_kinds[known], errors[known] ** 2)
+    tree.fit(seen_kinds[finite], errors[finite] ** 2)
     leaves = np.flatnonzero(tree.tree_.children_left < 0)
     start = TreeFilter(base, tree, leaves, LeafNoise())
     names = [f"leaf_{number}" for number in range(len(leaves))]
-    found = tune(start.estimate, start.noise, names, drives, default_car, executor)
-    return replace(start, noise=found.parameters)
+    tuned = tune(start.estimate, start.noise, names, drives, default_car, executor)
+    return replace(start, noise=tuned.parameters)

@@ -17,7 +17,7 @@ cluster, not all done."""
 
 
 class Night(dagster.Config):
-    """Where logs land, their mapping, and the model."""
+    """The inbox of logs, their mapping, and the model."""
 
     inbox: str = "/srv/fleet-slip/inbox"
     mapping: str = "/etc/fleet-slip/mapping.toml"
@@ -37,9 +37,9 @@ def champion(context: dagster.AssetExecutionContext, config: Night) -> dagster.M
             f"nightly ended with exit code {done.returncode}",
             allow_retries=done.returncode in AGAIN,
         )
-    told = json.loads(done.stdout)
+    document = json.loads(done.stdout)
     figures = ("champion", "drives", "new_drives", "rows", "verdict")
-    return dagster.MaterializeResult(metadata={name: told[name] for name in figures})
+    return dagster.MaterializeResult(metadata={name: document[name] for name in figures})
 
 
 night = dagster.define_asset_job(
