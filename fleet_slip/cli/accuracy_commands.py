@@ -19,11 +19,7 @@ def score(
     context: Context,
     model: opt.Model = None,
     cohort: Annotated[
-        str | None,
-        Option(
-            help="SQL predicate on the view drives. Default: the drives that the model was not "
-            "trained on, or all if there are no others."
-        ),
+        str | None, Option(help="SQL predicate on the view drives. Default: drives of no training.")
     ] = None,
     include_faulty: opt.IncludeFaulty = False,
     json: opt.Json = False,
@@ -59,9 +55,7 @@ def predict(
 def evaluate(
     context: Context,
     model: opt.Model = None,
-    compare: Annotated[
-        list[str] | None, Option(help="Another model to evaluate beside it. May be repeated.")
-    ] = None,
+    compare: Annotated[list[str] | None, Option(help="Another model. May be repeated.")] = None,
     scenario: Annotated[
         list[str] | None,
         Option(
@@ -69,27 +63,19 @@ def evaluate(
         ),
     ] = None,
     blind: Annotated[
-        bool,
-        Option(
-            "--blind",
-            help="Evaluate on random roads, cars, weather and drivers, drawn from the hash of the "
-            "model's version: unknown before it was published.",
-        ),
+        bool, Option("--blind", help="Evaluate on random drives, drawn from the version's hash.")
     ] = False,
     cohort: Annotated[
         str | None,
         Option(
-            help="SQL predicate on the view drives: evaluate on measured drives with a label "
-            "instead. Models and filters are trained without the drives, or parts, that they are "
-            "evaluated on."
+            help="SQL predicate on the view drives: evaluate on these measured drives with a label "
+            "instead, each by models and filters that were trained without it."
         ),
     ] = None,
     include_faulty: opt.IncludeFaulty = False,
     vehicle: opt.Vehicle = None,
     threads: opt.Threads = None,
-    everything: Annotated[
-        bool, Option("--all", help="Print the errors of all estimators on every drive.")
-    ] = False,
+    everything: opt.All = False,
     json: opt.Json = False,
 ) -> None:
     """Evaluate models on the paper's test drives and on others; simulate those that are missing.
@@ -134,15 +120,15 @@ def identify(
     vehicle: Annotated[
         str,
         Option(
-            help="Measured data of the car: a TOML file with mass_kg, front_axle_m and "
-            "rear_axle_m, optionally track_m, height_m, rolling_radius_m and front_drive_share."
+            help="Measured data of the car: a TOML file with mass_kg, front_axle_m, rear_axle_m, "
+            "optionally track_m, height_m, rolling_radius_m, front_drive_share."
         ),
     ],
     cohort: opt.Cohort = TRAINING_DRIVES,
     threads: opt.Threads = None,
     output: Annotated[Path | None, Option(help="Vehicle file to write.")] = None,
     campaign: Annotated[
-        Path | None, Option(help="Campaign file with the car to write, for publish --prior.")
+        Path | None, Option(help="Campaign file to write, for publish --prior.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -173,9 +159,7 @@ def identify(
 def report(
     context: Context,
     model: opt.Model = None,
-    output: Annotated[
-        Path | None, Option(help="Folder to write into. Default: report/ in the data root.")
-    ] = None,
+    output: Annotated[Path | None, Option(help="Default: report/ in the data root.")] = None,
     json: opt.Json = False,
 ) -> None:
     """Write a page that compares the latest evaluation with the paper's figures.
@@ -201,19 +185,13 @@ def watch(
     drive: Annotated[
         str,
         Argument(
-            metavar="SCENARIO|DRIVE",
-            help="Scenario of configs/scenarios, a TOML file, or a logged drive: its drive_id, its "
-            "name, or the name of its file.",
+            metavar="SCENARIO|DRIVE", help="A scenario, or a drive by its drive_id, name or file."
         ),
     ],
     model: opt.Model = None,
-    output: Annotated[Path, Option(help="Page to write, .html. It plays in a browser.")] = Path(
-        "watch.html"
-    ),
+    output: Annotated[Path, Option(help="Page to write, .html.")] = Path("watch.html"),
     from_s: Annotated[float, Option("--from", help="First second of the drive.")] = 0.0,
-    until_s: Annotated[
-        float | None, Option("--until", help="Last second. Default: the end.")
-    ] = None,
+    until_s: Annotated[float | None, Option("--until", help="Last second.")] = None,
 ) -> None:
     """Show a drive: the car on its track, its angle and the estimate, wheels and gates.
 
@@ -229,9 +207,7 @@ def explore(
     context: Context,
     edit: Annotated[bool, Option("--edit", help="Show the code, for editing.")] = False,
     port: Annotated[int | None, Option(min=1, max=65535, help="Port on this machine.")] = None,
-    headless: Annotated[
-        bool, Option("--headless", help="Print the address, and open no browser.")
-    ] = False,
+    headless: Annotated[bool, Option("--headless", help="Open no browser.")] = False,
 ) -> None:
     """Explore a data root in the browser: cohorts by mouse, error maps, coefficients, drift.
 

@@ -162,24 +162,17 @@ def options(
     context: Context,
     root: Annotated[
         str | None,
-        Option(
-            help="Data root: a folder, or the URL of an object store, such as s3://BUCKET/PATH. "
-            "Default: $FLEET_SLIP_ROOT, else ./data."
-        ),
+        Option(help="Data root: a folder or s3://BUCKET/PATH. Default: $FLEET_SLIP_ROOT, or data."),
     ] = None,
     config: Annotated[
         str | None,
-        Option(
-            help="Folder of configs that override the shipped ones (docs/configuration.md). "
-            "Default: $FLEET_SLIP_CONFIG."
-        ),
+        Option(help="Folder of configs over the shipped ones. Default: $FLEET_SLIP_CONFIG."),
     ] = None,
     lineage: Annotated[  # noqa: ARG001 - read by `recorded`
         str | None,
         Option(
             envvar="FLEET_SLIP_LINEAGE",
-            help="File or URL (http://HOST:PORT) for OpenLineage events of commands that change "
-            "the data root.",
+            help="File or URL (http://HOST:PORT) for OpenLineage events.",
         ),
     ] = None,
     _version: Annotated[

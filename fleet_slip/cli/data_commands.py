@@ -45,7 +45,7 @@ def simulate(
     through: opt.Through = None,
     engine: Annotated[
         Literal["kernel", "highway-env"],
-        Option(help="The compiled kernel, or highway-env's vehicle: slower, the same logs."),
+        Option(help="highway-env is slower; the logs are the same."),
     ] = "kernel",
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -77,25 +77,14 @@ def ingest(
         ),
     ],
     mapping: Annotated[
-        str | None,
-        Option(
-            help="Mapping of configs/mappings, or a TOML file. Without it, the files are tables of "
-            "Gram rows."
-        ),
+        str | None, Option(help="Mapping of configs/mappings, or a TOML file; none for Gram rows.")
     ] = None,
     dry_run: Annotated[
         bool,
-        Option(
-            "--dry-run", help="Store nothing; show the result and what looks wrong (exit code 10)."
-        ),
+        Option("--dry-run", help="Store nothing; show the result (exit code 10 if it is odd)."),
     ] = False,
     replace: Annotated[
-        bool,
-        Option(
-            "--replace",
-            help="Replace the drives of the same recordings, such as after a correction of the "
-            "mapping.",
-        ),
+        bool, Option("--replace", help="Replace the drives of the same recordings.")
     ] = False,
     cluster: opt.Cluster = None,
     json: opt.Json = False,
@@ -214,13 +203,9 @@ def mapping() -> None:
 def suggest(
     context: Context,
     file: Annotated[str, Argument(help="A measured log, or the folder of a lake of CAN messages.")],
-    output: Annotated[
-        Path | None, Option(help="File to write the draft to, instead of stdout.")
-    ] = None,
+    output: Annotated[Path | None, Option(help="File to write. Default: stdout.")] = None,
     can: Annotated[Path | None, Option(help="Database of a CAN trace: DBC, KCD or SYM.")] = None,
-    plot: Annotated[
-        Path | None, Option(help="Page to write, .html: the mapped signals in SI units.")
-    ] = None,
+    plot: Annotated[Path | None, Option(help="Page of the mapped signals to write, .html.")] = None,
     json: opt.Json = False,
 ) -> None:
     """List the channels of a measured log, and draft a mapping for it.
@@ -321,21 +306,15 @@ def _draft(signals: "SignalCatalog", file: str, can: Path | None) -> "tuple[Draf
 def gram(
     context: Context,
     features: Annotated[
-        str,
-        Option(help="Feature set of configs/features.toml, or all; signals is the logged signals."),
+        str, Option(help="Feature set of configs/features.toml, signals (the logged ones), or all.")
     ] = "signals",
     cohort: Annotated[
         str | None,
-        Option(
-            help="SQL predicate on the view drives: read only log files with such a drive. "
-            "Default: all files."
-        ),
+        Option(help="SQL predicate on the view drives: read only files with such a drive."),
     ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
-    sql: Annotated[
-        bool, Option("--sql", help="Print the SQL statement, and compute nothing.")
-    ] = False,
+    sql: Annotated[bool, Option("--sql", help="Print the SQL; compute nothing.")] = False,
     json: opt.Json = False,
 ) -> None:
     """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
@@ -372,18 +351,11 @@ def gram(
 
 def features(
     context: Context,
-    sets: Annotated[
-        bool, Option("--sets", help="List the feature sets instead of the features.")
-    ] = False,
+    sets: Annotated[bool, Option("--sets", help="List the feature sets.")] = False,
     sql: Annotated[
-        str | None,
-        Option(
-            help="Print the query over log_counts that computes this feature, window or factor."
-        ),
+        str | None, Option(help="Print the query over log_counts that computes this column.")
     ] = None,
-    files: Annotated[
-        bool, Option("--files", help="List the config files in use, and their folders.")
-    ] = False,
+    files: Annotated[bool, Option("--files", help="List the config files in use.")] = False,
     everything: opt.All = False,
     json: opt.Json = False,
 ) -> None:

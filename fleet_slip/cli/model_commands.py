@@ -36,11 +36,7 @@ def select(
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
     save: Annotated[
-        Path | None,
-        Option(
-            metavar="LIST.toml",
-            help="Write what was compared as a model list, for publish --models.",
-        ),
+        Path | None, Option(metavar="LIST.toml", help="Model list to write, for publish --models.")
     ] = None,
     everything: opt.All = False,
     json: opt.Json = False,
@@ -73,10 +69,7 @@ def publish(
     name: opt.ModelName,
     cohort: Annotated[
         str | None,
-        Option(
-            help="SQL predicate on the view drives. Default: the cohort of the model's champion; "
-            "all drives, for a new model."
-        ),
+        Option(help="SQL predicate on the view drives. Default: the champion's, or all."),
     ] = None,
     include_faulty: opt.IncludeFaulty = False,
     models: opt.ModelList = None,
@@ -87,20 +80,13 @@ def publish(
     with_filter: Annotated[
         str | None,
         Option(
-            help="Combine the model with a Kalman filter in this car, identified from the drives: "
-            "a vehicle of configs/vehicles, or a TOML file with mass_kg, front_axle_m and "
-            "rear_axle_m; none for no filter. Default: the champion's."
+            help="Combine it with a Kalman filter in this car, a vehicle of configs/vehicles or a "
+            "TOML file with mass_kg, front_axle_m, rear_axle_m; or none. Default: the champion's."
         ),
     ] = None,
-    force: Annotated[
-        bool, Option("--force", help="Publish even a model that is worse than the champion.")
-    ] = False,
-    candidate: Annotated[
-        bool, Option("--candidate", help="Publish as a candidate; promote makes it champion.")
-    ] = False,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="Print what would be published; publish nothing.")
-    ] = False,
+    force: Annotated[bool, Option("--force", help="Publish even a worse model.")] = False,
+    candidate: opt.Candidate = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Publish nothing.")] = False,
     json: opt.Json = False,
 ) -> None:
     """Select from a model list and publish the winner as a model's next version, its champion.
@@ -147,14 +133,9 @@ def diagnose(
     cohort: opt.Cohort = TRAINING_DRIVES,
     signals: Annotated[
         str | None,
-        Option(
-            help="Signals to fit instead of a published model, separated by commas; 'catalogue' is "
-            "all inputs."
-        ),
+        Option(help="Signals to fit instead, separated by commas; or 'catalogue' for all."),
     ] = None,
-    features: Annotated[
-        str | None, Option(help="Feature set of --signals. Default: the logged signals.")
-    ] = None,
+    features: Annotated[str | None, Option(help="Feature set of --signals.")] = None,
     json: opt.Json = False,
 ) -> None:
     """Fit a model's signals to a cohort and examine the fit, from Gram rows.
@@ -175,8 +156,7 @@ def diagnose(
 def models(
     context: Context,
     name: Annotated[
-        str | None,
-        Argument(help="Name of a model: list its versions and the history of its aliases."),
+        str | None, Argument(help="Name of a model: list its versions and its aliases' history.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -282,13 +262,10 @@ def diff(context: Context, first: opt.Version, second: opt.Version, json: opt.Js
 def export(
     context: Context,
     to: Annotated[
-        Literal["json", "c", "sql", "dbc", "onnx", "fmu", "mlflow"],
-        Option(help="Target of the export; mlflow registers the version in the server of --uri."),
+        Literal["json", "c", "sql", "dbc", "onnx", "fmu", "mlflow"], Option(help="Target.")
     ],
     model: opt.Model = None,
-    output: Annotated[
-        Path, Option(help="Folder to write into; files of the same names are replaced.")
-    ] = Path(),
+    output: Annotated[Path, Option(help="Folder to write into; replaces files.")] = Path(),
     with_gram: Annotated[
         bool, Option("--with-gram", help="With C: also the code for Gram rows on board.")
     ] = False,

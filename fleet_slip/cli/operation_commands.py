@@ -39,9 +39,7 @@ def status(
 
 def contract(
     context: Context,
-    output: Annotated[
-        Path | None, Option(help="File to write, such as fleet.odcs.yaml. Default: stdout.")
-    ] = None,
+    output: Annotated[Path | None, Option(help="File to write. Default: stdout.")] = None,
 ) -> None:
     """Write the data contract of the views in ODCS 3.1: columns, units, ranges and keys.
 
@@ -71,8 +69,7 @@ def calibrate(
     context: Context,
     cohort: opt.Cohort = ALL_DRIVES,
     car: Annotated[
-        str | None,
-        Option(help="vehicle_id: print the parameters of this car, also as on-board constants."),
+        str | None, Option(help="vehicle_id: print its parameters, also as on-board constants.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -90,12 +87,10 @@ def monitor(
     context: Context,
     model: opt.Model = None,
     cohort: Annotated[
-        str | None,
-        Option(help="SQL predicate on the view drives. Default: the predicate of the training."),
+        str | None, Option(help="SQL predicate on the view drives. Default: the training's.")
     ] = None,
     since: Annotated[
-        str | None,
-        Option(help="First new day, YYYY-MM-DD. Default: the day after the training data."),
+        str | None, Option(help="First new day, YYYY-MM-DD. Default: the one after the training.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
@@ -111,22 +106,14 @@ def monitor(
 
 def verify(
     context: Context,
-    full: Annotated[
-        bool, Option("--full", help="Compute the Gram rows of all log files again.")
-    ] = False,
+    full: Annotated[bool, Option("--full", help="Compute all Gram rows again.")] = False,
     grams: Annotated[
-        bool,
-        Option("--grams", help="Also compute some Gram rows in several ways and compare the bits."),
+        bool, Option("--grams", help="Compute some Gram rows in several ways; compare the bits.")
     ] = False,
-    repair: Annotated[
-        bool, Option("--repair", help="Rebuild damaged Gram rows from the logs.")
-    ] = False,
+    repair: Annotated[bool, Option("--repair", help="Rebuild damaged Gram rows.")] = False,
     accept_loss: Annotated[
         list[str] | None,
-        Option(
-            help="Lost document without a backup to give up: FOLDER/NUMBER.json, or FOLDER for all "
-            "its documents. May be repeated."
-        ),
+        Option(help="Lost document to give up: FOLDER/NUMBER.json, or FOLDER. May be repeated."),
     ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -157,15 +144,9 @@ def compact(
     ] = None,
     retention_hours: Annotated[
         float | None,
-        Option(
-            min=1,
-            max=168,
-            help="Hours for which files of replaced versions are kept. Default: 168, a week.",
-        ),
+        Option(min=1, max=168, help="Age at which replaced files are removed. Default: 168 h."),
     ] = None,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="List the files to be removed; change nothing.")
-    ] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="List the files; change nothing.")] = False,
     json: opt.Json = False,
 ) -> None:
     """Merge the small log files of each day, and remove files that are out of use.
@@ -186,19 +167,12 @@ def forget(
     context: Context,
     vehicle: Annotated[str | None, Option(help="vehicle_id to erase.")] = None,
     drive: Annotated[str | None, Option(help="drive_id to erase.")] = None,
-    now: Annotated[
-        bool, Option("--now", help="Delete old files at once, instead of by compact.")
-    ] = False,
-    allow: Annotated[
-        bool, Option("--allow", help="Accept new rows of the vehicle or drive again.")
-    ] = False,
+    now: Annotated[bool, Option("--now", help="Delete old files at once.")] = False,
+    allow: Annotated[bool, Option("--allow", help="Accept its new rows again.")] = False,
     expired: Annotated[
         bool, Option("--expired", help="Erase drives older than the retention period.")
     ] = False,
-    retention: Annotated[
-        str | None,
-        Option(help="Retention file of --expired. Default: retention.toml of the configs."),
-    ] = None,
+    retention: opt.Retention = None,
     json: opt.Json = False,
 ) -> None:
     """Erase a vehicle or a drive from logs, Gram rows and quarantine; mark models it trained.

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
 def demo(
     context: Context,
-    output: Annotated[Path, Option(help="Folder to write into: data, c and report.html.")] = Path(
-        "fleet-slip-demo"
-    ),
+    output: Annotated[Path, Option(help="Folder to write into.")] = Path("fleet-slip-demo"),
     open_page: Annotated[bool, Option("--open", help="Open the report in the browser.")] = False,
 ) -> None:
     """Simulate 12 drives, train a model, export it as C, and show it on another drive.
@@ -166,23 +164,13 @@ def nightly(
     model: Annotated[str, Option(help="Name of the model.")],
     cohort: opt.Cohort = TRAINING_DRIVES,
     models: opt.ModelList = None,
-    candidate: Annotated[
-        bool, Option("--candidate", help="Publish as a candidate, even if it is not worse.")
-    ] = False,
-    retention: Annotated[
-        str | None, Option(help="Retention file. Default: retention.toml of the configs.")
-    ] = None,
-    night: Annotated[
-        str | None, Option(help="Date of the night, YYYY-MM-DD. Default: today.")
-    ] = None,
+    candidate: opt.Candidate = False,
+    retention: opt.Retention = None,
+    night: Annotated[str | None, Option(help="Date, YYYY-MM-DD. Default: today.")] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     output: Annotated[
-        Path | None,
-        Option(
-            help="Folder for the summary: NIGHT.txt and NIGHT.json. The files name drives; forget "
-            "does not change them."
-        ),
+        Path | None, Option(help="Folder for the summary, NIGHT.txt and NIGHT.json.")
     ] = None,
     json: opt.Json = False,
 ) -> None:
