@@ -8,10 +8,13 @@ jobs that have not read the new logs. Files of such jobs are deleted by them or 
 """
 
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
+from functools import partial
+from typing import TypeAlias
 
 import polars as pl
 import pyarrow as pa
@@ -49,9 +52,10 @@ from fleet_slip.operations.rewriting import (
 from fleet_slip.quality.checks import implausible_day
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.resources import Configs, cache_folder
-from fleet_slip.storage.folder import SPILL_PREFIX, StoredFile
+from fleet_slip.storage.commits import LOG
+from fleet_slip.storage.folder import StoredFile
 from fleet_slip.storage.runs import runs_under_way
-from fleet_slip.storage.table import Snapshot, Table, retrying, rows_in
+from fleet_slip.storage.table import Table, TableFile, retrying, rows_in
 from fleet_slip.warehouse.erasure_log import ALLOWED, ErasureLog, ErasureSubject
 from fleet_slip.warehouse.gram_reader import is_onboard_file
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -90,70 +94,68 @@ def quarantined_of(
     return pc.or_(of_drives, rows_of(rows, subject))
 
 
-@dataclass(frozen=True)
-class Located:
-    """A subject's `drives` by log file, and the `reduced` log files, which have plain Gram rows."""
-
-    reduced: frozenset[str]
-    drives: Mapping[str, frozenset[str]]
+DrivesByFile: TypeAlias = Mapping[str, Collection[str]]
 
 
-def locate(grams: Snapshot, subject: ErasureSubject) -> Located:
-    """Look for a subject's drives in the Gram rows."""
+def find_rows(
+    warehouse: Warehouse, subject: ErasureSubject, drives: Collection[str] = ()
+) -> dict[str, DrivesByFile]:
+    """Return a subject's drives by table and file, without tables that have none.
+
+    `drives` are names for the quarantine. Drives of `grams` are by log file. Log files with Gram
+    rows are not opened.
+    """
+    in_grams: dict[str, set[str]] = defaultdict(set)
     reduced: set[str] = set()
-    drives: dict[str, set[str]] = {}
-    columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
-    for file in grams.files:
-        rows = grams.table.read(file.path, columns)
+    for file in warehouse.grams.snapshot().files:
+        columns = ["feature_set", "file", "drive_id", "vehicle_id", "day"]
+        rows = warehouse.grams.read(file.path, columns)
         is_plain = pc.equal(rows["feature_set"], PLAIN)
         reduced.update(rows["file"].filter(is_plain).unique().to_pylist())
-        matches = rows.filter(rows_of(rows, subject))
-        for path, drive in zip(
-            matches["file"].to_pylist(), matches["drive_id"].to_pylist(), strict=True
-        ):
-            drives.setdefault(path, set()).add(drive)
-    return Located(frozenset(reduced), {path: frozenset(names) for path, names in drives.items()})
+        matches = rows.filter(rows_of(rows, subject)).select(["file", "drive_id"])
+        for path, drive in zip(*matches.to_pydict().values(), strict=True):
+            in_grams[path].add(drive)
+    in_logs = {
+        file.path: in_grams.get(file.path)
+        if file.path in reduced
+        else _drives_in(warehouse.logs, file.path, subject, day=file.day)
+        for file in warehouse.logs.snapshot().files
+    }
+    refused = {
+        file.path: _drives_in(warehouse.quarantine, file.path, subject, drives)
+        for file in warehouse.quarantine.snapshot().files
+    }
+    tables: dict[str, Mapping[str, set[str] | None]]
+    tables = {"grams": in_grams, "logs": in_logs, "quarantine": refused}
+    concerned: dict[str, DrivesByFile] = {
+        name: {path: names for path, names in files.items() if names is not None}
+        for name, files in tables.items()
+    }
+    return {name: files for name, files in concerned.items() if files}
 
 
-def drives_by_file(
-    logs: Snapshot, subject: ErasureSubject, located: Located
-) -> dict[str, frozenset[str]]:
-    """Return the drives concerned by log file, opening only files without Gram rows."""
-    by_file = {}
-    for file in logs.files:
-        drives = located.drives.get(file.path, frozenset())
-        if file.path not in located.reduced:
-            names = logs.table.read_combinations(file.path, ["drive_id", "vehicle_id"])
-            names = names.append_column("day", pa.repeat(file.day, names.num_rows))
-            drives = frozenset(names.filter(rows_of(names, subject))["drive_id"].to_pylist())
-        if drives:
-            by_file[file.path] = drives
-    return by_file
+def drives_of(tables: Mapping[str, DrivesByFile]) -> frozenset[str]:
+    """Return the drives in the answer of `find_rows`."""
+    return frozenset(
+        drive for files in tables.values() for drives in files.values() for drive in drives
+    )
 
 
-def tables_with(
-    warehouse: Warehouse,
+def _drives_in(
+    table: Table,
+    path: str,
     subject: ErasureSubject,
     drives: Collection[str] = (),
-    located: Located | None = None,
-) -> dict[str, set[str]]:
-    """Return the tables that have rows of a subject or of its drives, and the drives of these."""
-    located = located or locate(warehouse.grams.snapshot(), subject)
-    in_logs = drives_by_file(warehouse.logs.snapshot(), subject, located)
-    tables: dict[str, set[str]] = {}
-    for name, by_file in (("grams", located.drives), ("logs", in_logs)):
-        if by_file:
-            tables[name] = set().union(*by_file.values())
-    for file in warehouse.quarantine.snapshot().files:
-        refused = find_in_file(warehouse, warehouse.quarantine, file.path, subject, drives)
-        if refused is not None:
-            tables.setdefault("quarantine", set()).update(refused)
-    return tables
-
-
-def drives_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> frozenset[str]:
-    """Return a subject's drives in all tables."""
-    return frozenset().union(*tables_with(warehouse, subject, (), located).values())
+    day: date | None = None,
+) -> set[str] | None:
+    """Return a subject's drives in a file, None if no row is of the subject."""
+    rows = table.read(path, ["drive_id", "vehicle_id"])
+    if table.folder.name == "quarantine":
+        mask = quarantined_of(rows, subject, drives)
+    else:
+        mask = rows_of(rows.append_column("day", pa.repeat(day, len(rows))), subject)
+    matches = rows["drive_id"].filter(mask)
+    return set(matches.drop_null().to_pylist()) if len(matches) else None
 
 
 def remove_uncommitted(
@@ -171,27 +173,12 @@ def remove_uncommitted(
             if file.path in removals:
                 continue
             with suppress(StorageError):  # half a file, or just deleted
-                matches = find_in_file(warehouse, table, file.path, subject, drives)
+                matches = _drives_in(table, file.path, subject, drives)
                 if matches is not None:
                     drives = {*drives, *matches}
                     leftovers.append(file)
     for file in reversed(leftovers):
         file.folder.remove(file)
-
-
-def find_in_file(
-    warehouse: Warehouse,
-    table: Table,
-    path: str,
-    subject: ErasureSubject,
-    drives: Collection[str],
-) -> set[str] | None:
-    """Return a subject's drives in a file, None if no row is of the subject."""
-    rows = table.read(path, ["drive_id", "vehicle_id"])
-    is_quarantine = table is warehouse.quarantine
-    mask = quarantined_of(rows, subject, drives) if is_quarantine else rows_of(rows, subject)
-    matches = rows["drive_id"].filter(mask)
-    return set(matches.drop_null().to_pylist()) if len(matches) else None
 
 
 def find_remains(
@@ -204,70 +191,47 @@ def find_remains(
     for table in warehouse.tables if subject.kind != "before" else ():
         for file in find_unreferenced(table):
             try:
-                if find_in_file(warehouse, table, file.path, subject, drives) is not None:
+                if _drives_in(table, file.path, subject, drives) is not None:
                     yield path_below(warehouse, file)
             except StorageError:
-                if any(file == other for other in find_unreferenced(table)):  # not just deleted
+                if file in find_unreferenced(table):  # not just deleted
                     yield f"{path_below(warehouse, file)} (unreadable)"
 
 
-def half_written(warehouse: Warehouse) -> list[StoredFile]:
-    """Return the temporary files that may have rows of any drive."""
-    tables = {table.folder.name for table in warehouse.tables}
-    return [
-        file
-        for file in find_temporary_files(warehouse)
-        if file.path.startswith(SPILL_PREFIX)
-        or (file.path.split("/")[0] in tables and "_delta_log" not in file.path)
-    ]
-
-
-def digests_of(warehouse: Warehouse, subject: ErasureSubject, located: Located) -> Iterator[str]:
+def digests_of(
+    warehouse: Warehouse, subject: ErasureSubject, in_logs: DrivesByFile
+) -> Iterator[str]:
     """Yield the digests of the counts of a subject's drives: of their Gram rows, and of logs."""
-    grams = warehouse.grams.snapshot()
-    for file in grams.files:
-        names = warehouse.grams.read(file.path, ["drive_id", "vehicle_id", "day"])
-        if pc.any(selected := rows_of(names, subject)).as_py():
-            rows = read_rows(warehouse.grams, file).filter(selected)
-            on_board = pc.is_in(
-                rows["feature_set"],
-                pa.array(list(onboard_feature_sets(warehouse.catalog)), pa.string()),
-            )
-            yield from gram_digests(rows.filter(on_board))[0]
-    logs = warehouse.logs.snapshot()
-    drives = drives_by_file(logs, subject, located)
-    for file in logs.files:
-        if file.path not in drives:
+    sets = pa.array(list(onboard_feature_sets(warehouse.catalog)), pa.string())
+    for file in warehouse.grams.snapshot().files:
+        rows = read_rows(warehouse.grams, file)
+        rows = rows.filter(pc.and_(rows_of(rows, subject), pc.is_in(rows["feature_set"], sets)))
+        yield from gram_digests(rows)[0]
+    for file in warehouse.logs.snapshot().files:
+        if file.path not in in_logs:
             continue
         signals = [name for name in warehouse.catalog.signals.signals if name in file.null_counts]
         rows = warehouse.logs.read(file.path, ["drive_id", "vehicle_id", "tick", *signals])
         ids = rows["drive_id"].cast(pa.string())
-        for name in sorted(drives[file.path]):
-            rows_of_drive = rows.filter(pc.equal(ids, name)).combine_chunks()
-            [batch] = rows_of_drive.to_batches()
+        for name in sorted(in_logs[file.path]):
+            [batch] = rows.filter(pc.equal(ids, name)).combine_chunks().to_batches()
             counts = {signal: batch[signal] for signal in signals}
             car, ticks = str(batch["vehicle_id"][0]), pl.Series(batch["tick"]).to_numpy()
             yield digest_counts(car, str(file.day), ticks, counts)
 
 
 @retrying
-def erase_rows(table: Table, is_removed: Callable[[pa.Table], pa.ChunkedArray]) -> None:
-    """Commit a table without some rows."""
+def erase_rows(
+    table: Table,
+    is_removed: Callable[[pa.Table], pa.ChunkedArray],
+    is_examined: Callable[[TableFile], bool] = lambda _: True,
+) -> list[pa.Table]:
+    """Commit a table without some rows of the examined files; return these rows."""
     snapshot = table.snapshot()
-    change, removed_rows = without_rows(snapshot, snapshot.files, is_removed)
+    change, removed_rows = without_rows(snapshot, filter(is_examined, snapshot.files), is_removed)
     if removed_rows:
         snapshot.commit_or_discard(change)
-
-
-@retrying
-def erase_onboard_rows(grams: Table, subject: ErasureSubject) -> int:
-    """Commit the Gram rows without those that cars sent; return the rows that they count."""
-    snapshot = grams.snapshot()
-    files = [file for file in snapshot.files if is_onboard_file(file)]
-    change, removed_rows = without_rows(snapshot, files, lambda rows: rows_of(rows, subject))
-    if removed_rows:
-        snapshot.commit_or_discard(change)
-    return sum(pc.sum(rows["n"]).as_py() for rows in removed_rows)
+    return removed_rows
 
 
 # Erasure.
@@ -352,8 +316,8 @@ def forget(
     """
     _require_delta_logs(warehouse)
     erasure_log = ErasureLog(warehouse.root)
-    located = locate(warehouse.grams.snapshot(), subject)
-    drives = drives_of(warehouse, subject, located)
+    tables = find_rows(warehouse, subject)
+    drives = drives_of(tables)
     state = erasure_log.state(subject)
     if not drives and state is None and subject.kind != "before":
         raise QuestionError(
@@ -362,36 +326,38 @@ def forget(
         )
     models = erasure_log.models_of(subject)
     if state == ALLOWED or (drives and state != "begun"):
-        models = _begin(warehouse, erasure_log, subject, drives, located)
+        models = _begin(warehouse, erasure_log, subject, tables)
     for table in (warehouse.quarantine, warehouse.logs):
         if drives or state:
             table.fence()
-    landed = drives_of(warehouse, subject, located)
-    if not landed <= drives:  # they landed before the fence
-        drives |= landed
-        models = _begin(warehouse, erasure_log, subject, drives, located)
+    tables = find_rows(warehouse, subject)
+    if not drives_of(tables) <= drives:  # they landed before the fence
+        drives |= drives_of(tables)
+        models = _begin(warehouse, erasure_log, subject, tables)
     if drives:
         erase_rows(warehouse.quarantine, lambda rows: quarantined_of(rows, subject, drives))
-    rows, rewritten, removed = _rewrite_logs(warehouse, subject, located, progress)
+    rows, rewritten, files_removed = _rewrite_logs(warehouse, subject, progress)
     if drives or state:
         warehouse.grams.fence()
-    rows += erase_onboard_rows(warehouse.grams, subject)
+    of_subject = partial(rows_of, subject=subject)
+    onboard = erase_rows(warehouse.grams, of_subject, is_onboard_file)
+    rows += sum(pc.sum(removed["n"]).as_py() for removed in onboard)
     remove_uncommitted(warehouse, subject, drives)
     reconcile(warehouse)
     replaced = find_replaced(warehouse)
     deleted = sum(file.folder.remove(file) for file in replaced) if now else 0
     look = (drives or state) and subject.kind != "before"  # such drives may be landing
-    tables = list(tables_with(warehouse, subject, drives)) if look else []
-    if not tables and (drives or state in ("begun", ALLOWED)):
+    remaining = list(find_rows(warehouse, subject, drives)) if look else []
+    if not remaining and (drives or state in ("begun", ALLOWED)):
         erasure_log.end(subject, warehouse.grams.snapshot().version)
     pending: list[str] = []
     if drives or state:
-        pending = [*tables, *_find_pending(warehouse, subject, drives, now=now)]
+        pending = [*remaining, *_find_pending(warehouse, subject, drives, now=now)]
     return ForgetReport(
         drives=len(drives),
         rows=rows,
         files_rewritten=rewritten,
-        files_removed=removed,
+        files_removed=files_removed,
         models=tuple(models),
         old_files_deleted=deleted,
         old_files_left=0 if now else len(replaced),
@@ -413,31 +379,32 @@ def _begin(
     warehouse: Warehouse,
     erasure_log: ErasureLog,
     subject: ErasureSubject,
-    drives: Collection[str],
-    located: Located,
+    tables: Mapping[str, DrivesByFile],
 ) -> list[str]:
-    registry = Registry.open(warehouse)
+    """Record the beginning of an erasure; return the models trained on the drives."""
+    drives, registry = drives_of(tables), Registry.open(warehouse)
     examined = {name: max(registry.versions(name), default=0) for name in registry.names()}
     models = models_trained_on(warehouse, drives)
-    digests = () if subject.kind == "before" else digests_of(warehouse, subject, located)
+    by_age = subject.kind == "before"
+    digests = () if by_age else digests_of(warehouse, subject, tables.get("logs", {}))
     erasure_log.begin(subject, len(drives), models, examined, set(digests))
     return models
 
 
 @retrying
 def _rewrite_logs(
-    warehouse: Warehouse, subject: ErasureSubject, located: Located, progress: Progress
+    warehouse: Warehouse, subject: ErasureSubject, progress: Progress
 ) -> tuple[int, int, int]:
+    """Commit the logs without a subject; return the rows, and the files rewritten and removed."""
     logs = warehouse.logs.snapshot()
-    drives = drives_by_file(logs, subject, located)
+    drives = find_rows(warehouse, subject).get("logs", {})
     concerned = [file for file in logs.files if file.path in drives]
     if not concerned:
         return 0, 0, 0
     change = build_rewriting(warehouse, logs, [[file] for file in concerned], drives, progress)
     logs.commit_or_discard(replace(change, note={"job": "forget"}))
-    added = change.add
-    rows = sum(file.rows for file in concerned) - sum(map(rows_in, added))
-    return rows, len(added), len(concerned) - len(added)
+    rows = sum(file.rows for file in concerned) - sum(map(rows_in, change.add))
+    return rows, len(change.add), len(concerned) - len(change.add)
 
 
 def _find_pending(
@@ -450,14 +417,19 @@ def _find_pending(
     """
     if now:
         shutil.rmtree(cache_folder("examined"), ignore_errors=True)
-    files = half_written(warehouse)  # listed before the runs: a run that begins later has none
+    files = _half_written(warehouse)  # listed before the runs: a run that begins later has none
     runs = [f"{RUN}{run}" for run in runs_under_way(warehouse.root)] if now else []
     if now and not runs:
         for file in files:
             file.folder.remove(file)
-    temporary = [path_below(warehouse, file) for file in half_written(warehouse)]
+    temporary = [path_below(warehouse, file) for file in _half_written(warehouse)]
     remains = find_remains(warehouse, subject, drives) if now else ()
     return [*remains, *temporary, *runs]
+
+
+def _half_written(warehouse: Warehouse) -> list[StoredFile]:
+    """Return the temporary files that may have rows of any drive."""
+    return [file for file in find_temporary_files(warehouse) if f"/{LOG}/" not in file.path]
 
 
 # How long data is kept: `configs/retention.toml`, or a file of the user's own.
@@ -582,20 +554,14 @@ def marked_models(warehouse: Warehouse) -> frozenset[str]:
     for name in registry.names() if examined else ():
         for number in registry.versions(name):
             later = [ended[s] for s, numbers in examined.items() if number > numbers.get(name, 0)]
-            if later and _is_trained_before(registry, name, number, later):
-                marked.add(f"{name}@{number}")
+            if not later:
+                continue
+            with suppress(FleetSlipError):  # an unreadable version is marked
+                trained_on = registry.load(name, number).manifest.trained_on.grams_version
+                if all(end is not None and trained_on >= end for end in later):
+                    continue
+            marked.add(f"{name}@{number}")
     return frozenset(marked)
-
-
-def _is_trained_before(
-    registry: Registry, name: str, number: int, ends: Sequence[int | None]
-) -> bool:
-    """Return True if Gram rows from before the end of an erasure may have trained a version."""
-    try:
-        manifest = registry.load(name, number).manifest
-    except FleetSlipError:
-        return True
-    return any(end is None or manifest.trained_on.grams_version < end for end in ends)
 
 
 def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str]:
@@ -605,11 +571,9 @@ def models_trained_on(warehouse: Warehouse, drives: Collection[str]) -> list[str
     references: list[str] = []
     for name in registry.names():
         for number in registry.versions(name):
-            try:
+            with suppress(FleetSlipError):  # an unreadable version is marked
                 trained = registry.trained_drives(registry.load(name, number).manifest)
-                is_trained = bool(trained.among(hashes).any())
-            except FleetSlipError:
-                is_trained = True
-            if is_trained:
-                references.append(f"{name}@{number}")
+                if not trained.among(hashes).any():
+                    continue
+            references.append(f"{name}@{number}")
     return sorted(references)

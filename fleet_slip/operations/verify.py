@@ -150,8 +150,11 @@ def verify(
     bytes or files. Files that jobs remove meanwhile are looked up again.
     """
     warehouse.require()
-    look = partial(_verify, warehouse, full, steps, executor)
-    return retry_if_stale(warehouse.tables, look, lambda report: bool(report.damage))
+    return retry_if_stale(
+        warehouse.tables,
+        lambda: _verify(warehouse, full, steps, executor),
+        lambda report: bool(report.damage),
+    )
 
 
 def _verify(
@@ -159,12 +162,13 @@ def _verify(
 ) -> Verification:
     report = Verification()
     snapshots = _open_tables(warehouse, report)
-    read = {
-        table: verify_files(snapshot, report, steps(f"read {table}"), executor)
-        for table, snapshot in snapshots.items()
-    }
+    sound: dict[str, Snapshot] = {}
+    read: dict[str, dict[str, Names]] = {}
+    for table, snapshot in snapshots.items():
+        files = read[table] = verify_files(snapshot, report, steps(f"read {table}"), executor)
+        damaged = frozenset(file.path for file in snapshot.files if file.path not in files)
+        sound[table] = replace(snapshot, without=damaged)
     verify_names(warehouse, read, report, full)
-    sound = {table: _sound(snapshots[table], files) for table, files in read.items()}
     verify_rows(sound, report)
     if (grams := sound.get("grams")) and grams.files:
         stale = named_files(grams, PLAIN)[1]
@@ -189,12 +193,6 @@ def _verify(
     return report
 
 
-def _sound(snapshot: Snapshot, read: Sequence["ReadFile"]) -> Snapshot:
-    """Return a snapshot without the files that are damaged."""
-    damaged = frozenset(file.path for file in snapshot.files) - {r.file.path for r in read}
-    return replace(snapshot, without=snapshot.without | damaged)
-
-
 def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapshot]:
     snapshots = {}
     for table in warehouse.tables:
@@ -210,71 +208,59 @@ def _open_tables(warehouse: Warehouse, report: Verification) -> dict[str, Snapsh
     return snapshots
 
 
-@dataclass(frozen=True)
-class ReadFile:
-    """A data file with its problem, or with the names in its dictionaries."""
-
-    file: TableFile
-    problem: str | None
-    names: Mapping[str, frozenset[str]] = field(default_factory=dict)
+Names: TypeAlias = Mapping[str, frozenset[str]]
+"""Names in the dictionaries of a data file, by column."""
 
 
 def verify_files(
     snapshot: Snapshot, report: Verification, progress: Progress, executor: Executor | None
-) -> list[ReadFile]:
-    """Read the files of a table; return those without faults."""
+) -> dict[str, Names]:
+    """Read the files of a table; return the names in those without faults, by path."""
     table = snapshot.table
-    read: list[ReadFile] = []
+    read: dict[str, Names] = {}
     with LocalThreads(os.cpu_count() or 1) as threads:
         task, files = partial(read_whole, table), snapshot.files
         for file, result in run_tasks(executor or threads, task, files, lambda f: f.path):
-            read.append(result)
+            if isinstance(result, str):
+                problem = f"{result} (it held {file.rows:,} rows)"
+                report.note("file", f"{table.folder.name}/{file.path}", problem)
+            else:
+                read[file.path] = result
             progress(file.size_bytes, snapshot.size_bytes)
-    read.sort(key=lambda result: result.file.path)
-    for result in read:
-        if result.problem:
-            problem = f"{result.problem} (it held {result.file.rows:,} rows)"
-            report.note("file", f"{table.folder.name}/{result.file.path}", problem)
     report.files += len(snapshot.files)
     report.size_bytes += snapshot.size_bytes
     report.rows += snapshot.rows if table.folder.name == "logs" else 0
-    return [result for result in read if not result.problem]
+    return read
 
 
-def read_whole(table: Table, file: TableFile) -> ReadFile:
-    """Read every byte of a data file, and compare it with the Delta log."""
+def read_whole(table: Table, file: TableFile) -> Names | str:
+    """Compare every byte of a data file with its name and the log; return its names, or a fault."""
     path = f"{table.folder}/{file.path}"
     try:
         content = table.folder.read(file.path)
         if len(content) != file.size_bytes:
-            problem = f"has {len(content):,} bytes instead of {file.size_bytes:,}"
-            return ReadFile(file, problem)
+            return f"has {len(content):,} bytes instead of {file.size_bytes:,}"
         if checksum_of(content) != checksum_in(file.path):
-            return ReadFile(file, "its bytes do not match the checksum in its name")
+            return "its bytes do not match the checksum in its name"
         with storage_errors(path):
-            metadata = pq.read_metadata(pa.BufferReader(content))
+            rows = pq.read_metadata(pa.BufferReader(content)).num_rows
             names = read_names(pa.BufferReader(content), table.encoding.dictionary)
     except FleetSlipError as error:
-        return ReadFile(file, str(error).removeprefix(f"{path}: "))
-    return ReadFile(file, _contradiction(file, metadata), names)
-
-
-def _contradiction(file: TableFile, metadata: pq.FileMetaData) -> str | None:
-    if metadata.num_rows != file.rows:
-        return f"has {metadata.num_rows:,} rows, the Delta log says {file.rows:,}"
+        return str(error).removeprefix(f"{path}: ")
+    if rows != file.rows:
+        return f"has {rows:,} rows, the Delta log says {file.rows:,}"
     if file.day and not file.path.startswith(f"day={file.day}/"):
         return f"its folder is not that of the day in the Delta log, {file.day}"
-    return None
+    return names
 
 
 def verify_names(
-    warehouse: Warehouse, read: Mapping[str, Sequence[ReadFile]], report: Verification, full: bool
+    warehouse: Warehouse, read: Mapping[str, Mapping[str, Names]], report: Verification, full: bool
 ) -> None:
     """Find files with rows of erased cars; with `full`, also of erased drives."""
-    all_files = [file for files in read.values() for file in files]
     cars, drives = (
-        {name for file in all_files for name in file.names.get(column, ())}
-        for column in ("vehicle_id", "drive_id")
+        {name for files in read.values() for names in files.values() for name in names.get(c, ())}
+        for c in ("vehicle_id", "drive_id")
     )
     try:
         log = ErasureLog(warehouse.root)
@@ -282,10 +268,10 @@ def verify_names(
     except StorageError:  # a lost or damaged document, which is reported as such
         return
     for table, files in read.items():
-        for file in files:
-            if any(not file.names.get(c, frozenset()).isdisjoint(erased[c]) for c in erased):
+        for path, names in sorted(files.items()):
+            if any(not names.get(c, frozenset()).isdisjoint(erased[c]) for c in erased):
                 problem = "has rows of a car or drive that was forgotten; give forget again"
-                report.note("name", f"{table}/{file.file.path}", problem)
+                report.note("name", f"{table}/{path}", problem)
 
 
 def verify_rows(sound: Mapping[str, Snapshot], report: Verification) -> None:
@@ -317,24 +303,20 @@ DriveGrams = dict[tuple[str, tuple[str, ...]], Gram]
 
 
 def grams_of(rows: pa.Table) -> DriveGrams:
-    """Return rows of the table `grams` as Grams, by drive (and block) and signals."""
+    """Return rows of the table `grams` as Grams, by drive (and block) and sorted signals."""
     grams = {}
     for row in rows.select(["drive_id", "part", "signals", "n", "sums", "products"]).to_pylist():
         signals = tuple(row["signals"].split(",")) if row["signals"] else ()
         drive = row["drive_id"] if row["part"] is None else f"{row['drive_id']}, {row['part']}"
-        grams[drive, signals] = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
+        gram = Gram(signals, row["n"], tuple(row["sums"]), tuple(row["products"]))
+        ordered = tuple(sorted(signals))
+        grams[drive, ordered] = gram.restrict(ordered)
     return grams
 
 
 def differing_drives(a: DriveGrams, b: DriveGrams) -> list[str]:
     """Return the sorted drives whose Grams differ, regardless of the order of signals."""
-    a, b = _sort_signals(a), _sort_signals(b)
     return sorted({key[0] for key in a.keys() | b.keys() if a.get(key) != b.get(key)})
-
-
-def _sort_signals(grams: DriveGrams) -> DriveGrams:
-    ordered = ((drive, tuple(sorted(signals)), gram) for (drive, signals), gram in grams.items())
-    return {(drive, signals): gram.restrict(signals) for drive, signals, gram in ordered}
 
 
 def stored_grams(
@@ -611,8 +593,8 @@ def _drop_wrong(warehouse: Warehouse, damaged: Set[str], wrong: Set[str]) -> lis
     snapshot = warehouse.grams.snapshot()
     bad = []
     for file in snapshot.files:
-        if read_whole(warehouse.grams, file).problem:
-            is_bad = f"grams/{file.path}" in damaged and not is_onboard_file(file)
+        if f"grams/{file.path}" in damaged:
+            is_bad = not is_onboard_file(file)
         else:
             names = warehouse.grams.read_combinations(file.path, ["file"])["file"].to_pylist()
             is_bad = not wrong.isdisjoint(f"logs/{name}" for name in names)
