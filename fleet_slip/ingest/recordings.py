@@ -26,7 +26,6 @@ from fleet_slip.storage.table import (
     WITHDRAWN,
     AppTransaction,
     Change,
-    Snapshot,
     Table,
     retry_conflicts,
 )
@@ -269,61 +268,44 @@ class Duplicates(NamedTuple):
     drives: int = 0
 
 
-class DuplicateDetector:
-    """Finds recordings that are stored already, or twice in a batch."""
+def find_duplicates(
+    warehouse: Warehouse,
+    fingerprints_of_logs: Fingerprints,
+    replace: Replace,
+    file: Path,
+    log: MeasuredLog,
+    fingerprints: Named[str, int],
+    earlier: str | None,
+) -> Duplicates:
+    """Return the stored recordings of a file that was read.
 
-    def __init__(
-        self, warehouse: Warehouse, logs: Snapshot, mapping: str, replace: Replace
-    ) -> None:
-        """Take a snapshot of the logs, the mapping's name, and which recordings to replace."""
-        self._warehouse, self._logs = warehouse, logs
-        self._mapping, self._replace = mapping, replace
-        self._logs_have: Fingerprints | None = None
-        self._batch: dict[str, int] = {}
-        self._files: dict[str, Path] = {}
-
-    def find(
-        self, file: Path, log: MeasuredLog, fingerprints: Named[str, int], earlier: str | None
-    ) -> Duplicates:
-        """Return the stored recordings of a file that was read.
-
-        `earlier` is the digest of the stored content that its path had before. Raises
-        `RepeatedError` for a recording that is not to be replaced.
-        """
-        for source in Fingerprints(self._batch).find(fingerprints):
-            # A file with other bytes: identical files are stored once anyway.
-            raise RepeatedError(
-                f"{quote_name(file)}: same recording as {quote_name(self._files[source.digest])}. "
-                "Leave one of them out."
-            )
-        if self._logs_have is None:
-            self._logs_have = Fingerprints(self._logs.transactions)
-        sources = self._logs_have.find(fingerprints)
-        changed = earlier is not None and earlier != log.digest
-        if earlier is not None and changed:
-            sources |= {SourceRef.of_file(earlier)}
-        stored = _drives_of(self._warehouse, {source.file for source in sources})
-        replaced = _replaced(stored, sources, log.name)
-        drives = [drive for drive in stored if is_from(drive, replaced)]
-        is_replaced = self._replace == "all" or (
-            self._replace == "corrected"
-            and not changed
-            and replaced <= {source for source in sources if not source.drive}
-            and {re.sub(MEASURED, "", drive) for drive in drives} <= {self._mapping}
+    `earlier` is the digest of the stored content that its path had before. Raises `RepeatedError`
+    for a recording that is not to be replaced.
+    """
+    sources = fingerprints_of_logs.find(fingerprints)
+    changed = earlier is not None and earlier != log.digest
+    if earlier is not None and changed:
+        sources |= {SourceRef.of_file(earlier)}
+    stored = _drives_of(warehouse, {source.file for source in sources})
+    replaced = _replaced(stored, sources, log.name)
+    drives = [drive for drive in stored if is_from(drive, replaced)]
+    is_replaced = replace == "all" or (
+        replace == "corrected"
+        and not changed
+        and replaced <= {source for source in sources if not source.drive}
+        and {re.sub(MEASURED, "", drive) for drive in drives} <= {log.mapping.name}
+    )
+    if drives and not is_replaced:
+        problem = "this recording is in the logs already"
+        problem = "it has changed since it was ingested" if changed else problem
+        source_file, more = quote_name(stored[drives[0]]), pluralize(len(drives), "drive")
+        count = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
+        raise RepeatedError(
+            f"{quote_name(file)}: {problem} and would count twice: {count} from {source_file}. "
+            "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
+            f"{drives[0]}"
         )
-        if drives and not is_replaced:
-            problem = "this recording is in the logs already"
-            problem = "it has changed since it was ingested" if changed else problem
-            source_file, more = quote_name(stored[drives[0]]), pluralize(len(drives), "drive")
-            count = drives[0] if len(drives) == 1 else f"{more}, {drives[0]} …"
-            raise RepeatedError(
-                f"{quote_name(file)}: {problem} and would count twice: {count} from {source_file}. "
-                "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
-                f"{drives[0]}"
-            )
-        self._batch.update(fingerprints)
-        self._files[SourceRef.of_file(log.digest).digest] = file
-        return Duplicates(sources, replaced if drives else frozenset(), len(drives))
+    return Duplicates(sources, replaced if drives else frozenset(), len(drives))
 
 
 def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:

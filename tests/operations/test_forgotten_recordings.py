@@ -14,7 +14,7 @@ import pytest
 
 from fleet_slip.grams.update import update_grams
 from fleet_slip.ingest import logs
-from fleet_slip.ingest.logs import BatchCommit, ingest_files
+from fleet_slip.ingest.logs import ingest_files
 from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.recordings import drop_erased_drives, drop_erased_rejects
@@ -125,13 +125,13 @@ def test_a_recording_that_is_forgotten_while_it_lands_again_does_not(
     ingest_file(warehouse, write(tmp_path, recording()), a_mapping())
     (file,) = warehouse.logs.snapshot().files
     (name,) = warehouse.logs.read_names(file.path)["drive_id"]
-    commit = BatchCommit.run
+    commit = logs.commit_batch
 
-    def overtaken(batch: BatchCommit) -> frozenset[str]:
+    def overtaken(*batch: Any) -> Any:
         forget(warehouse, ErasureSubject("drive", name), now=True)
-        return commit(batch)
+        return commit(*batch)
 
-    monkeypatch.setattr(BatchCommit, "run", overtaken)
+    monkeypatch.setattr(logs, "commit_batch", overtaken)
     again, other = write(tmp_path, recording()), a_mapping(name="other")
     (report,) = logs.ingest_files(warehouse, [again], other, replace="all")
     assert report.drives_forgotten == 1
