@@ -213,9 +213,7 @@ def run(options: argparse.Namespace, folder: Path, url: str) -> int:
     findings += [title for title in counts if title.endswith((": died", "exit 1"))]
     findings += forked(lambda: settle(soak)).result
     print("\n".join(findings))
-    print(
-        f"{counts.total()} commands and reads in {options.minutes} min, {len(findings)} findings"
-    )
+    print(f"{counts.total()} commands and reads in {options.minutes} min, {len(findings)} findings")
     return bool(findings)
 
 

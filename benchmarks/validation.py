@@ -137,7 +137,8 @@ def step_steer(
     speed_mps: float = STEP_SPEED_MPS,
 ) -> Step:
     """Turn the steering wheel at 500 °/s so far that the car settles at a lateral acceleration."""
-    angle = car.steering.ratio * LinearBicycle.of(car, speed_mps, compliance(flaws)).wheelbase_m
+    bicycle = LinearBicycle.from_car(car, speed_mps, compliance(flaws))
+    angle = car.steering.ratio * bicycle.wheelbase_m
     angle = angle * ay_mps2 / speed_mps**2 + flaws.steering_lash_deg * np.pi / 360
     for _ in range(6):  # to the angle that gives the acceleration
         response = _turned_to(car, flaws, float(angle), speed_mps)
@@ -225,7 +226,7 @@ HEADER = (
 def row(name: str, car: VehicleParameters, flaws: CarImperfections) -> tuple[str, ...]:
     """Return what is measured of one car, as text."""
     circle, step = constant_radius(car, flaws), step_steer(car, flaws)
-    linear = LinearBicycle.of(car, STEP_SPEED_MPS, compliance(flaws))
+    linear = LinearBicycle.from_car(car, STEP_SPEED_MPS, compliance(flaws))
     expected = handling(car, compliance(flaws))
     understeer = np.radians(circle.understeer_deg_per_g) / GRAVITY_MPS2
     return (

@@ -1,4 +1,4 @@
-"""What every test gets: a warehouse, the command line as a user runs it, and the same examples."""
+"""Fixtures of all tests: a warehouse, the command line as a user runs it, and the same examples."""
 
 import gc
 import os
@@ -68,15 +68,15 @@ def why_left_out(item: pytest.Item) -> list[str]:
 
 
 def tries_examples(item: pytest.Item) -> bool:
-    """Whether a test is one of hypothesis, of which `make test` tries a part."""
+    """Return True for tests of hypothesis, of which `make test` tries a part."""
     return is_hypothesis_test(getattr(item, "obj", None))
 
 
 def try_fewer(test: Any) -> None:
     """Let a test of hypothesis try one example of `QUICK`, but five if it has them."""
-    asked = test._hypothesis_internal_use_settings  # its own pytest plugin asks so, too
-    fewer = max(asked.max_examples // QUICK, min(asked.max_examples, 5))
-    test._hypothesis_internal_use_settings = settings(asked, max_examples=fewer)
+    settings_ = test._hypothesis_internal_use_settings  # its own pytest plugin asks so, too
+    fewer = max(settings_.max_examples // QUICK, min(settings_.max_examples, 5))
+    test._hypothesis_internal_use_settings = settings(settings_, max_examples=fewer)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -93,16 +93,16 @@ def pytest_collection() -> Generator[None, object, object]:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     with_tools = config.getoption("--tools")
-    left = [item for item in items if bool(why_left_out(item)) != with_tools]
+    deselected = [item for item in items if bool(why_left_out(item)) != with_tools]
     if with_tools:
-        left = [item for item in left if not tries_examples(item)]
+        deselected = [item for item in deselected if not tries_examples(item)]
     elif settings.get_current_profile_name() == "fixed":
         for test in {item.obj for item in items if tries_examples(item)}:  # type: ignore[attr-defined]
             try_fewer(test)
-    out = set(left)
+    out = set(deselected)
     items[:] = [item for item in items if item not in out]
-    config.hook.pytest_deselected(items=left)
-    names = [name for item in left for name in why_left_out(item)]
+    config.hook.pytest_deselected(items=deselected)
+    names = [name for item in deselected for name in why_left_out(item)]
     config.stash[LEFT_OUT] = {name: names.count(name) for name in sorted(set(names))}
 
 

@@ -1,4 +1,4 @@
-"""What `base` and `rendering` promise: canonical JSON, dates, and results as JSON documents."""
+"""`base` and `rendering`: canonical JSON, dates, and results as JSON documents."""
 
 import json
 import math
@@ -47,7 +47,7 @@ class Outer(Record):
 
 @dataclass(frozen=True)
 class Plain(Record):
-    one: Outer | None = None
+    outer: Outer | None = None
 
 
 def test_a_class_names_what_its_document_has() -> None:
@@ -63,8 +63,8 @@ def test_a_class_names_what_its_document_has() -> None:
 
 
 def test_without_words_all_fields_are_there() -> None:
-    assert Plain().as_dict() == {"one": None}
-    assert document_of([Plain(Outer("a", Inner(3)))])[0]["one"]["label"] == "a"
+    assert Plain().as_dict() == {"outer": None}
+    assert document_of([Plain(Outer("a", Inner(3)))])[0]["outer"]["label"] == "a"
 
 
 CONTENT = st.recursive(
@@ -107,10 +107,10 @@ def test_numbers_that_json_has_not_are_refused(number: float) -> None:
 DAY = date(2024, 5, 6)
 
 
-@pytest.mark.parametrize("given", [DAY, "2024-05-06", datetime(2024, 5, 6, 23, 59)])
-def test_a_day_is_a_date_a_text_or_the_day_of_a_time(given: date | str) -> None:
-    assert date_of(given, "since") == DAY
-    assert type(date_of(given, "since")) is date
+@pytest.mark.parametrize("day", [DAY, "2024-05-06", datetime(2024, 5, 6, 23, 59)])
+def test_a_day_is_a_date_a_text_or_the_day_of_a_time(day: date | str) -> None:
+    assert date_of(day, "since") == DAY
+    assert type(date_of(day, "since")) is date
 
 
 def test_none_is_no_day_and_today_may_be_a_last_day() -> None:
@@ -118,7 +118,7 @@ def test_none_is_no_day_and_today_may_be_a_last_day() -> None:
     assert last_day("today") == date.today()
 
 
-def test_what_is_no_date_is_told_with_an_example() -> None:
+def test_an_invalid_date_is_refused_with_an_example() -> None:
     with pytest.raises(UsageError, match=r"since 6 May: not a date; write it as 2024-05-01\."):
         date_of("6 May", "since")
     with pytest.raises(UsageError, match="write it as 2024-05-01, or today"):
@@ -140,7 +140,7 @@ class Example(Config):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "fault"),
     [
         ("", "name: is missing"),
         ("name = 3", "name: must be a valid string"),
@@ -153,10 +153,10 @@ class Example(Config):
         ("name = 'x'\nwords = [1]", "words.0: must be a valid string"),
     ],
 )
-def test_a_fault_names_the_key_and_what_it_must_be(text: str, told: str, tmp_path: Path) -> None:
+def test_a_fault_names_the_key_and_what_it_must_be(text: str, fault: str, tmp_path: Path) -> None:
     file = tmp_path / "example.toml"
     file.write_text(text)
     with pytest.raises(ConfigError) as caught:
         load_config(file, Example)
-    assert told in str(caught.value)
+    assert fault in str(caught.value)
     assert "Input" not in str(caught.value)

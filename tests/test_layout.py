@@ -16,4 +16,4 @@ def test_no_two_public_classes_have_one_name() -> None:
         for node in ast.parse(text).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places[node.name].append(path.relative_to(PACKAGE))
-    assert not {name: found for name, found in places.items() if len(found) > 1}
+    assert not {name: modules for name, modules in places.items() if len(modules) > 1}

@@ -21,14 +21,14 @@ from tests.support.measured import MAPPING_TEXT, csv_text, good_columns
 pytestmark = pytest.mark.long
 
 UNTIL_ALL_HAD_ONE = 1000
-"""So many tasks that every worker gets one, however late it comes and busy the machine is."""
+"""Enough tasks that every worker gets one, even a late one on a busy machine."""
 
 
 @pytest.fixture(scope="module")
 def dask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskProcesses]:
-    with dask_processes(tmp_path_factory.mktemp("dask"), workers=2) as found:
-        found.wait_for_workers(2)
-        yield found
+    with dask_processes(tmp_path_factory.mktemp("dask"), workers=2) as address:
+        address.wait_for_workers(2)
+        yield address
 
 
 def stored(root: Path) -> dict[str, bytes]:
@@ -55,9 +55,9 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
         rows["ax"][3] = "broken"
         (tmp_path / f"{n}.csv").write_text(csv_text(rows))
     ingest = ["ingest", "0.csv", "1.csv", "2.csv", "--mapping", "test.toml", "--json"]
-    local, there = tmp_path / "local", tmp_path / "there"
+    local, remote = tmp_path / "local", tmp_path / "there"
     cluster = ["--cluster", dask.address]
-    for root, options in ((local, []), (there, cluster)):
+    for root, options in ((local, []), (remote, cluster)):
         windows = ["gram", "--features", "windows"]
         for command in (ingest, windows, ["run", "--campaign", "smoke"]):
             done = run_command(*command, *options, root=root)
@@ -65,40 +65,40 @@ def test_every_command_gives_the_same_bits_as_on_one_machine(
             assert "distributed" not in done.stderr
             if command is ingest:
                 assert [(r["new"], r["rows_quarantined"]) for r in done.json] == [(True, 1)] * 3
-    assert stored(there) == stored(local)
+    assert stored(remote) == stored(local)
 
     by_variable = {"env": os.environ | {"DASK_SCHEDULER_ADDRESS": dask.address}}
-    again = run_command("run", "--campaign", "smoke", root=there, **by_variable)
+    again = run_command("run", "--campaign", "smoke", root=remote, **by_variable)
     assert "nothing to do" in again.stderr
-    verified = run_command("verify", "--full", "--json", *cluster, root=there)
+    verified = run_command("verify", "--full", "--json", *cluster, root=remote)
     assert verified.exit_code == 0, verified.stderr
     assert verified.json == run_command("verify", "--full", "--json", root=local).json
     assert (verified.json["damage"], verified.json["remarks"]) == ([], [])
 
-    damaged = min((there / "logs").rglob("*.parquet"))
+    damaged = min((remote / "logs").rglob("*.parquet"))
     damaged.write_bytes(damaged.read_bytes()[:-1] + b"?")
-    found = run_command("verify", *cluster, root=there)
-    assert found.exit_code == 9
-    assert damaged.name in found.stdout + found.stderr
+    verification = run_command("verify", *cluster, root=remote)
+    assert verification.exit_code == 9
+    assert damaged.name in verification.stdout + verification.stderr
 
 
 def test_a_killed_command_is_finished_by_the_next(
     dask: DaskProcesses, run_command: RunCommand, tmp_path: Path
 ) -> None:
-    local, there = tmp_path / "local", tmp_path / "there"
+    local, remote = tmp_path / "local", tmp_path / "there"
     assert run_command("simulate", "smoke", root=local).exit_code == 0
     command = ["simulate", "smoke", "--cluster", dask.address]
-    killed = start_on(there, *command)
-    until(lambda: list(there.glob("logs/_delta_log/*.json")) or killed.poll() is not None)
+    killed = start_on(remote, *command)
+    until(lambda: list(remote.glob("logs/_delta_log/*.json")) or killed.poll() is not None)
     killed.kill()
     finish(killed)
-    assert run_command(*command, root=there).exit_code == 0
-    # What the killed one wrote and did not commit lies beside it until `vacuum`.
-    assert {checksum_in(name) for name in stored(there)} == {
+    assert run_command(*command, root=remote).exit_code == 0
+    # Files that the killed command wrote and did not commit remain until `compact`.
+    assert {checksum_in(name) for name in stored(remote)} == {
         checksum_in(name) for name in stored(local)
     }
     rows = ["sql", "--json", "SELECT * FROM log_counts ORDER BY drive_id, tick"]
-    assert run_command(*rows, root=there).json == run_command(*rows, root=local).json
+    assert run_command(*rows, root=remote).json == run_command(*rows, root=local).json
 
 
 def test_a_worker_of_other_versions_is_refused(dask: DaskProcesses, tmp_path: Path) -> None:

@@ -24,8 +24,8 @@ pytestmark = pytest.mark.long
 def dask(tmp_path: Path) -> Iterator[DaskProcesses]:
     """A scheduler and two workers; a task that kills its worker once is given up."""
     settings = {"scheduler__allowed_failures": "0", "comm__timeouts__connect": "20s"}
-    with dask_processes(tmp_path, workers=2, **settings) as found:
-        yield found
+    with dask_processes(tmp_path, workers=2, **settings) as address:
+        yield address
 
 
 def orders(folder: Path, number: int, seconds: float = 0.0, deadly: str = "") -> list[Order]:

@@ -49,8 +49,8 @@ class Block:
     @property
     def title(self) -> str | None:
         """The name of the file that it stands for."""
-        found = _TITLE.fullmatch(self.options)
-        return found["title"] if found else None
+        match = _TITLE.fullmatch(self.options)
+        return match["title"] if match else None
 
     @property
     def fault(self) -> str | None:
@@ -66,17 +66,17 @@ class Block:
 
 def blocks(page: Path) -> list[Block]:
     """Return the code blocks of a page, in order."""
-    found, names, marked = [], dict[str, Any](), False
+    result, names, marked = [], dict[str, Any](), False
     for token in MarkdownIt("commonmark").parse(page.read_text(encoding="utf-8")):
         if token.type == "fence" and token.map:
             language, _, options = token.info.partition(" ")
             line, options = token.map[0] + 1, options.strip()
-            found.append(Block(page, line, language, options, token.content, marked, names))
+            result.append(Block(page, line, language, options, token.content, marked, names))
         marked = token.type == "html_block" and bool(_MARK.fullmatch(token.content))
-    return found
+    return result
 
 
-def run(block: Block, known: dict[str, str]) -> None:
+def run(block: Block, variables: dict[str, str]) -> None:
     """Run a block in the working directory.
 
     `known` are the outputs of commands that were run before the page was opened.
@@ -96,14 +96,14 @@ def run(block: Block, known: dict[str, str]) -> None:
         printed_by_bash(block.source)
     else:
         for command, expected in _commands(block.source):
-            printed = known[command] if command in known else printed_by(command)
+            printed = variables[command] if command in variables else printed_by(command)
             assert matches(printed, expected), f"{command}\nprinted\n{printed}\nnot\n{expected}"
 
 
 def _commands(session: str) -> Iterator[tuple[str, str]]:
-    first, *others = re.split(r"^\$ ", session, flags=re.M)
+    first, *remaining = re.split(r"^\$ ", session, flags=re.M)
     assert not first.strip(), f"a console block begins with a command, not with {first!r}"
-    for command in others:
+    for command in remaining:
         typed, _, printed = command.partition("\n")
         yield typed.strip(), printed
 

@@ -1,4 +1,4 @@
-"""What README and pages tell the reader to type is run, on the data that `make run` makes."""
+"""Commands of README and pages run on the data of `make run`."""
 
 import os
 import shutil
@@ -14,12 +14,12 @@ pytestmark = pytest.mark.long
 
 HERE = Path(__file__).resolve().parents[2]
 PAGES = [HERE / "README.md", HERE / "CONTRIBUTING.md", *sorted((HERE / "docs").rglob("*.md"))]
-CODE = {str(page.relative_to(HERE)): found for page in PAGES if (found := blocks(page))}
+CODE = {str(page.relative_to(HERE)): page_blocks for page in PAGES if (page_blocks := blocks(page))}
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `make run` makes, `data`, and prints, `printed`."""
+def fleet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data root of `make run`, `data`, and its output, `printed`."""
     return made_once(tmp_path_factory, "make_run", make_run)
 
 
@@ -41,13 +41,13 @@ def as_typed(patch: pytest.MonkeyPatch, folder: Path) -> None:
 
 @pytest.mark.parametrize("page", CODE)
 def test_the_code_of_a_page_runs(
-    page: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: str, fleet_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Nothing changes a file of a table in place, so that 30 MB need not be copied for each page.
-    shutil.copytree(made / "data", tmp_path / "data", copy_function=link_tables)
+    shutil.copytree(fleet_run / "data", tmp_path / "data", copy_function=link_tables)
     as_typed(monkeypatch, tmp_path)
     for block in CODE[page]:
-        run(block, {"make run": (made / "printed").read_text(encoding="utf-8")})
+        run(block, {"make run": (fleet_run / "printed").read_text(encoding="utf-8")})
 
 
 def link_tables(file: str, copy: str) -> None:
@@ -78,7 +78,7 @@ def test_a_block_of_another_kind_is_noticed(text: str, fault: str, tmp_path: Pat
     assert fault in (blocks(page)[0].fault or "")
 
 
-def test_what_fails_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_example_is_detected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     as_typed(monkeypatch, tmp_path)
     page = tmp_path / "page.md"
     page.write_text(

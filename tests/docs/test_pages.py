@@ -1,4 +1,4 @@
-"""What the pages say of the repository holds, and leads somewhere."""
+"""Pages describe the repository correctly, and their links have targets."""
 
 import inspect
 import pkgutil
@@ -90,13 +90,13 @@ def test_the_diagram_names_commands_and_folders_that_exist() -> None:
 
 def test_folder_and_section_agree_in_both_directions() -> None:
     page = DOCS / "architecture.md"
-    there = {
+    sections = {
         name
         for _, cell, _ in rows_of(page, "section of the paper")
         for name in re.findall("`(.+?)`", cell)
     }
     back = {cells[0].strip("`") for cells in rows_of(page, "folder") if cells[2]}
-    assert there == back
+    assert sections == back
 
 
 def pages_in(nav: list[Any]) -> list[str]:
@@ -120,15 +120,15 @@ def test_the_reference_has_what_is_public_and_no_more() -> None:
     assert list((DOCS / "api").iterdir()) == [DOCS / "api/index.md"]
     calls: list[Any] = [
         call.fget if isinstance(call, property) else call
-        for of in (Fleet, FleetCohort, FleetModels, FleetEvaluation, FleetMaintenance)
-        for name, call in inspect.getmembers(of)
+        for owner in (Fleet, FleetCohort, FleetModels, FleetEvaluation, FleetMaintenance)
+        for name, call in inspect.getmembers(owner)
         if not name.startswith("_") and (callable(call) or isinstance(call, property))
     ]
-    told = " ".join(str(inspect.signature(call).return_annotation) for call in calls)
-    public = set(re.findall(r"[A-Z]\w+", told)) - set(fleet_slip.__all__)
-    own = public - {"Any", "DuckDBPyRelation", "None", "Path", "Table"}
+    annotations = " ".join(str(inspect.signature(call).return_annotation) for call in calls)
+    public = set(re.findall(r"[A-Z]\w+", annotations)) - set(fleet_slip.__all__)
+    package_names = public - {"Any", "DuckDBPyRelation", "None", "Path", "Table"}
     assert shown[:2] == ["fleet_slip", "fleet_slip.errors"]
-    assert {name.rpartition(".")[2] for name in shown[2:]} == own
+    assert {name.rpartition(".")[2] for name in shown[2:]} == package_names
     for name in shown[2:]:
         assert pkgutil.resolve_name(name).__module__ == name.rpartition(".")[0]
 
@@ -136,13 +136,13 @@ def test_the_reference_has_what_is_public_and_no_more() -> None:
 def targets(page: Path) -> list[str]:
     """Return what a page links to and the pictures that it shows, without other sites."""
     inline = MarkdownIt("commonmark").enable("table").parse(page.read_text())
-    found = [
+    links = [
         str(child.attrs.get("href") or child.attrs.get("src"))
         for token in inline
         for child in token.children or []
         if child.type in ("link_open", "image")
     ]
-    return [target for target in found if "://" not in target]
+    return [target for target in links if "://" not in target]
 
 
 @pytest.mark.parametrize("page", AT_THE_TOP, ids=lambda page: page.name)
@@ -166,7 +166,7 @@ def test_pages_link_to_nothing_that_the_site_lacks() -> None:
 def test_no_row_of_a_table_stands_apart(page: Path) -> None:
     """After a blank line it would be text with bars."""
     blocks = MarkdownIt("commonmark").enable("table").parse(page.read_text())
-    assert [one.content for one in blocks if one.content.startswith("| ")] == []
+    assert [block.content for block in blocks if block.content.startswith("| ")] == []
 
 
 def test_the_readme_is_short() -> None:
@@ -189,7 +189,7 @@ VERSION = re.compile(r"(\d+\.\d+\.\d+) - \d{4}-\d{2}-\d{2}")
 
 
 def released() -> list[str]:
-    return [found[1] for heading in HEADINGS if (found := VERSION.fullmatch(heading))]
+    return [match[1] for heading in HEADINGS if (match := VERSION.fullmatch(heading))]
 
 
 def parts(version: str) -> tuple[int, ...]:
@@ -198,12 +198,16 @@ def parts(version: str) -> tuple[int, ...]:
 
 def test_the_changelog_goes_by_version_the_newest_first() -> None:
     assert HEADINGS
-    assert [one for one in HEADINGS if one != "Unreleased" and not VERSION.fullmatch(one)] == []
+    assert [
+        heading
+        for heading in HEADINGS
+        if heading != "Unreleased" and not VERSION.fullmatch(heading)
+    ] == []
     assert "Unreleased" not in HEADINGS[1:]
     assert released() == sorted(set(released()), key=parts, reverse=True)
 
 
 def test_the_program_is_not_older_than_its_changelog_says() -> None:
     version = tomllib.loads((HERE / "pyproject.toml").read_text())["project"]["version"]
-    assert all(parts(version) >= parts(one) for one in released())
+    assert all(parts(version) >= parts(release) for release in released())
     assert HEADINGS[0] == "Unreleased" or version == released()[0]

@@ -49,7 +49,7 @@ def cache(compiled: Path, tmp_path: Path) -> Path:
     return shutil.copytree(compiled, tmp_path / "cache")
 
 
-def kept(cache: Path, suffix: str) -> Path:
+def stored_code(cache: Path, suffix: str) -> Path:
     (file,) = cache.glob(f"{compiling.PREFIX}*/*/*{suffix}")
     return file
 
@@ -65,7 +65,7 @@ def test_damaged_code_is_deleted(
     cache: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, damage: str
 ) -> None:
     """A power cut leaves files empty or torn: numba renames them without flushing."""
-    file = kept(cache, suffix)
+    file = stored_code(cache, suffix)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content if damage == "flipped" else b"")
@@ -77,13 +77,13 @@ def found_by(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path | None:
     """Return which folder a process is given that asks for it now."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     monkeypatch.setattr("fleet_slip.compiling.atexit.register", lambda *_: None)
-    (own,) = cache.glob(f"{compiling.PREFIX}*")
-    return compiling.code_folder.__wrapped__(own.name.removeprefix(compiling.PREFIX))
+    (user_folder,) = cache.glob(f"{compiling.PREFIX}*")
+    return compiling.code_folder.__wrapped__(user_folder.name.removeprefix(compiling.PREFIX))
 
 
 def run_if_unpickled(cache: Path, mark: Path) -> None:
     """Plant what makes a file when numba reads the code, and its checksum."""
-    file = kept(cache, ".nbi")
+    file = stored_code(cache, ".nbi")
     file.write_bytes(f"cos\nsystem\n(S'touch {mark}'\ntR.".encode())
     folder = file.parents[1]
     sums = json.dumps(compiling._checksums(folder))
@@ -108,10 +108,10 @@ def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(compiling.LOGGER, "propagate", True)
-    (own,) = cache.iterdir()
-    assert found_by(cache, monkeypatch) == own
+    (user_folder,) = cache.iterdir()
+    assert found_by(cache, monkeypatch) == user_folder
     cache.chmod(0o1777)  # as /tmp is: nobody else can rename what is in it
-    assert found_by(cache, monkeypatch) == own
+    assert found_by(cache, monkeypatch) == user_folder
     assert not caplog.messages
     cache.chmod(0o777)
     assert found_by(cache, monkeypatch) is None
@@ -122,7 +122,7 @@ def test_a_folder_is_refused_that_others_can_write_or_put_another_in_its_place(
     assert found_by(tmp_path / "link", monkeypatch) is None
     assert f"can write {tmp_path}" in caplog.text
     tmp_path.chmod(0o700)
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(kept(cache, ".nbi")))  # no folder
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(stored_code(cache, ".nbi")))  # no folder
     assert compiling.code_folder.__wrapped__("0") is None
 
 
@@ -148,8 +148,8 @@ def test_a_change_of_what_a_kernel_imports_or_of_the_compiler_takes_another_fold
 
     before = digest()
     assert digest(beside="changed") == digest() == before
-    others = {digest(**{name: f"{sources[name]}# changed"}) for name in [*sources][:3]}
-    assert len(others | {before}) == 4
+    digests = {digest(**{name: f"{sources[name]}# changed"}) for name in [*sources][:3]}
+    assert len(digests | {before}) == 4
     monkeypatch.setattr("numba.__version__", "another")
-    assert digest() not in others | {before}
+    assert digest() not in digests | {before}
     compiling._imported.cache_clear()

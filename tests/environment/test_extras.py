@@ -52,14 +52,14 @@ def of_extras(*extras: str) -> list[str]:
     return sorted({MODULES.get(name, name) for name in names})
 
 
-def given(absent: list[str], *commands: list[str]) -> tuple[list[int], str]:
+def run_without(absent: list[str], *commands: list[str]) -> tuple[list[int], str]:
     """Give commands in a process in which some modules are missing.
 
     Returns their exit codes, and what they said.
     """
     words = [sys.executable, "-c", PROGRAM, json.dumps(absent), json.dumps(commands)]
-    *said, codes = run(words).stderr.splitlines()
-    return json.loads(codes), "\n".join(said)
+    *messages, codes = run(words).stderr.splitlines()
+    return json.loads(codes), "\n".join(messages)
 
 
 @pytest.fixture
@@ -70,29 +70,30 @@ def root(smoke_root: Path, tmp_path: Path) -> Path:
 
 
 def test_querying_and_selecting_need_the_core_alone(root: Path, tmp_path: Path) -> None:
-    own = str(tmp_path / "own.toml")
+    list_path = str(tmp_path / "own.toml")
     at = ["--root", str(root)]
-    asked = [
+    commands = [
         [*at, "sql", "SELECT count(*) FROM log"],
         [*at, "gram"],
         [*at, "select", "--models", "table1"],
-        [*at, "select", "--order", "ay,yaw_rate,ax", "--save", own],
-        [*at, "publish", "core", "--models", own],
+        [*at, "select", "--order", "ay,yaw_rate,ax", "--save", list_path],
+        [*at, "publish", "core", "--models", list_path],
         [*at, "show", "core"],
         [*at, "score", "core"],
         [*at, "quality"],
         [*at, "verify"],
         [*at, "status"],
     ]
-    codes, said = given(of_extras(), *asked)
-    assert codes == [0] * len(asked), said
+    codes, messages = run_without(of_extras(), *commands)
+    assert codes == [0] * len(commands), messages
 
 
-def test_what_needs_more_says_which_extra() -> None:
-    codes, said = given(of_extras("objects"), ["--root", "s3://bucket/data", "status"])
-    assert codes == [13], said
+def test_a_missing_extra_is_named() -> None:
+    codes, messages = run_without(of_extras("objects"), ["--root", "s3://bucket/data", "status"])
+    assert codes == [13], messages
     assert (
-        'which is not installed. Run: pip install "fleet-slip[objects]", or start by: uvx' in said
+        'which is not installed. Run: pip install "fleet-slip[objects]", or start by: uvx'
+        in messages
     )
 
 

@@ -28,7 +28,7 @@ ENOUGH_DATA_KIB = resources.data_needed() // 2**10
         f"-d {ENOUGH_DATA_KIB + 150_000}",  # what Arrow would take for itself, and too little more
     ],
 )
-def test_what_is_said_to_be_enough_is_enough(tmp_path: Path, limit: str) -> None:
+def test_the_documented_limits_are_sufficient(tmp_path: Path, limit: str) -> None:
     root = tmp_path / "data"
     done = run(
         ["bash", "-c", f"ulimit {limit} && {COMMAND} --root {root} run --campaign smoke --days 1"]
@@ -58,7 +58,7 @@ def test_a_limit_under_which_libraries_abort_is_refused(tmp_path: Path, limit: s
 def test_the_limit_of_a_control_group_is_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, membership: str, file: str
 ) -> None:
-    """Of systemd's MemoryMax= and of a container."""
+    """The limit comes from systemd's MemoryMax= or from a container."""
     (tmp_path / "cgroup").write_text(membership + "\n")
     (tmp_path / "fs" / file).parent.mkdir(parents=True)
     (tmp_path / "fs" / file).write_text("123456789\n")
@@ -69,18 +69,18 @@ def test_the_limit_of_a_control_group_is_found(
 
 
 @pytest.mark.parametrize(
-    ("address_space", "data", "left"),
+    ("address_space", "data", "remaining"),
     [
         (resources.LIBRARIES_BYTES + 10**9, resource.RLIM_INFINITY, 10**9),
         (resource.RLIM_INFINITY, 2 * 10**9, 2 * 10**9 - resources.DATA_BYTES // 2),
     ],
 )
 def test_data_gets_what_the_libraries_leave(
-    monkeypatch: pytest.MonkeyPatch, address_space: int, data: int, left: int
+    monkeypatch: pytest.MonkeyPatch, address_space: int, data: int, remaining: int
 ) -> None:
     hard = {resource.RLIMIT_AS: address_space, resource.RLIMIT_DATA: data}
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (hard[kind], hard[kind]))
-    assert resources.memory_bytes() == left
+    assert resources.memory_bytes() == remaining
 
 
 FULL = Path("/dev/full")

@@ -37,16 +37,16 @@ def environment(landing: Landing, place: Path) -> dict[str, str]:
 
 @pytest.mark.tools("airflow")
 def test_airflow_runs_the_night_and_then_tells_the_health(landing: Landing, tmp_path: Path) -> None:
-    given = environment(landing, tmp_path)
+    variables = environment(landing, tmp_path)
     program = shutil.which("airflow")
     assert program
     python = Path(program).resolve().with_name("python")
     dags = tmp_path / "airflow" / "dags"
     dags.mkdir(parents=True)
     shutil.copy(SCHEDULE / "airflow_nightly.py", dags)
-    made = run([program, "db", "migrate"], env=given)
-    assert made.exit_code == 0, made.stderr
-    done = run([str(python), str(dags / "airflow_nightly.py")], env=given)
+    migration = run([program, "db", "migrate"], env=variables)
+    assert migration.exit_code == 0, migration.stderr
+    done = run([str(python), str(dags / "airflow_nightly.py")], env=variables)
     assert done.exit_code == 0, done.stdout + done.stderr
     assert "state=success" in done.stdout + done.stderr
     assert fleet_slip.open(tmp_path / "data").models.get("fleet").reference == "fleet@1"
@@ -76,6 +76,6 @@ def test_dagster_makes_the_champion_an_asset(landing: Landing, tmp_path: Path) -
 def test_dagster_fails_at_once_where_the_night_fails(landing: Landing, tmp_path: Path) -> None:
     done = materialize(landing, tmp_path, str(tmp_path / "no-such-mapping.toml"))
     assert done.exit_code != 0
-    told = done.stderr + done.stdout
-    assert "exit code 3" in told
-    assert "STEP_UP_FOR_RETRY" not in told
+    output = done.stderr + done.stdout
+    assert "exit code 3" in output
+    assert "STEP_UP_FOR_RETRY" not in output

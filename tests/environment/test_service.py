@@ -29,14 +29,14 @@ DIRECTORIES = {
     "CacheDirectory": ("/var/cache", "cache", "CACHE_DIRECTORY"),
     "LogsDirectory": ("/var/log", "logs", "LOGS_DIRECTORY"),
 }
-"""Where systemd makes a folder that the service may write, and what tells it."""
+"""Parents of the folders that systemd creates for the service, and their variables."""
 
 
 def can_confine() -> bool:
     if os.geteuid() != 0 or not shutil.which("unshare") or not shutil.which("setpriv"):
         return False
-    made = commands.run(["unshare", "--mount", "mount", "-o", "remount,bind,ro", "/"])
-    return made.exit_code == 0
+    remount = commands.run(["unshare", "--mount", "mount", "-o", "remount,bind,ro", "/"])
+    return remount.exit_code == 0
 
 
 pytestmark = [
@@ -69,10 +69,10 @@ def confined(service: dict[str, str], folder: Path, arguments: list[str], **extr
     lines = ["set -e"]
     environment = dict([service["Environment"].split("=", 1)]) | extra
     places: dict[Path, Path] = {}
-    for setting, (parent, kept, variable) in DIRECTORIES.items():
+    for setting, (parent, subfolder, variable) in DIRECTORIES.items():
         if setting in service:
             place = Path(parent) / service[setting]
-            places[place] = folder / kept
+            places[place] = folder / subfolder
             environment[variable] = str(place)
     for place, real in places.items():
         real.mkdir(exist_ok=True)

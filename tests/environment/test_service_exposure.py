@@ -25,8 +25,8 @@ def test_the_service_is_exposed_to_little(tmp_path: Path) -> None:
     unit = SCHEDULE / "fleet-slip.service"
     assert security(unit) == 0
     bare = tmp_path / "fleet-slip.service"
-    kept = [line for line in unit.read_text().splitlines() if not line.startswith("Cap")]
-    bare.write_text("\n".join(kept))
+    lines = [line for line in unit.read_text().splitlines() if not line.startswith("Cap")]
+    bare.write_text("\n".join(lines))
     assert security(bare) != 0
 
 
@@ -43,14 +43,14 @@ def allowed_calls() -> set[str]:
     """Return the system calls that the service may make."""
 
     def group(name: str) -> set[str]:
-        told = run(["systemd-analyze", "syscall-filter", "--no-pager", name]).stdout.splitlines()
-        found: set[str] = set()
-        for line in map(str.strip, told[1:]):
+        lines = run(["systemd-analyze", "syscall-filter", "--no-pager", name]).stdout.splitlines()
+        calls: set[str] = set()
+        for line in map(str.strip, lines[1:]):
             if line.startswith("@"):
-                found |= group(line)
+                calls |= group(line)
             elif line and not line.startswith("#"):
-                found.add(line)
-        return found
+                calls.add(line)
+        return calls
 
     return group("@system-service") - group("@privileged")
 
@@ -69,7 +69,7 @@ def test_a_night_makes_no_other_system_calls(tmp_path: Path, smoke_root: Path) -
     if "ptrace" in done.stderr and done.exit_code:
         pytest.skip("this machine does not let one process trace another")
     assert done.exit_code == 0, done.stderr
-    made = {line.strip() for line in counts.read_text().splitlines()[2:]}
-    made -= {"total", ""} | {line for line in made if set(line) <= {"-", " "}}
-    assert len(made) > 20
-    assert made - allowed_calls() <= {"chown", "fchown", "lchown", "setns"} - {"setns"}
+    calls = {line.strip() for line in counts.read_text().splitlines()[2:]}
+    calls -= {"total", ""} | {line for line in calls if set(line) <= {"-", " "}}
+    assert len(calls) > 20
+    assert calls - allowed_calls() <= {"chown", "fchown", "lchown", "setns"} - {"setns"}

@@ -235,7 +235,7 @@ def test_received_rows_are_those_of_the_log(
     tmp_path: Path, of_course: Counter, late: int, every: int
 ) -> None:
     """With fixes that fail, holes, missing values, standing cars and a course that goes round."""
-    table = valid(hostile_drive("a", 5000, 7, every=every))
+    table = valid(hostile_drive("a", 5000, 7, fix_ticks=every))
     came = received_rows(tmp_path / "cars", of_course.messages(table, late))
     logs = LocalFolder(tmp_path / "logs")
     for one in of_course.sets:

@@ -88,10 +88,10 @@ def test_a_reader_can_do_no_harm(
     monkeypatch.setenv("SOME_TOKEN", "secret")
     secret = tmp_path / "secret"
     secret.write_text("secret")
-    told = {"secret": str(secret), "folder": str(tmp_path), "port": 1, "pid": os.getpid()}
+    settings = {"secret": str(secret), "folder": str(tmp_path), "port": 1, "pid": os.getpid()}
     is_arm = platform.machine() == "aarch64"
     numbers = {"ioprio_set": 30 if is_arm else 251, "shmctl": 195 if is_arm else 31}
-    harm = HARM.format(**told, **numbers, variable="SOME_TOKEN")
+    harm = HARM.format(**settings, **numbers, variable="SOME_TOKEN")
     names = [line.split("(")[0].removeprefix("def ") for line in harm.split("\n") if line]
     done = f"""
 def fail(): raise PermissionError
@@ -123,7 +123,7 @@ raise ValueError("done: " + json.dumps(done))
     ],
     ids=["fault", "end", "exit", "time", "memory", "disk"],
 )
-def test_what_a_reader_does_is_its_files_fault(
+def test_harm_by_a_reader_is_a_fault_of_the_file(
     fake_reader: Any, monkeypatch: pytest.MonkeyPatch, harm: str, why: str
 ) -> None:
     monkeypatch.setattr(budget, "FREE_S", 0.3)
@@ -150,8 +150,8 @@ def test_temporary_files_are_bounded_together(
     assert "in a temporary file" in failure(fake_reader(f"{harm}time.sleep(100)"), own_clock())
 
 
-def test_what_a_reader_says_is_looked_at(fake_reader: Any) -> None:
-    for said in (
+def test_answers_of_a_reader_are_checked(fake_reader: Any) -> None:
+    for answer in (
         'struct.pack("<QQ", 2**40, 0)',
         'struct.pack("<QQ", 2, 2**60) + b"{}"',
         'struct.pack("<QQ", 2, 0) + b"[]"',
@@ -163,11 +163,11 @@ def test_what_a_reader_says_is_looked_at(fake_reader: Any) -> None:
 def is_socket(number):
     try: return stat.S_ISSOCK(os.fstat(number).st_mode)
     except OSError: return False
-socket.socket(fileno=next(n for n in range(3, 99) if is_socket(n))).sendall({said})
+socket.socket(fileno=next(n for n in range(3, 99) if is_socket(n))).sendall({answer})
 os._exit(0)
 """
-        told = failure(fake_reader(text), own_clock())
-        assert "its reader crashed" in told or "x1b" in told
+        message = failure(fake_reader(text), own_clock())
+        assert "its reader crashed" in message or "x1b" in message
 
 
 def scaled(file: Path, scales: dict[str, Any]) -> Path:
@@ -178,13 +178,13 @@ def scaled(file: Path, scales: dict[str, Any]) -> Path:
 
 def nested(file: Path) -> Path:
     """A TDMS file of 60 scales, each the sum of the one before and itself."""
-    of = {"NI_Number_Of_Scales": np.uint32(60)}
+    properties = {"NI_Number_Of_Scales": np.uint32(60)}
     for number in range(60):
-        of[f"NI_Scale[{number}]_Scale_Type"] = "Add"  # type: ignore[assignment]
+        properties[f"NI_Scale[{number}]_Scale_Type"] = "Add"  # type: ignore[assignment]
         for side in ("Left", "Right"):
             source = np.uint32(number - 1 if number else 0xFFFFFFFF)
-            of[f"NI_Scale[{number}]_Add_{side}_Operand_Input_Source"] = source
-    return scaled(file, of)
+            properties[f"NI_Scale[{number}]_Add_{side}_Operand_Input_Source"] = source
+    return scaled(file, properties)
 
 
 def test_a_file_that_never_ends_holds_no_night_up(

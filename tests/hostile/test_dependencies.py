@@ -1,4 +1,4 @@
-"""What is installed is what was pinned, fits together, and may be used.
+"""Installed packages are the pinned ones, are compatible, and have usable licences.
 
 Known vulnerabilities are looked up by `pip-erasure_log`, which needs a network; this does not.
 """
@@ -36,33 +36,33 @@ def pinned() -> dict[str, str]:
 
 def required(*requirements: str) -> dict[str, str | None]:
     """These packages and all that they need; without a version where one is not installed."""
-    found: dict[str, str | None] = {}
+    markers: dict[str, str | None] = {}
     waiting = [Requirement(text) for text in requirements]
     while waiting:
-        wanted = waiting.pop()
-        name = canonicalize_name(wanted.name)
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
         try:
             package = distribution(name)
         except PackageNotFoundError:
-            found[name] = None  # of an extra or a group that is not installed here
+            markers[name] = None  # of an extra or a group that is not installed here
             continue
-        extras = wanted.extras or {""}
+        extras = requirement.extras or {""}
         for text in package.requires or ():
             needed = Requirement(text)
             marker = needed.marker
             applies = marker is None or any(marker.evaluate({"extra": e}) for e in extras)
-            if applies and canonicalize_name(needed.name) not in found:
+            if applies and canonicalize_name(needed.name) not in markers:
                 waiting.append(needed)
-        found[name] = package.version
-    return found
+        markers[name] = package.version
+    return markers
 
 
 def everything() -> dict[str, str | None]:
-    """What users and developers install."""
+    """The packages that users and developers install."""
     return required("pip", "uv", *SHIPPED, *chain(*GROUPS.values()))
 
 
-def test_what_is_installed_is_what_was_pinned() -> None:
+def test_installed_versions_are_the_pinned_ones() -> None:
     installed = {name: version for name, version in everything().items() if version}
     assert {name: pinned().get(name) for name in installed} == installed
 
@@ -79,7 +79,7 @@ def test_nothing_is_pinned_that_nothing_needs() -> None:
 @pytest.mark.parametrize(
     ("folders", "groups"), [(["fleet_slip"], []), (["tests", "benchmarks"], list(GROUPS))]
 )
-def test_what_is_imported_is_declared(folders: list[str], groups: list[str]) -> None:
+def test_imported_packages_are_declared(folders: list[str], groups: list[str]) -> None:
     stated = [*SHIPPED, *chain(*(GROUPS[group] for group in groups))]
     declared = {canonicalize_name(Requirement(text).name) for text in stated}
     providers = packages_distributions()

@@ -158,7 +158,7 @@ TRACK = 'name = "x"\ndescription = "d"\nclosed = {closed}\nsegments = [{segments
         b"x = 1\nx = 2",
     ],
 )
-def test_what_is_not_toml_is_refused_on_one_line(tmp_path: Path, content: bytes) -> None:
+def test_text_that_is_not_toml_is_refused_on_one_line(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "x.toml"
     file.write_bytes(content)
     with pytest.raises(ConfigError) as raised:
@@ -191,7 +191,7 @@ def test_a_track_bends_no_more_than_a_car_can(tmp_path: Path, curvature: str) ->
         load_track(str(file), SHIPPED_CONFIGS)
 
 
-def test_of_many_faults_the_first_are_told(tmp_path: Path) -> None:
+def test_the_first_of_many_faults_are_listed(tmp_path: Path) -> None:
     file = tmp_path / "x.toml"
     file.write_text("\n".join(f"{'k' * 500}{i} = 1" for i in range(500)))
     with pytest.raises(ConfigError, match=r"and 49\d more") as raised:

@@ -92,8 +92,8 @@ def test_a_pattern_does_not_lead_out_of_its_folder(tmp_path: Path) -> None:
     for file in (folder / "sound" / "a.csv", other / "secret.csv"):
         file.write_text(csv_text(good_columns()))
     (folder / "below").symlink_to(other)
-    found = find_logs([f"{folder}/**/*.csv"])
-    strays = {str(file): isinstance(file, StrayLink) for file in found}
+    logs = find_logs([f"{folder}/**/*.csv"])
+    strays = {str(file): isinstance(file, StrayLink) for file in logs}
     assert strays == {str(folder / "sound/a.csv"): False, str(folder / "below/secret.csv"): True}
     (tmp_path / "link").symlink_to(folder)  # a person's own link to a folder is followed
     assert not isinstance(find_logs([tmp_path / "link" / "sound"])[0], StrayLink)

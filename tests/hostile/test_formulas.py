@@ -34,8 +34,8 @@ def write_mdf(
         mdf.append([Signal(raw, TIME_S[: len(raw)], name="beta")])
         mdf.append([Signal(raw, TIME_S[: len(raw)], name="ax", conversion=conversion)])
         if version < "4":  # where asammdf writes another formula than it is given
-            made: Any = mdf.groups[1].channels[1].conversion
-            made.formula = conversion["formula"]
+            conversion_block: Any = mdf.groups[1].channels[1].conversion
+            conversion_block.formula = conversion["formula"]
         if times is not None:
             mdf.groups[1].channels[0].conversion = conversion_utils.from_dict(times)
         return Path(mdf.save(folder / "log.mf4", overwrite=True))
@@ -119,8 +119,8 @@ def test_named_values_are_null_and_the_rest_is_physical(tmp_path: Path, rows: in
 
 def test_names_alone_stay_names(tmp_path: Path) -> None:
     conversion = {"val_0": 0, "text_0": b"off", "val_1": 1, "text_1": b"on", "default_addr": b"?"}
-    told = read(write_mdf(tmp_path, conversion), "ax")
-    assert told[99:102].tolist() == ["?", "off", "on"]
+    values = read(write_mdf(tmp_path, conversion), "ax")
+    assert values[99:102].tolist() == ["?", "off", "on"]
 
 
 def test_a_table_that_is_not_in_order_is_refused(tmp_path: Path) -> None:
@@ -131,8 +131,8 @@ def test_a_table_that_is_not_in_order_is_refused(tmp_path: Path) -> None:
 def test_an_unknown_conversion_is_refused(tmp_path: Path) -> None:
     file = write_mdf(tmp_path, {"a": 0.05, "b": 0.0})
     data = bytearray(file.read_bytes())
-    for found in re.finditer(b"##CC", data):
-        data[found.start() + 24 + 4 * 8] = 77
+    for match in re.finditer(b"##CC", data):
+        data[match.start() + 24 + 4 * 8] = 77
     file.write_bytes(data)
     assert "unknown type" in refusal(file, "ax")
 
@@ -141,11 +141,11 @@ def test_an_unknown_conversion_is_refused(tmp_path: Path) -> None:
 
 
 def tdms(folder: Path, **properties: Any) -> Path:
-    told = {
+    channel_properties = {
         "wf_increment": 0.01,
         **{name.replace("_0_", "[0]_"): v for name, v in properties.items()},
     }
-    channel = nptdms.ChannelObject("g", "ax", RAW, told)
+    channel = nptdms.ChannelObject("g", "ax", RAW, channel_properties)
     with nptdms.TdmsWriter(folder / "log.tdms") as writer:
         writer.write_segment([channel])
     return folder / "log.tdms"
@@ -190,7 +190,7 @@ def test_messages_of_another_encoding_are_refused(tmp_path: Path, kind: int) -> 
 
 
 @pytest.mark.parametrize(
-    ("attributes", "told"),
+    ("attributes", "fault"),
     [
         ({"scale_factor": 0.05}, "scale_factor"),
         ({"MATLAB_class": b"string"}, "is a string of MATLAB"),
@@ -202,11 +202,11 @@ def test_messages_of_another_encoding_are_refused(tmp_path: Path, kind: int) -> 
     ],
 )
 def test_only_numbers_of_their_own_are_read_from_hdf5(
-    tmp_path: Path, attributes: dict[str, Any], told: str
+    tmp_path: Path, attributes: dict[str, Any], fault: str
 ) -> None:
     with h5py.File(tmp_path / "log.h5", "w") as root:
         root.create_dataset("ax", data=RAW).attrs.update(attributes)
-    if told:
-        assert told in refusal(tmp_path / "log.h5", "ax", "mat")
+    if fault:
+        assert fault in refusal(tmp_path / "log.h5", "ax", "mat")
     else:
         np.testing.assert_array_equal(read(tmp_path / "log.h5", "ax", "mat"), X)

@@ -14,7 +14,7 @@ from tests.support.fuzz.targets import TARGETS
 EXAMPLES = {"csv": 60, "parquet": 60, "config": 100, "sql": 60, "manifest": 40}
 FEW = 6
 AT_ONCE = ("csv", "parquet")
-"""What `make test` attacks, too."""
+"""The targets that `make test` attacks as well."""
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def sandbox(tmp_path_factory: pytest.TempPathFactory) -> Path:
         *(pytest.param(n, EXAMPLES.get(n, FEW), marks=pytest.mark.long) for n in TARGETS),
     ],
 )
-def test_whatever_comes_is_answered_or_refused(name: str, examples: int, sandbox: Path) -> None:
+def test_hostile_input_is_answered_or_refused(name: str, examples: int, sandbox: Path) -> None:
     target, _ = TARGETS[name]
 
     @settings(max_examples=examples, database=None, suppress_health_check=list(HealthCheck))

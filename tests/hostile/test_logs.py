@@ -28,7 +28,7 @@ from tests.support.measured import OWN_CLOCK, a_mapping, read_measured
 
 COLUMNS = ("t", "ax", "beta")
 SECRET = 12_345.0
-"""What stands in a file that the log is not to be read from."""
+"""The content of a file that a log must not be able to read."""
 ROWS = 100
 
 
@@ -80,12 +80,12 @@ def test_values_in_another_file_or_a_pipe_are_not_read(tmp_path: Path, place: st
 @pytest.mark.parametrize("is_unlimited", [False, True])
 def test_a_virtual_dataset_is_not_read(tmp_path: Path, is_unlimited: bool) -> None:
     other = secret(tmp_path)
-    most = (None,) if is_unlimited else (ROWS,)
+    max_shape = (None,) if is_unlimited else (ROWS,)
 
     def make(root: h5py.File, column: str) -> None:
-        layout = h5py.VirtualLayout((ROWS,), "f8", maxshape=most)
+        layout = h5py.VirtualLayout((ROWS,), "f8", maxshape=max_shape)
         layout[: h5py.h5s.UNLIMITED if is_unlimited else ROWS] = h5py.VirtualSource(
-            str(other), "x", (ROWS,), maxshape=most
+            str(other), "x", (ROWS,), maxshape=max_shape
         )[: h5py.h5s.UNLIMITED if is_unlimited else ROWS]
         root.create_virtual_dataset(column, layout)
 
@@ -107,8 +107,8 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
     assert "'ax' is a link, which is not followed" in failure(hdf5(tmp_path, outside))
     assert "'ax' is a link, which is not followed" in failure(hdf5(tmp_path, within_it))
     signals = {name: {"column": f"{name}_of.x", "unit": "m/s^2"} for name in ("ax", "ay")}
-    told = failure(hdf5(tmp_path, group), a_mapping(signals=signals))
-    assert "'ax_of.x' is a link, which is not followed" in told
+    message = failure(hdf5(tmp_path, group), a_mapping(signals=signals))
+    assert "'ax_of.x' is a link, which is not followed" in message
 
 
 def test_rows_that_stand_nowhere_are_not_read(
@@ -126,8 +126,8 @@ def test_rows_that_stand_nowhere_are_not_read(
 
     assert write(tmp_path / "a.h5").stat().st_size < 10_000
     for number, options in enumerate(({}, {"chunks": (1000,)}, {"chunks": (10**8,)})):
-        told = failure(write(tmp_path / f"{number}.h5", **options))
-        assert "more than" in told
+        message = failure(write(tmp_path / f"{number}.h5", **options))
+        assert "more than" in message
 
 
 # Parquet
@@ -210,8 +210,8 @@ def test_links_in_a_circle_are_refused(tmp_path: Path, monkeypatch: pytest.Monke
     at = data.index(b"##DG", 64)
     data[at + 24 : at + 32] = at.to_bytes(8, "little")  # the next one is itself
     file.write_bytes(data)
-    told = failure(file, MDF_MAPPING)
-    assert "took more than" in told or "more than" in told
+    message = failure(file, MDF_MAPPING)
+    assert "took more than" in message or "more than" in message
 
 
 def conversion(parts: list[int]) -> bytes:
@@ -275,8 +275,8 @@ def test_an_object_of_a_trace_has_a_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: int, message: str
 ) -> None:
     monkeypatch.setattr(source, "FREE_S", 1.0)
-    one = struct.pack("<4sHHII", b"LOBJ", 32, 1, size, 99) + bytes(64)
-    assert re.search(message, trace(tmp_path, "log.blf", blf(one)))
+    object_bytes = struct.pack("<4sHHII", b"LOBJ", 32, 1, size, 99) + bytes(64)
+    assert re.search(message, trace(tmp_path, "log.blf", blf(object_bytes)))
 
 
 def test_a_container_that_was_cut_is_no_shorter_trace(tmp_path: Path) -> None:
@@ -292,7 +292,7 @@ def test_a_container_that_was_cut_is_no_shorter_trace(tmp_path: Path) -> None:
     assert "Unknown compression method (7)" in trace(tmp_path, "log.blf", unknown)
 
 
-def test_what_a_trace_unfolds_to_is_bounded(
+def test_the_decoded_size_of_a_trace_is_bounded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(source, "FREE_MEMORY", 2**26)

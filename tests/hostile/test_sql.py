@@ -92,7 +92,7 @@ IN_STRINGS = (
 )
 
 
-def test_what_writes_is_refused_and_has_not_run(root: Path) -> None:
+def test_statements_that_write_are_refused_and_not_run(root: Path) -> None:
     before = contents(root)
     target = root / next(name for name in before if name.endswith(".parquet"))
     text = serialised(COPY_IN_CTE.format(file=target))
@@ -172,7 +172,7 @@ READS = (
 )
 
 
-def test_what_reads_is_answered(root: Path) -> None:
+def test_statements_that_read_are_answered(root: Path) -> None:
     with connect(root) as database:
         for query in READS:
             assert database.sql(one_query(database, query)).fetchall() is not None, query
@@ -200,7 +200,7 @@ AFTER = (")", ") FROM x", ";", "; DELETE FROM t", " UNION ALL FROM t", " /* x", 
         st.lists(st.sampled_from(AFTER), max_size=3).map("".join),
     )
 )
-def test_what_is_not_refused_writes_nothing(text: str) -> None:
+def test_accepted_statements_write_nothing(text: str) -> None:
     with TemporaryDirectory() as folder, contextlib.chdir(folder), duckdb.connect() as database:
         database.execute("CREATE TABLE t AS SELECT 1 AS n")
         try:

@@ -1,4 +1,4 @@
-"""What all pages share: numbers as people read them, colours, and drawings within a page."""
+"""Shared parts of pages: formatted numbers, colours, and inline drawings."""
 
 import math
 import re
@@ -84,11 +84,11 @@ def test_references_follow_their_names() -> None:
         '<?xml version="1.0"?><svg viewBox="0 0 72 36"><defs><clipPath id="p1"/></defs>'
         '<use xlink:href="#p1"/><g clip-path="url(#p1)"/></svg>'
     )
-    found = inline(svg, "one", "text")
-    assert 'id="one-p1"' in found
-    assert 'href="#one-p1"' in found
-    assert "url(#one-p1)" in found
-    assert "max-width: 96px" in found
+    inlined = inline(svg, "one", "text")
+    assert 'id="one-p1"' in inlined
+    assert 'href="#one-p1"' in inlined
+    assert "url(#one-p1)" in inlined
+    assert "max-width: 96px" in inlined
 
 
 def test_texts_of_a_page_are_escaped_with_code_and_links() -> None:

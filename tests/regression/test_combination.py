@@ -99,8 +99,8 @@ def test_combinations_stay_between_both_estimates(
 def test_mirrored_estimates_have_a_mirrored_combination(seed: int) -> None:
     pairs = random_pairs(seed, 0.2, 0.1)
     mirrored = pairs_of(-pairs.line, -pairs.filter, -pairs.label, pairs.group)
-    one, other = (fit_combination(p, "constant") for p in (pairs, mirrored))
-    assert one == other
+    original, other = (fit_combination(p, "constant") for p in (pairs, mirrored))
+    assert original == other
 
 
 def test_few_groups_keep_the_constant_share() -> None:

@@ -1,1 +1,1 @@
-"""What several tests, and some benchmarks, use: data, processes, servers, outside answers."""
+"""Shared code of tests and benchmarks: data, processes, servers, outside answers."""

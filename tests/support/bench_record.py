@@ -66,7 +66,7 @@ def add_record(file: Path, record: Record) -> None:
 
 def slower_than(before: Sequence[Record], now: Record) -> str | None:
     """Return what to say if a benchmark takes a fifth longer than the median of the last ones."""
-    same = [one.relative for one in before if one.command == now.command][-REMEMBERED:]
+    same = [record.relative for record in before if record.command == now.command][-REMEMBERED:]
     usual = statistics.median(same) if same else now.relative
     if now.relative <= SLOWER * usual:
         return None

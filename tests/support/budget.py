@@ -1,4 +1,4 @@
-"""What tests take on processors: the dearest, and the folders beyond `tests/budget.toml`."""
+"""Processor time of tests: the slowest, and the folders beyond `tests/budget.toml`."""
 
 import resource
 import tomllib
@@ -15,8 +15,8 @@ DEAREST = 20
 
 def processor_s() -> float:
     """Return what this process has taken, and those that it started and that have ended."""
-    own, ended = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
+    process, ended = map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return process.ru_utime + process.ru_stime + ended.ru_utime + ended.ru_stime
 
 
 class Budget:
@@ -50,7 +50,7 @@ class Budget:
         for name, seconds in self._taken.most_common(DEAREST):
             write(f"{seconds:6.1f} {name}")
         for folder, allowed_s in tomllib.loads(BUDGET.read_text("utf-8"))["processor_s"].items():
-            mine = f"tests/{folder}/"
-            took_s = sum(s for name, s in self._taken.items() if name.startswith(mine))
+            prefix = f"tests/{folder}/"
+            took_s = sum(s for name, s in self._taken.items() if name.startswith(prefix))
             if took_s > allowed_s:
-                write(f"{mine}: {took_s:.0f} s of processors, and its budget is {allowed_s}")
+                write(f"{prefix}: {took_s:.0f} s of processors, and its budget is {allowed_s}")

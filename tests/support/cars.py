@@ -63,10 +63,10 @@ def counts(signals: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.i
     }
 
 
-def gram_of(told: Mapping[str, NDArray[np.int16]]) -> Gram:
+def gram_of(counts: Mapping[str, NDArray[np.int16]]) -> Gram:
     """Return the Gram of a drive's counts."""
     names = SIGNALS.gram_signals
-    return Gram.from_counts(names, np.column_stack([told[n].astype(np.int64) for n in names]))
+    return Gram.from_counts(names, np.column_stack([counts[n].astype(np.int64) for n in names]))
 
 
 def broken(signals: Signals, change: Callable[[Signals], None]) -> Signals:

@@ -29,10 +29,10 @@ def counts(rng: np.random.Generator, label: float = 1.0, noise: float = 20.0) ->
     ay, yaw_rate, *weak = rng.normal(0, 1000, (2 + len(WEAK), ROWS))
     true = 0.3 * ay + 0.2 * yaw_rate + 0.004 * sum(weak)
     sideslip = label * true + rng.normal(0, noise, ROWS)
-    found: dict[str, Any] = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
-    found |= dict(zip(CHOICE[2:], rng.normal(0, 1000, (4, ROWS)), strict=True))
-    found["sideslip"] = sideslip
-    return {name: np.rint(values).astype(np.int16) for name, values in found.items()}
+    columns: dict[str, Any] = {"ay": ay, "yaw_rate": yaw_rate, **dict(zip(WEAK, weak, strict=True))}
+    columns |= dict(zip(CHOICE[2:], rng.normal(0, 1000, (4, ROWS)), strict=True))
+    columns["sideslip"] = sideslip
+    return {name: np.rint(values).astype(np.int16) for name, values in columns.items()}
 
 
 def write(
@@ -61,9 +61,9 @@ def publish_from(
         warehouse, SelectionRequest(order=signals, tolerance="0.0001deg"), cohort
     )
     manifest = manifest_of(answer, "beta")
-    told = would_publish(registry_of(warehouse), manifest, answer, **options)
+    decision = would_publish(registry_of(warehouse), manifest, answer, **options)
     done = publish_challenger(registry_of(warehouse), manifest, answer, **options)
-    assert (told.publishes, told.candidate) == (done.new, done.candidate)
+    assert (decision.publishes, decision.candidate) == (done.new, done.candidate)
     return done
 
 

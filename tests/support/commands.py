@@ -66,18 +66,18 @@ def run_here(
         with (
             _left_as_it_was(),
             contextlib.chdir(cwd or "."),
-            tempfile.TemporaryFile("w+") as given,
+            tempfile.TemporaryFile("w+") as stdin,
         ):
-            given.write(input)
-            given.seek(0)
+            stdin.write(input)
+            stdin.seek(0)
             if env is not None:
                 os.environ.clear()
                 os.environ.update(env)
-            for descriptor, stream in enumerate((given, out, err)):
+            for descriptor, stream in enumerate((stdin, out, err)):
                 os.dup2(stream.fileno(), descriptor)
             sys.argv = list(words)
             assert sys.__stdout__ and sys.__stderr__
-            sys.stdin, sys.stdout, sys.stderr = given, sys.__stdout__, sys.__stderr__
+            sys.stdin, sys.stdout, sys.stderr = stdin, sys.__stdout__, sys.__stderr__
             code = 0
             try:
                 fleet_slip_main()
@@ -94,7 +94,7 @@ _running_here = threading.Lock()
 @contextlib.contextmanager
 def _left_as_it_was() -> Iterator[None]:
     """Put back what a command changes of its process: streams, words, log, environment, limits."""
-    kept = [os.dup(descriptor) for descriptor in range(3)]
+    descriptors = [os.dup(descriptor) for descriptor in range(3)]
     log = (LOGGER.handlers[:], LOGGER.level, LOGGER.propagate)
     limits = resource.getrlimit(resource.RLIMIT_DATA)
     streams: Any = {
@@ -107,7 +107,7 @@ def _left_as_it_was() -> Iterator[None]:
         try:
             yield
         finally:
-            for descriptor, copy in enumerate(kept):
+            for descriptor, copy in enumerate(descriptors):
                 os.dup2(copy, descriptor)
                 os.close(copy)
             LOGGER.handlers[:], LOGGER.level, LOGGER.propagate = log
@@ -115,7 +115,7 @@ def _left_as_it_was() -> Iterator[None]:
 
 
 def _can_run_here() -> bool:
-    """Whether no other thread has the streams of this process, or may take them."""
+    """Return True if no other thread uses, or may take, the streams of this process."""
     return threading.current_thread() is threading.main_thread() and not _running_here.locked()
 
 
@@ -132,8 +132,8 @@ def run_on(root: object, *arguments: str | Path, **options: Any) -> Finished:
     """
     words = [COMMAND, "--root", str(root), *map(str, arguments)]
     preloaded = "LD_PRELOAD" in (options.get("env") or {})  # read when a process begins
-    here = options.keys() <= {"cwd", "env", "input"} and not preloaded and _can_run_here()
-    done = (run_here if here else run)(words, **options)
+    in_process = options.keys() <= {"cwd", "env", "input"} and not preloaded and _can_run_here()
+    done = (run_here if in_process else run)(words, **options)
     assert "Traceback" not in done.stderr, done.stderr
     require_no_failed_run(root)
     return done
@@ -160,13 +160,13 @@ def start_on(root: object, *arguments: str | Path, **options: Any) -> subprocess
 def finish(*processes: subprocess.Popen[str]) -> list[Finished]:
     """Wait for processes that run at once; if one has no end, kill them all."""
     try:
-        told = [process.communicate(timeout=PATIENCE_S) for process in processes]
+        outputs = [process.communicate(timeout=PATIENCE_S) for process in processes]
     finally:
         for process in processes:
             process.kill()
     return [
         Finished(process.returncode, stdout, stderr)
-        for process, (stdout, stderr) in zip(processes, told, strict=True)
+        for process, (stdout, stderr) in zip(processes, outputs, strict=True)
     ]
 
 

@@ -1,4 +1,4 @@
-"""What exported C costs on a Cortex-M4: compiled by arm-none-eabi-gcc, run by qemu.
+"""The cost of exported C on a Cortex-M4: compiled by arm-none-eabi-gcc, run by qemu.
 
 No library of C is linked: `cortex/startup.c` calls `main`, and what it returns ends qemu. Stack
 and code are the compiler's figures with -Os. qemu runs one instruction at a time and names each, so
@@ -31,7 +31,7 @@ int main(void)
 
 
 def can_measure() -> bool:
-    """Whether the tools are here."""
+    """Return True if the tools are installed."""
     return all(which(tool) for tool in TOOLS)
 
 
@@ -57,12 +57,12 @@ def measure_cortex_m(folder: Path, prefix: str, files: Mapping[str, str]) -> dic
         r"^\S+ (\S+) . state$", run(folder, "arm-none-eabi-nm", "-S", "least.elf"), re.M
     )
     assert state
-    own = text_bytes(folder, f"{prefix}.o")
-    others = text_bytes(folder, "least.o") + text_bytes(folder, "startup.o")
+    model_bytes = text_bytes(folder, f"{prefix}.o")
+    overhead_bytes = text_bytes(folder, "least.o") + text_bytes(folder, "startup.o")
     stack = [int(line.split()[1]) for line in (folder / f"{prefix}.su").read_text().splitlines()]
     return {
-        "code_and_constants_bytes": own,
-        "with_divisions_of_64_bits_bytes": text_bytes(folder, "least.elf") - others,
+        "code_and_constants_bytes": model_bytes,
+        "with_divisions_of_64_bits_bytes": text_bytes(folder, "least.elf") - overhead_bytes,
         "state_bytes": int(state[1], 16),
         "largest_frame_bytes": max(stack),
         "most_instructions": max(instructions_of_calls(folder, "self_test.elf", f"{prefix}_step")),

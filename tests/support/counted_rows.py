@@ -29,11 +29,15 @@ def row_of(
     gram: Gram,
     vehicle: str = "VIN1",
     start_s: int = START_S,
-    of: str = "signals",
+    set_name: str = "signals",
     **other: Any,
 ) -> dict[str, Any]:
     """A row of the table of a Gram; `other` columns are as they should not be."""
-    (key,) = (one.key for one in onboard_feature_sets(CATALOG).values() if one.name == of)
+    (key,) = (
+        feature_set.key
+        for feature_set in onboard_feature_sets(CATALOG).values()
+        if feature_set.name == set_name
+    )
     start = datetime.fromtimestamp(start_s, UTC)
     row = {"source": "received", "vehicle_id": vehicle, "day": start.date(), "feature_set": key}
     row |= {"drive_id": f"{vehicle}-{start:%Y%m%dT%H%M%SZ}", "part": None, "course_late": None}
@@ -51,16 +55,19 @@ def write_counted(path: Path, rows: Iterable[Mapping[str, Any]] | pa.Table) -> P
 
 @cache
 def _reading() -> dict[str, Any]:
-    """What the Python of the page defines."""
-    found: dict[str, Any] = {}
-    exec(re.findall(r"```python\n([^`]*def row_of.*?)```", PAGE.read_text(), re.S)[0], found)  # noqa: S102
-    return found
+    """Return the names that the Python code of the page defines."""
+    namespace: dict[str, Any] = {}
+    exec(re.findall(r"```python\n([^`]*def row_of.*?)```", PAGE.read_text(), re.S)[0], namespace)  # noqa: S102
+    return namespace
 
 
 def rows_of_messages(content: bytes, catalog: Catalog = CATALOG) -> list[dict[str, Any]]:
     """The rows that the page makes of messages one behind the other."""
     rows: list[dict[str, Any]] = []
-    sets = {one.definition: one for one in onboard_feature_sets(catalog).values()}
+    sets = {
+        feature_set.definition: feature_set
+        for feature_set in onboard_feature_sets(catalog).values()
+    }
     while content:
         size = int.from_bytes(content[6:8], "little")
         rows.append(_reading()["row_of"](content[:size], sets))
@@ -85,7 +92,7 @@ def gram_of(seed: int, rows: int = 500) -> Gram:
 
 
 class Message(NamedTuple):
-    """What a message says, read by what docs/export.md says of its layout."""
+    """The content of a message, decoded by the layout of docs/export.md."""
 
     definition: int
     vehicle: bytes
@@ -101,7 +108,7 @@ class Message(NamedTuple):
 
 def parse_messages(content: bytes) -> list[Message]:
     """Read sound messages one behind the other, one at a time; the first that is not ends it."""
-    found = []
+    messages = []
     at = 0
     while content[at : at + 6] == b"FSGR\x01\0":
         size = int.from_bytes(content[at + 6 : at + 8], "little")
@@ -113,11 +120,11 @@ def parse_messages(content: bytes) -> list[Message]:
         )
         name = vehicle.rstrip(b"\0")
         numbers = body[56:-4]
-        found.append(
+        messages.append(
             Message(definition, name, place, parts, start_s, mask, rows, lost, numbers, body)
         )
         at += size
-    return found
+    return messages
 
 
 def list_array(values: IntArray) -> pa.ListArray:
@@ -153,7 +160,7 @@ def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = F
     products[:, row == column] += (products[:, row == column] ^ sums) & 1
     start = datetime.fromtimestamp(start_s, UTC)
     names = [f"CAR{car}" for car in range(cars)]
-    known = {
+    facts = {
         "source": ["received"] * cars,
         "vehicle_id": names,
         "drive_id": [f"{name}-{start:%Y%m%dT%H%M%SZ}" for name in names],
@@ -166,4 +173,4 @@ def rows_of_fleet(cars: int, start_s: int, seed: int, *, label_follows: bool = F
         "sums": list_array(sums),
         "products": list_array(products),
     }
-    return pa.table(known, schema=COLUMNS)
+    return pa.table(facts, schema=COLUMNS)

@@ -100,28 +100,35 @@ def greedy_order(gram: Gram, method: str) -> tuple[str, ...]:
         return fit(gram, [*chosen], label).rss
 
     order: list[str] = []
-    while left := [name for name in inputs if name not in order]:
+    while candidates := [name for name in inputs if name not in order]:
         if method == "forward":
-            order.append(min(left, key=lambda name: rss([*order, name])))
+            order.append(min(candidates, key=lambda name: rss([*order, name])))
         else:  # of equals the later
-            without = {name: rss(n for n in left if n != name) for name in reversed(left)}
+            without = {
+                name: rss(n for n in candidates if n != name) for name in reversed(candidates)
+            }
             order.append(min(without, key=lambda name: without[name]))
     return tuple(order if method == "forward" else reversed(order))
 
 
 def drives_of(
-    random: np.random.Generator, clusters: int, inputs: int, *, rows: float = 30, own: float = 0.3
+    random: np.random.Generator,
+    clusters: int,
+    inputs: int,
+    *,
+    rows: float = 30,
+    spread: float = 0.3,
 ) -> list[Matrix]:
     """Draw the rows of unequal clusters, whose coefficients differ by `own`."""
-    found = []
+    drives = []
     for _ in range(clusters):
         many = int(rows * np.exp(0.6 * random.normal())) + inputs + 2
         x = random.normal(size=(many, inputs)) * np.exp(0.3 * random.normal(size=inputs))
         x += 0.3 * random.normal(size=inputs)
-        b = 1 + own * random.normal(size=inputs)
-        y = x @ b + own * random.normal() + random.normal(size=many)
-        found.append(np.rint(1000 * np.column_stack([x, y])).astype(np.int64))
-    return found
+        b = 1 + spread * random.normal(size=inputs)
+        y = x @ b + spread * random.normal() + random.normal(size=many)
+        drives.append(np.rint(1000 * np.column_stack([x, y])).astype(np.int64))
+    return drives
 
 
 def by_rows(clusters: Sequence[Matrix], *, intercept: bool = True) -> tuple[Matrix, Matrix]:
@@ -136,16 +143,18 @@ def by_rows(clusters: Sequence[Matrix], *, intercept: bool = True) -> tuple[Matr
     unit = np.sqrt((x**2).mean(axis=0))
     x = x / unit
     bread = np.linalg.inv(x.T @ x)
-    left = np.eye(len(x)) - x @ bread @ x.T
-    of = np.repeat(np.arange(len(clusters)), [len(part) for part in clusters])
+    residual_maker = np.eye(len(x)) - x @ bread @ x.T
+    cluster_of_row = np.repeat(np.arange(len(clusters)), [len(part) for part in clusters])
     moves = []
     for number in range(len(clusters)):
-        mine = of == number
-        values, vectors = np.linalg.eigh(left[np.ix_(mine, mine)])
-        moves.append(bread @ x[mine].T @ (vectors / np.sqrt(values)) @ vectors.T @ left[mine])
-    each = np.array(moves)  # (clusters, coefficients, rows): what is squared, of the label
-    errors = np.sqrt(((each @ y) ** 2).sum(axis=0)) / unit
-    covariances = np.einsum("gjn,hjn->jgh", each, each)
+        mask = cluster_of_row == number
+        values, vectors = np.linalg.eigh(residual_maker[np.ix_(mask, mask)])
+        moves.append(
+            bread @ x[mask].T @ (vectors / np.sqrt(values)) @ vectors.T @ residual_maker[mask]
+        )
+    effects = np.array(moves)  # (clusters, coefficients, rows): what is squared, of the label
+    errors = np.sqrt(((effects @ y) ** 2).sum(axis=0)) / unit
+    covariances = np.einsum("gjn,hjn->jgh", effects, effects)
     traces = np.einsum("jgg->j", covariances)
     return errors, traces**2 / (covariances**2).sum(axis=(1, 2))
 
@@ -199,21 +208,21 @@ def cohort_of(
     drives: Sequence[Driven], *, feature_set: str = PLAIN, predicate: str = "true"
 ) -> Cohort:
     """Return the cohort of drives that all have the same signals."""
-    (signals,) = {one.signals for one in drives}
-    table = table_of([Gram.from_counts(signals, one.counts) for one in drives])
+    (signals,) = {drive.signals for drive in drives}
+    table = table_of([Gram.from_counts(signals, drive.counts) for drive in drives])
     days = [date(2024, 5, 1) + timedelta(days=i % 3) for i in range(len(drives))]
     columns = {
-        "drive_id": [one.drive for one in drives],
-        "trip": [one.drive for one in drives],
+        "drive_id": [drive.drive for drive in drives],
+        "trip": [drive.drive for drive in drives],
         "source": ["simulated"] * len(drives),
         "signals": [",".join(signals)] * len(drives),
-        "n": [len(one.counts) for one in drives],
+        "n": [len(drive.counts) for drive in drives],
         "vehicle_id": [f"car-{i % 4}" for i in range(len(drives))],
         "track": [f"track-{i % 2}" for i in range(len(drives))],
         "day": days,
         "mass_kg": [1200.0 + 100 * (i % 5) for i in range(len(drives))],
         "adhesion": [1.0 - 0.1 * (i % 3) for i in range(len(drives))],
-        "part": pa.array([one.part for one in drives], pa.string()),
+        "part": pa.array([drive.part for drive in drives], pa.string()),
     }
     columns |= {
         f"{name}_hash": pa.array(hash_names(pa.array(columns[f"{name}_id"])))
@@ -232,4 +241,4 @@ def cohort_of(
 
 def rows_of(drives: Sequence[Driven]) -> Matrix:
     """Return the counts of all drives, one below the other."""
-    return np.concatenate([one.counts for one in drives])
+    return np.concatenate([drive.counts for drive in drives])

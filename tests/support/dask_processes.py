@@ -33,7 +33,7 @@ class DaskProcesses:
 
     @property
     def address(self) -> str:
-        """Where commands find the scheduler."""
+        """The address of the scheduler."""
         return f"tcp://{self.host}:{self.port}"
 
     def start_scheduler(self, *before: str) -> Process:

@@ -140,8 +140,8 @@ def write_logs(warehouse: Warehouse, files: int) -> list[str]:
         for drives in drawn_for(files):
             rows = drives.log(warehouse)
             for i, number in enumerate(drives.numbers.tolist()):
-                one, name = rows.slice(i * ROWS, ROWS), f"growth-{number:07d}"
-                actions.append(warehouse.logs.write_file(name, one, day_of(number)))
+                part, name = rows.slice(i * ROWS, ROWS), f"growth-{number:07d}"
+                actions.append(warehouse.logs.write_file(name, part, day_of(number)))
     warehouse.logs.snapshot().commit(Change(add=actions, note={"job": "growth"}))
     delta = warehouse.logs.snapshot().delta
     assert delta is not None

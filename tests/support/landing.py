@@ -57,10 +57,10 @@ class Landing:
     def drives(self) -> list[str]:
         """Return the drives that can land, by day and number."""
         with fleet_slip.connect(self.source, query="log") as database:
-            found = database.sql(
+            relation = database.sql(
                 "SELECT DISTINCT drive_id FROM log WHERE source <> 'scenario' ORDER BY 1"
             ).fetchall()
-        return [name for (name,) in found]
+        return [name for (name,) in relation]
 
     def land(self, name: str, drives: Iterable[str], day: date, **changes: str) -> Path:
         """Write the log of some drives, on a day of your own; `changes` are columns in SQL."""

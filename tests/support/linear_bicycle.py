@@ -49,7 +49,7 @@ class LinearBicycle:
     speed_mps: float
 
     @classmethod
-    def of(
+    def from_car(
         cls, car: VehicleParameters, speed_mps: float, compliance_rad_per_n: float = 0.0
     ) -> "LinearBicycle":
         """Return the bicycle of a car on a dry road, its tyres loaded as at rest."""
@@ -113,11 +113,11 @@ STEPS = round(SAMPLE_S / STEP_S)
 
 
 class Response(NamedTuple):
-    """What a car did, at 100 Hz."""
+    """The motion of a car at 100 Hz."""
 
     time_s: FloatArray
     demand_rad: FloatArray
-    """Of the steering wheel."""
+    """The angle of the steering wheel."""
     yaw_rate_rad_s: FloatArray
     sideslip_rad: FloatArray
     ay_mps2: FloatArray
@@ -161,11 +161,11 @@ def steer(
     c, t = constants(car, 1.0), imperfection_constants(car, flaws, SAMPLE_S)
     x = State(speed_mps, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *4 * (speed_mps * c.inverse_radius,))
     still = Slopes(*(0.0 for _ in Slopes._fields))
-    rest, steady = (
+    initial, steady = (
         Compliance(*(0.0 for _ in Compliance._fields)),
         ComplianceRates(*(0.0 for _ in ComplianceRates._fields)),
     )
     warm = Environment(0.0, 0.0, 1.0, 1.0, 0.0, 1.0)
-    rate, vy, ay, vx = _run(x, still, rest, steady, warm, c, t, demand_rad, speed_mps)
+    rate, vy, ay, vx = _run(x, still, initial, steady, warm, c, t, demand_rad, speed_mps)
     time_s = np.arange(len(demand_rad), dtype=np.float64) * SAMPLE_S
     return Response(time_s, demand_rad, rate, np.arctan2(vy, vx), ay, vx)

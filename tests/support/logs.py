@@ -26,11 +26,13 @@ def path_of(folder: Folder) -> Path:
     return Path(str(folder))
 
 
-def ask(root: Folder | Path | Warehouse, query: str, given: Any = None) -> list[tuple[Any, ...]]:
+def ask(
+    root: Folder | Path | Warehouse, query: str, parameters: Any = None
+) -> list[tuple[Any, ...]]:
     """Return the answer to a query, for which no view is opened that it does not name."""
     warehouse = root if isinstance(root, Warehouse) else open_warehouse(root)
     with open_views(warehouse, query) as database:
-        return database.execute(query, given).fetchall()
+        return database.execute(query, parameters).fetchall()
 
 
 def without_names(drives: pa.Table) -> pa.Table:
@@ -62,7 +64,7 @@ def log_rows(
 ) -> pa.Table:
     """Rows of the logs for one drive; a signal that is not given is absent."""
     rows = len(next(iter(counts.values())))
-    known: dict[str, Any] = {
+    facts: dict[str, Any] = {
         "drive_id": drive_id,
         "vehicle_id": "car-1",
         "vehicle_model": "d_class_sedan",
@@ -80,13 +82,13 @@ def log_rows(
     }
     columns = {"tick": np.arange(rows, dtype=np.int32), **counts}
     schema = signals.log_schema
-    every = [
+    arrays = [
         pa.array(columns[field.name], field.type)
         if field.name in columns
-        else pa.repeat(pa.scalar(known.get(field.name), field.type), rows)
+        else pa.repeat(pa.scalar(facts.get(field.name), field.type), rows)
         for field in schema
     ]
-    return pa.table(every, schema=schema)
+    return pa.table(arrays, schema=schema)
 
 
 def land(warehouse: Warehouse, name: str, *drives: pa.Table, day: date = DAY) -> None:

@@ -53,8 +53,8 @@ def publish(registry: Registry, manifest: Manifest) -> ModelVersion:
     number = version.version
 
     def move(newest: int) -> bool | None:
-        there = history.pointed_at(CHAMPION) == number
-        return there or history.move(CHAMPION, number, "publish", after=newest) or None
+        is_current = history.pointed_at(CHAMPION) == number
+        return is_current or history.move(CHAMPION, number, "publish", after=newest) or None
 
     history.decide(move)
     return version

@@ -91,14 +91,14 @@ def a_mapping(**changes: Any) -> Mapping:
     catalog: Catalog = changes.pop("catalog", CATALOG)
     time = changes.pop("time", {})
     drive = changes.pop("drive", {})
-    whole = {
+    document = {
         "name": "test",
         "time": time if "rate_hz" in time else {**TIME, **time},
         "drive": {**DRIVE, **drive},
         "signals": SIGNALS,
         **changes,
     }
-    return Mapping.model_validate(whole, context=catalog.signals)
+    return Mapping.model_validate(document, context=catalog.signals)
 
 
 def own_clock(**changes: Any) -> Mapping:
@@ -141,7 +141,7 @@ def good_columns(rows: int = 20) -> dict[str, Any]:
 def recording(seed: int = 1, rows: int = 600) -> dict[str, list[str]]:
     """A drive with noise, as sensors have it, and a row for the quarantine."""
     noise = np.random.default_rng(seed).normal(size=(2, rows)).cumsum(axis=1) / 50
-    ax, beta = ([f"{x:.3f}" for x in np.clip(some, -9, 9)] for some in noise)
+    ax, beta = ([f"{x:.3f}" for x in np.clip(values, -9, 9)] for values in noise)
     ax[100] = "broken"
     return {"t": [f"{i / 100:.2f}" for i in range(rows)], "ax": ax, "beta": beta}
 

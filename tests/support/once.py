@@ -1,4 +1,4 @@
-"""What is made once, for all tests and all test processes."""
+"""Data that is made once, for all tests and all test processes."""
 
 import os
 import shutil
@@ -17,36 +17,36 @@ from fleet_slip import compiling
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.warehouse.warehouse import Warehouse
 
-_made: dict[Path, frozenset[Path]] = {}
-"""What is committed and published in each."""
+_results: dict[Path, frozenset[Path]] = {}
+"""The files that are committed and published in each."""
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
     """Return a folder that the first process to ask for it makes, while the others wait."""
     base = factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    made, begun = shared / name, shared / f"{name}-begun"
+    result, begun = shared / name, shared / f"{name}-begun"
     with LocalFolder(shared).exclusive(f"{name}.lock", lambda: None):
-        if not made.exists():
+        if not result.exists():
             shutil.rmtree(begun, ignore_errors=True)  # of a process that was killed
             make(begun)
-            begun.rename(made)
-    _made.setdefault(made, _landed(made))
-    return made
+            begun.rename(result)
+    _results.setdefault(result, _landed(result))
+    return result
 
 
 def filled_once(fill: Callable[[Warehouse], object]) -> Callable[[Warehouse], Warehouse]:
     """Fill a warehouse once in each process; every one that is asked for is a copy."""
 
     @cache
-    def kept() -> TemporaryDirectory[str]:
+    def filled_folder() -> TemporaryDirectory[str]:
         folder = TemporaryDirectory()
         fill(Warehouse(LocalFolder(Path(folder.name))))
         return folder
 
     @wraps(fill)
     def copy(warehouse: Warehouse) -> Warehouse:
-        shutil.copytree(kept().name, str(warehouse.root), dirs_exist_ok=True)
+        shutil.copytree(filled_folder().name, str(warehouse.root), dirs_exist_ok=True)
         return warehouse
 
     return copy
@@ -75,7 +75,7 @@ def compile_once() -> None:
 
 def require_no_failed_run(root: object) -> None:
     """Fail if a command failed in a data root that is made once: `status` tells others of it."""
-    if Path(str(root)) in _made:
+    if Path(str(root)) in _results:
         for file in Path(str(root), "runs").glob("*.jsonl"):
             failed = '"outcome":"failed"' in file.read_text(encoding="utf-8")
             assert not failed, f"a command failed in {root}, which other tests use. Copy it first."
@@ -84,9 +84,9 @@ def require_no_failed_run(root: object) -> None:
 def require_unchanged(roots: Iterable[object]) -> None:
     """Fail if anything was committed or published in a data root that is made once."""
     for root in roots:
-        if isinstance(root, Path) and root in _made:
-            before, _made[root] = _made[root], _landed(root)  # told once
-            new = _made[root] - before
+        if isinstance(root, Path) and root in _results:
+            before, _results[root] = _results[root], _landed(root)  # told once
+            new = _results[root] - before
             assert not new, f"{min(new)} is new, and other tests use {root}. Copy it first."
 
 

@@ -71,7 +71,7 @@ def _run(x: State, u: Controls, c: Constants, slopes: Slopes, step: float, count
 
 
 class Run:
-    """What happened: `states` (steps + 1, fields), specific forces (steps, 2), the last state."""
+    """The solution: `states` (steps + 1, fields), specific forces (steps, 2), the last state."""
 
     def __init__(
         self, x: State, u: Controls, seconds: float, c: Constants = CAR, step: float = STEP_S
@@ -84,11 +84,11 @@ class Run:
         return column
 
 
-def rolling(vx: float, c: Constants = CAR, **others: float) -> State:
+def rolling(vx: float, c: Constants = CAR, **overrides: float) -> State:
     """Return a car that rolls straight ahead without slip, but for what is given."""
     at_rest = State(*(0.0 for _ in State._fields))
     spins = {f"wheel_{wheel}": vx * c.inverse_radius for wheel in ("fl", "fr", "rl", "rr")}
-    return at_rest._replace(vx=vx, **{**spins, **others})
+    return at_rest._replace(vx=vx, **{**spins, **overrides})
 
 
 def holding(vx: float, c: Constants = CAR) -> float:
@@ -105,7 +105,7 @@ def kinetic_energy(states: NDArray[np.float64], c: Constants = CAR) -> NDArray[n
 
 
 class Truth:
-    """What happened in one drive, at 100 Hz: float64 arrays of one length by `CHANNELS`."""
+    """The motion of one drive at 100 Hz: float64 arrays of one length by `CHANNELS`."""
 
     def __init__(self, channels: dict[str, FloatArray], lost_control_tick: int | None) -> None:
         self.channels, self.lost_control_tick = channels, lost_control_tick
@@ -127,7 +127,8 @@ def simulate_drives(
         lost[block.drive] = block.lost_control_tick
     return [
         Truth(
-            {name: np.concatenate([part[name] for part in some]) for name in CHANNELS}, lost[drive]
+            {name: np.concatenate([part[name] for part in blocks]) for name in CHANNELS},
+            lost[drive],
         )
-        for drive, some in enumerate(parts)
+        for drive, blocks in enumerate(parts)
     ]

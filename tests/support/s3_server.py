@@ -75,7 +75,7 @@ class Server:
 
     @property
     def environment(self) -> dict[str, str]:
-        """Where the server is, and how to be let in."""
+        """The address of the server, and its credentials."""
         return {
             "AWS_ENDPOINT_URL": f"http://127.0.0.1:{self._server.server_port}",
             "AWS_ALLOW_HTTP": "true",
@@ -127,8 +127,8 @@ class Server:
             list(self._served(environ, lambda *_: None))
             return _answer(start, "500 Internal Server Error", "InternalError")
         answer = self._served(environ, start)
-        asked = method == "GET" and re.search(faults.flipping, environ["PATH_INFO"])
-        if asked and self._rng.random() < faults.flipped:
+        flipping = method == "GET" and re.search(faults.flipping, environ["PATH_INFO"])
+        if flipping and self._rng.random() < faults.flipped:
             return [self._flip(b"".join(answer))]
         if faults.bytes_per_s and method == "GET" and not environ["QUERY_STRING"]:
             return _slowly(b"".join(answer), faults.bytes_per_s)
@@ -191,10 +191,10 @@ class ServerApart:
         self._process.kill()
         self._process.communicate()
 
-    def _answer(self, asked: object = None) -> Any:
+    def _answer(self, _query: object = None) -> Any:
         assert self._process.stdin and self._process.stdout
-        if asked is not None:
-            self._process.stdin.write(f"{json.dumps(asked)}\n")
+        if _query is not None:
+            self._process.stdin.write(f"{json.dumps(_query)}\n")
             self._process.stdin.flush()
         return json.loads(self._process.stdout.readline())
 

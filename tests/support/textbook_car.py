@@ -18,16 +18,16 @@ def a_car(least_mps: float = 8.0) -> Car:
     )
     yaw_rate, ay = curvature * speed, curvature * speed**2
     road_wheel = 2.7 * curvature + 0.003 * ay
-    left, right = (1 - curvature * TRACK_M / 2, 1 + curvature * TRACK_M / 2)
+    inner, right = (1 - curvature * TRACK_M / 2, 1 + curvature * TRACK_M / 2)
     longer = np.sqrt(1 + (2.7 * curvature) ** 2)
     return {
         "ax": ax,
         "ay": ay,
         "yaw_rate": yaw_rate,
         "steering_wheel": 15 * road_wheel,
-        "wheel_fl": speed * left * longer / RADIUS_M,
+        "wheel_fl": speed * inner * longer / RADIUS_M,
         "wheel_fr": speed * right * longer / RADIUS_M,
-        "wheel_rl": speed * left / RADIUS_M,
+        "wheel_rl": speed * inner / RADIUS_M,
         "wheel_rr": speed * right / RADIUS_M,
         "sideslip": 1.4 * yaw_rate / speed - 0.004 * ay,
     }

@@ -44,20 +44,20 @@ TINY = {
     "statistics_figures": "{root} smoke --output {folder}",
     "validation": "",
 }
-"""What makes each small. `{root}` is a data root, see `tiny_root`."""
+"""Arguments of tiny sizes. `{root}` is a data root, see `tiny_root`."""
 
 RUN_BY = {
     "crash": "system/test_crash.py",
     "interleave": "operations/test_races.py",
     "rivals": "system/test_rivals.py",
 }
-"""What a test of its own runs, with sizes that are not tiny."""
+"""Benchmarks that separate tests run with larger sizes."""
 
 ELSEWHERE = {"weka": "WEKA and a JVM"}
-"""What is not run here, and what it needs."""
+"""Benchmarks that do not run here, and what they need."""
 
 PARTS = {"__main__", "peer_ways", "usage"}
-"""What benchmarks start as processes of their own."""
+"""Modules that benchmarks start as processes."""
 
 
 @pytest.fixture(scope="session")
@@ -66,15 +66,17 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
 
     def make(root: Path) -> None:
         shutil.copytree(smoke_root, root)
-        few = root.with_name("few.toml")
-        few.write_text(
+        short_list = root.with_name("few.toml")
+        short_list.write_text(
             'name = "few"\nbase = "fleet"\ndrives_per_day = 8\nlaps = 0.1\n'
             'plan.vehicles = ["d_class_sedan"]\n'
         )
-        done_on(root, "simulate", few, "--days", "1")
+        done_on(root, "simulate", short_list, "--days", "1")
         done_on(root, "gram")
-        own = write_list(root.with_name("list.toml"), "ay")
-        done_on(root, "publish", "few", "--models", own, "--cohort", "campaign = 'few'", "--force")
+        list_path = write_list(root.with_name("list.toml"), "ay")
+        done_on(
+            root, "publish", "few", "--models", list_path, "--cohort", "campaign = 'few'", "--force"
+        )
 
     return made_once(tmp_path_factory, "benchmarks", make)
 
@@ -85,9 +87,9 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory, smoke_root: Path) -> Pat
 def test_a_benchmark_runs_with_tiny_sizes(name: str, tiny_root: Path, tmp_path: Path) -> None:
     before = checkout()
     root = shutil.copytree(tiny_root, tmp_path / "data")
-    given = shlex.split(TINY[name].format(root=root, folder=tmp_path / "folder"))
+    arguments = shlex.split(TINY[name].format(root=root, folder=tmp_path / "folder"))
     done = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{name}", *given],
+        [sys.executable, "-m", f"benchmarks.{name}", *arguments],
         cwd=tmp_path,  # what it writes stays here
         env={**os.environ, "PYTHONPATH": str(HERE)},
         capture_output=True,
@@ -180,7 +182,7 @@ def test_make_bench_runs_what_is_there() -> None:
 
 
 def test_no_test_imports_a_benchmark() -> None:
-    """What both need lies in tests/support; the rivals are a small package of their own."""
+    """Shared code is in tests/support; the rivals are a small package."""
     pattern = re.compile(r"^\s*(?:from|import) benchmarks\b(?!\.rivals)", re.M)
     tests = (HERE / "tests").rglob("*.py")
     assert [str(path) for path in tests if pattern.search(path.read_text("utf-8"))] == []

@@ -38,7 +38,7 @@ KILLS = 40
 
 @pytest.mark.timeout(7200)
 def test_commands_that_are_killed_and_repeated_end_in_the_same_bits() -> None:
-    """What `python -m benchmarks.crash` does; a new process, because it forks."""
+    """`python -m benchmarks.crash` in a new process, because it forks."""
     command = [sys.executable, "-m", "benchmarks.crash", "--kills", str(KILLS)]
     done = run(command, patience_s=7000, cwd=Path(__file__).parents[2])
     assert done.exit_code == 0, done.stderr
@@ -94,16 +94,16 @@ def test_a_full_disk_is_told_and_the_same_command_goes_on_after_it(
 
 
 def meaning(root: Path) -> dict[str, Any]:
-    """What a data root holds, whatever its files are called.
+    """Return the content of a data root, without the names of its files.
 
     A file that was written when the disk was full, and not committed, is left alone: the next has
     a longer name.
     """
-    known = state(root)
-    logs = [digest for path, digest in known.pop("files").items() if path.parts[0] == "logs"]
+    stored = state(root)
+    logs = [digest for path, digest in stored.pop("files").items() if path.parts[0] == "logs"]
     with fleet_slip.connect(root) as database:
         grams = database.execute("SELECT * EXCLUDE (file) FROM grams ORDER BY ALL").fetchall()
-    return {**known, "logs": sorted(logs), "grams": grams}
+    return {**stored, "logs": sorted(logs), "grams": grams}
 
 
 def test_a_read_only_root_is_told_and_can_be_queried(
@@ -122,18 +122,18 @@ def test_a_read_only_root_is_told_and_can_be_queried(
 
 def test_a_damaged_log_file_is_named(run_command: RunCommand, simulated: Path) -> None:
     file = next((simulated / "logs").rglob("smoke-0000*.parquet"))
-    whole = file.read_bytes()
-    for damaged in (whole[:1000], b"", b"x" * len(whole)):
+    content = file.read_bytes()
+    for damaged in (content[:1000], b"", b"x" * len(content)):
         file.write_bytes(damaged)
-        told = run_command("gram")
-        assert told.exit_code == 6
-        assert file.name in told.stderr
+        result = run_command("gram")
+        assert result.exit_code == 6
+        assert file.name in result.stderr
     file.unlink()
     for command in (["gram"], ["sql", "SELECT max(ax_mps2) FROM log"]):
-        told = run_command(*command)
-        assert told.exit_code == 6
-        assert file.name in told.stderr
-    file.write_bytes(whole)
+        result = run_command(*command)
+        assert result.exit_code == 6
+        assert file.name in result.stderr
+    file.write_bytes(content)
     assert json.loads(run_command("gram", "--json").stdout)["files_read"] == 4
     table = run_command("verify", "--grams").stdout.splitlines()
     assert "SQL against the kernel                    8    yes" in table
@@ -147,8 +147,8 @@ def failing_disk(tmp_path: Path) -> dict[str, str]:
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("this machine has no C compiler to make a disk fail with")
-    made = run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"])
-    assert made.exit_code == 0, made.stderr
+    build = run([compiler, "-shared", "-fPIC", "-o", library, source, "-ldl"])
+    assert build.exit_code == 0, build.stderr
     return {**os.environ, "LD_PRELOAD": str(library)}
 
 
@@ -288,8 +288,8 @@ def test_commands_at_once_leave_what_they_leave_one_after_the_other(
     assert [code for code, _ in at_once(parallel, *jobs, *jobs, ["gram"], ["gram"])] == [0] * 8
     run_command("gram", root=parallel)
     assert contents(run_command, parallel) == contents(run_command, serial)
-    own = write_list(tmp_path / "own.toml", *nested("ay,steering_wheel"))
-    publishing = ["publish", "m", "--models", own, "--cohort", "campaign = 'smoke'"]
+    list_path = write_list(tmp_path / "own.toml", *nested("ay,steering_wheel"))
+    publishing = ["publish", "m", "--models", list_path, "--cohort", "campaign = 'smoke'"]
     for code, text in at_once(parallel, publishing, publishing, publishing):
         assert code == 0, text
     versions = run_command("models", "m", "--json", root=parallel).json
@@ -309,8 +309,8 @@ def test_the_second_run_of_a_campaign_waits_and_has_nothing_to_do(
             assert process.stderr
             assert process.stderr.readline() == "smoke: waiting for another fleet-slip run\n"
     done = finish(*running)
-    assert [one.exit_code for one in done] == [0, 0]
-    assert sum("nothing to do, smoke@1 is up to date" in one.stderr for one in done) == 1
-    both, one = state(tmp_path / "data"), state(smoke_root)
-    assert (both["versions"], both["moves"]) == (one["versions"], one["moves"])
-    assert both["files"].keys() == one["files"].keys()
+    assert [result.exit_code for result in done] == [0, 0]
+    assert sum("nothing to do, smoke@1 is up to date" in result.stderr for result in done) == 1
+    concurrent, single = state(tmp_path / "data"), state(smoke_root)
+    assert (concurrent["versions"], concurrent["moves"]) == (single["versions"], single["moves"])
+    assert concurrent["files"].keys() == single["files"].keys()

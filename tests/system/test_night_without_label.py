@@ -10,7 +10,7 @@ from tests.support.commands import done_on, run_on
 PAGE = Path(__file__).parents[2] / "docs/course.md"
 BLOCK = r'```\w+ title="([^"]+)"\n(.*?)```'
 FILES = dict(re.findall(BLOCK, PAGE.read_text(encoding="utf-8"), re.DOTALL))
-"""What the page tells its readers to write: a campaign, a mapping, and what a logger has."""
+"""The files that the page tells its readers to write: a campaign, a mapping, and columns."""
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(1800)]
 
@@ -36,8 +36,10 @@ def test_a_night_learns_from_the_course_and_the_next_one_again(tmp_path: Path) -
     (tmp_path / "landing/one.csv").write_text(logged(tmp_path, "one", 7), encoding="utf-8")
     assert "freed@1" in night(tmp_path, "2024-06-01")
     (tmp_path / "landing/two.csv").write_text(logged(tmp_path, "two", 8), encoding="utf-8")
-    told = " ".join(night(tmp_path, "2024-06-02").split())
-    assert re.search(r"On the same .* held out", told), "both versions, by what the course changes"
-    asked = run_on(tmp_path / "fleet", "select")
-    assert asked.exit_code, "there is no label to learn from"
-    assert "learn from it: fleet-slip select --label course" in asked.stderr
+    output = " ".join(night(tmp_path, "2024-06-02").split())
+    assert re.search(r"On the same .* held out", output), (
+        "both versions, by what the course changes"
+    )
+    selection = run_on(tmp_path / "fleet", "select")
+    assert selection.exit_code, "there is no label to learn from"
+    assert "learn from it: fleet-slip select --label course" in selection.stderr

@@ -160,8 +160,8 @@ def test_the_gate_refuses_a_worse_model_list_and_leaves_the_data_root(
 
 @pytest.mark.long
 def test_the_gate_passes_a_model_list_that_is_as_good(smoke_root: Path, tmp_path: Path) -> None:
-    own = shutil.copy(CHECKOUT / "configs/models/estimator.toml", tmp_path / "own.toml")
-    passed, outputs = gate(smoke_root, tmp_path, MODELS=str(own))
+    list_path = shutil.copy(CHECKOUT / "configs/models/estimator.toml", tmp_path / "own.toml")
+    passed, outputs = gate(smoke_root, tmp_path, MODELS=str(list_path))
     assert passed.exit_code == 0, passed.stderr
     assert json.loads(Path(outputs["decision"]).read_text())
 

@@ -28,7 +28,7 @@ from tests.support.drives import noisy, slalom
 
 HERE = Path(__file__).resolve().parents[2]
 CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
-CLASS = next(one for one in FILTERS if one.name == "ekf_class")
+CLASS = next(spec for spec in FILTERS if spec.name == "ekf_class")
 
 
 def sample(rows: int = 1200, drives: int = 12) -> RowSample:
@@ -47,13 +47,13 @@ def test_a_learner_learns_drives_that_it_has_not_seen(
     monkeypatch.setattr(learners, "MOST_TREES", 60)
     monkeypatch.setattr(anfis, "EPOCHS", 8)
     with one_thread():
-        found = sample().cross_validated(LEARNERS[name], all_signals())
-    assert found.coverage == 1
-    assert found.error_std_deg is not None
-    assert found.error_std_deg < 0.75 * np.degrees(sample().sideslip_rad.std())
+        predictions = sample().cross_validated(LEARNERS[name], all_signals())
+    assert predictions.coverage == 1
+    assert predictions.error_std_deg is not None
+    assert predictions.error_std_deg < 0.75 * np.degrees(sample().sideslip_rad.std())
 
 
-def test_whole_drives_are_held_back() -> None:
+def test_drives_are_held_back_completely() -> None:
     names = np.repeat([f"{number:03}" for number in range(20)], 7)
     mask = hold_back(names)
     assert mask.sum() == 14
@@ -78,9 +78,9 @@ def test_a_rival_sees_on_a_drive_what_it_was_trained_on(smoke_root: Path) -> Non
         ).fetchnumpy()
     signals = {"ay_mps2": np.ma.filled(rows["ay_mps2"].astype(float), np.nan)}
     stride = cohort.rows // 1000
-    found = estimate.estimate(signals, {})[::stride]
+    estimates = estimate.estimate(signals, {})[::stride]
     expected = drawn.inputs[drawn.trip == drive_id, 1]
-    np.testing.assert_array_equal(found[np.isfinite(found)], expected)
+    np.testing.assert_array_equal(estimates[np.isfinite(estimates)], expected)
 
 
 @pytest.mark.long
@@ -91,8 +91,8 @@ def test_a_tree_without_factors_is_the_filter_and_never_worse_with_them() -> Non
     with ThreadPoolExecutor(1) as executor:
         fitted = fit_tree_filter(base, CAR, drives, executor)
 
-    def rms(one: TreeFilter) -> float:
-        errors = [one.estimate(d.signals, CAR, one.noise) - d.sideslip_rad for d in drives]
+    def rms(spec: TreeFilter) -> float:
+        errors = [spec.estimate(d.signals, CAR, spec.noise) - d.sideslip_rad for d in drives]
         return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
     plain = replace(fitted, noise=LeafNoise())

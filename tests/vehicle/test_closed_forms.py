@@ -20,7 +20,7 @@ SMALL_RAD = 0.002
 """Angle of the road wheels: half a metre per second squared."""
 
 TIME_S = np.arange(0.0, 4.0, 0.01)
-RIGID = LinearBicycle.of(load_vehicle("d_class_sedan", SHIPPED_CONFIGS), SPEED_MPS)
+RIGID = LinearBicycle.from_car(load_vehicle("d_class_sedan", SHIPPED_CONFIGS), SPEED_MPS)
 
 
 def lagged_step(bicycle: LinearBicycle, lag_s: float) -> FloatArray:
@@ -35,7 +35,7 @@ def lagged_step(bicycle: LinearBicycle, lag_s: float) -> FloatArray:
 @pytest.mark.parametrize("name", CARS)
 def test_a_small_step_of_the_steering_answers_as_the_bicycle(name: str) -> None:
     car = load_vehicle(name, SHIPPED_CONFIGS)
-    bicycle = LinearBicycle.of(car, SPEED_MPS)
+    bicycle = LinearBicycle.from_car(car, SPEED_MPS)
     found = steer(car, PERFECT, np.full(len(TIME_S), car.steering.ratio * SMALL_RAD), SPEED_MPS)
     vy, rate = SMALL_RAD * lagged_step(bicycle, car.steering.lag_s)
     assert found.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * bicycle.yaw_gain_1ps, rel=0.03)
@@ -60,7 +60,7 @@ def test_a_small_sine_of_the_steering_answers_as_the_bicycle(
     # The demand is held for 10 ms, on average 5 ms late.
     lag = 1 / (1 + 2j * np.pi * frequency_hz * car.steering.lag_s)
     held = np.exp(-2j * np.pi * frequency_hz * 0.005)
-    expected = LinearBicycle.of(car, SPEED_MPS).yaw_response(frequency_hz) * lag * held
+    expected = LinearBicycle.from_car(car, SPEED_MPS).yaw_response(frequency_hz) * lag * held
     assert abs(amplitude / expected - 1) < 0.05
 
 
@@ -90,7 +90,7 @@ def test_tyres_that_relax_answer_as_the_bicycle_with_two_more_states() -> None:
 def test_a_compliant_steering_answers_as_a_softer_front_axle() -> None:
     car = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
     flaws = CarImperfections(steering_compliance_deg_per_kn=0.15)
-    soft = LinearBicycle.of(car, SPEED_MPS, float(np.radians(0.15)) / 1000)
+    soft = LinearBicycle.from_car(car, SPEED_MPS, float(np.radians(0.15)) / 1000)
     demand = np.full(len(TIME_S), car.steering.ratio * SMALL_RAD)
     found = steer(car, flaws, demand, SPEED_MPS)
     assert found.yaw_rate_rad_s[-1] == pytest.approx(SMALL_RAD * soft.yaw_gain_1ps, rel=0.02)

@@ -78,7 +78,7 @@ def test_diabetes_best_subsets(diabetes: tuple[Gram, dict[str, Any]]) -> None:
 
 
 def test_aic_orders_as_the_published_cp(diabetes: tuple[Gram, dict[str, Any]]) -> None:
-    """Of nested models C_p = AIC + 1 - k, with the variance of the full model."""
+    """For nested models C_p = AIC + 1 - k, with the variance of the full model."""
     gram, answers = diabetes
     order = answers["forward_order"]
     fits = nested_fits(gram, order, "y")
@@ -176,28 +176,28 @@ def named(inputs: int) -> list[str]:
 @pytest.mark.parametrize("method", ["forward", "backward"])
 def test_the_order_is_that_of_exact_arithmetic(seed: int, method: str) -> None:
     gram = correlated(seed, 12)
-    found = stepwise_order(gram, named(12), "y", method, 12)
-    assert found[-1] == rank(method, gram, named(12), "y") == greedy_order(gram, method)
-    assert [len(chosen) for chosen in found] == list(range(1, 13))
+    order = stepwise_order(gram, named(12), "y", method, 12)
+    assert order[-1] == rank(method, gram, named(12), "y") == greedy_order(gram, method)
+    assert [len(chosen) for chosen in order] == list(range(1, 13))
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_exchange_ends_where_no_exchange_helps(seed: int) -> None:
     gram = correlated(seed, 9)
-    found = stepwise_order(gram, named(9), "y", "exchange", 9)
+    order = stepwise_order(gram, named(9), "y", "exchange", 9)
     forward = stepwise_order(gram, named(9), "y", "forward", 9)
 
     def rss(chosen: Iterable[str]) -> Fraction:
         return fit(gram, tuple(chosen), "y").rss
 
-    for chosen, added in zip(found, forward, strict=True):
+    for chosen, added in zip(order, forward, strict=True):
         assert rss(chosen) <= rss(added)
-        others = {name: {*chosen} - {name} for name in chosen}
-        for left in others.values():
-            assert all(rss({*left, new}) >= rss(chosen) for new in {*named(9)} - {*chosen})
+        subsets = {name: {*chosen} - {name} for name in chosen}
+        for subset in subsets.values():
+            assert all(rss({*subset, new}) >= rss(chosen) for new in {*named(9)} - {*chosen})
 
 
-def test_of_equal_columns_the_first_declared_is_taken() -> None:
+def test_the_first_declared_of_equal_columns_is_chosen() -> None:
     rng = np.random.default_rng(3)
     x, z = rng.integers(-1000, 1000, (2, 300))
     y = 3 * x + z + rng.integers(-50, 50, 300)
@@ -231,16 +231,14 @@ def test_a_hundred_columns_are_searched_in_a_moment() -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_shortens_a_search_changes_no_order(
-    method: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_shortcuts_of_a_search_keep_the_order(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Inputs far from dependent need no elimination."""
     gram = correlated(5, 40)
-    found = stepwise_order(gram, named(40), "y", method, 40)
-    assert len(found) == 40
+    order = stepwise_order(gram, named(40), "y", method, 40)
+    assert len(order) == 40
     monkeypatch.setattr(orders, "DEPENDENT", 1e-13)
     monkeypatch.setattr(np.linalg, "cholesky", _singular)
-    assert stepwise_order(gram, named(40), "y", method, 40) == found
+    assert stepwise_order(gram, named(40), "y", method, 40) == order
 
 
 def _singular(_: object) -> None:

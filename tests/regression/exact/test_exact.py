@@ -81,10 +81,10 @@ def test_all_nested_models_equal_separate_fits(seed: int) -> None:
 
 def test_dependent_signals_are_named_with_the_relation() -> None:
     rng = np.random.default_rng(1)
-    left = rng.integers(-500, 500, 40)
+    first = rng.integers(-500, 500, 40)
     other, label = rng.integers(-500, 500, (2, 40))
     constant = np.full(40, 6)
-    counts = np.column_stack([left, other, 2 * left - other + 3, constant, label])
+    counts = np.column_stack([first, other, 2 * first - other + 3, constant, label])
     gram = Gram.from_counts(("steer_fl", "ay", "steer_fr", "ax", "sideslip"), counts)
     inputs = ["steer_fl", "ay", "steer_fr", "ax"]
     with pytest.raises(DataError) as raised:
@@ -148,8 +148,8 @@ def test_condition_number_is_that_of_the_correlations() -> None:
 
 
 def solved(matrix: list[list[int]]) -> list[Fraction] | None:
-    found = exact.solve([row[:-1] for row in matrix], [row[-1] for row in matrix])
-    return None if found is None else [Fraction(x, found[1]) for x in found[0]]
+    solution = exact.solve([row[:-1] for row in matrix], [row[-1] for row in matrix])
+    return None if solution is None else [Fraction(x, solution[1]) for x in solution[0]]
 
 
 @given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 60))

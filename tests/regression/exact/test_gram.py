@@ -125,12 +125,12 @@ def test_moments_about_an_origin_survive_wrapping() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wanted", "told"),
+    ("names", "fault"),
     [("b", "lack b."), ("bc", "lack b and c."), ("bcdefgh", "lack b, c, d, e and 3 more.")],
 )
-def test_absent_signals_are_named_of_many_the_first(wanted: str, told: str) -> None:
-    with pytest.raises(DataError, match=f"{told}$".replace(".", r"\.")):
-        require_signals("a", wanted)
+def test_absent_signals_are_named_of_many_the_first(names: str, fault: str) -> None:
+    with pytest.raises(DataError, match=f"{fault}$".replace(".", r"\.")):
+        require_signals("a", names)
 
 
 def test_blas_is_exact_at_the_largest_counts_over_many_blocks() -> None:

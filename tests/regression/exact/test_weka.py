@@ -55,7 +55,7 @@ def weka_linear_regression(
     if selection == "none":
         return model
     price = _Akaike(gram, model)
-    removals = _smallest if selection == "m5" else _each
+    removals = _smallest if selection == "m5" else _models
     improved = True
     while improved and model.signals:
         candidates = [
@@ -112,7 +112,7 @@ def _smallest(gram: Gram, model: LinearModel) -> list[str]:
     return [min(sizes, key=lambda name: sizes[name])]
 
 
-def _each(gram: Gram, model: LinearModel) -> list[str]:
+def _models(gram: Gram, model: LinearModel) -> list[str]:
     return list(model.signals)
 
 
@@ -136,7 +136,7 @@ def standardised_size(gram: Gram, model: LinearModel) -> dict[str, float]:
 
 DATASETS = ["diabetes_raw", "vehicle9"]
 RUNS = range(6)
-"""Of the files: LinearRegression, and PaceRegression that leaves least squares as it is."""
+"""Models of the files: LinearRegression, and PaceRegression that keeps least squares as it is."""
 SELECTION: dict[str, Any] = {"-S 0": "m5", "-S 1": "none", "-S 2": "greedy"}
 
 # WEKA's LinearRegression solves normal equations of condition 2e6 in floating point and has lost

@@ -65,9 +65,9 @@ def test_intervals_of_few_unequal_cars_hold(cars: int, rows: int) -> None:
     for _ in range(100):
         drives = drives_of(random, cars, 3, rows=rows)
         fitted = fit(gram_of(np.concatenate(drives)), names(3)[:-1], "y")
-        for one in infer(fitted, unit_scales(3), moments_of(drives)).estimates[1:]:
-            reach = scipy.stats.t.ppf(0.975, one.degrees_of_freedom) * one.standard_error
-            inside.append(abs(one.value - 1) <= reach)
+        for estimate in infer(fitted, unit_scales(3), moments_of(drives)).estimates[1:]:
+            reach = scipy.stats.t.ppf(0.975, estimate.degrees_of_freedom) * estimate.standard_error
+            inside.append(abs(estimate.value - 1) <= reach)
     assert np.mean(inside) >= 0.92
 
 
@@ -83,9 +83,9 @@ def test_variance_inflation_is_that_of_the_inverse_correlations() -> None:
 
 def test_questions_without_an_answer_are_errors() -> None:
     drives = random_drives(1, drives=2)
-    few = gram_of(drives[0][:2, [0, -1]])
+    small = gram_of(drives[0][:2, [0, -1]])
     with pytest.raises(DataError, match="2 rows are too few"):
-        infer(fit(few, ["x1"], "y"), unit_scales(1))
+        infer(fit(small, ["x1"], "y"), unit_scales(1))
     with pytest.raises(DataError, match="no drive of the cohort has all"):
         complete_cases([moments_table()], ["x9"])
 
@@ -169,11 +169,11 @@ def test_the_best_subsets_and_orders_are_those_of_the_rows() -> None:
 
     for best in best_subsets(gram, INPUTS, "y")[1:]:
         assert best.model.intercept == 0
-        mine = [INPUTS.index(name) for name in best.model.signals]
-        assert float(best.rss) == pytest.approx(rss(mine), rel=1e-9)
-        others = [rss([i for i in range(4) if mask >> i & 1]) for mask in range(1, 16)]
+        chosen = [INPUTS.index(name) for name in best.model.signals]
+        assert float(best.rss) == pytest.approx(rss(chosen), rel=1e-9)
+        subset_errors = [rss([i for i in range(4) if mask >> i & 1]) for mask in range(1, 16)]
         sizes = [mask.bit_count() for mask in range(1, 16)]
-        least = min(r for r, size in zip(others, sizes, strict=True) if size == best.size)
+        least = min(r for r, size in zip(subset_errors, sizes, strict=True) if size == best.size)
         assert float(best.rss) == pytest.approx(least, rel=1e-9)
     alone = min(range(4), key=lambda i: rss([i]))
     assert rank("forward", gram, INPUTS, "y")[0] == INPUTS[alone]
@@ -197,26 +197,26 @@ def test_members_of_equal_variance_are_drawn_as_the_closed_form_says() -> None:
     root = np.sqrt(45) * np.arcsin(2 * BASEBALL - 1)  # of variance 1
     mean, squares = root.mean(), root.var() * 18
     drawn = np.roots([squares, -(squares + 17), 17 - 2]).min()
-    found = pool(root, np.ones(18))
-    assert found is not None
-    assert found.mean == pytest.approx(mean)
-    assert found.values == pytest.approx(root + drawn * (mean - root))
-    assert found.spread == pytest.approx(np.sqrt(1 / drawn - 1))
+    pooled = pool(root, np.ones(18))
+    assert pooled is not None
+    assert pooled.mean == pytest.approx(mean)
+    assert pooled.values == pytest.approx(root + drawn * (mean - root))
+    assert pooled.spread == pytest.approx(np.sqrt(1 / drawn - 1))
 
 
 @given(NUMBERS, VARIANCES, st.floats(-10, 10), st.floats(0.1, 10))
 def test_a_unit_and_an_origin_change_nothing_else(
     values: FloatArray, variances: FloatArray, origin: float, unit: float
 ) -> None:
-    one, other = pool(values, variances), pool(unit * values + origin, unit**2 * variances)
-    assert one is not None
+    original, other = pool(values, variances), pool(unit * values + origin, unit**2 * variances)
+    assert original is not None
     assert other is not None
-    assert other.values == pytest.approx(unit * one.values + origin, abs=1e-6)
-    assert other.errors == pytest.approx(unit * one.errors, rel=1e-3, abs=1e-6)
-    assert other.spread == pytest.approx(unit * one.spread, rel=1e-3, abs=1e-5)
+    assert other.values == pytest.approx(unit * original.values + origin, abs=1e-6)
+    assert other.errors == pytest.approx(unit * original.errors, rel=1e-3, abs=1e-6)
+    assert other.spread == pytest.approx(unit * original.spread, rel=1e-3, abs=1e-5)
 
 
-def test_of_too_few_members_nothing_is_drawn() -> None:
+def test_too_few_members_are_not_pooled() -> None:
     assert pool(np.arange(3.0), np.ones(3)) is None
 
 
@@ -230,10 +230,10 @@ def test_errors_hold_as_often_as_stated_and_are_smaller(spread: float, members: 
     for _ in range(1200 // members):
         true = 3 + spread * random.standard_normal(members)
         values = true + np.sqrt(variances) * random.standard_normal(members)
-        found = pool(values, variances)
-        assert found is not None
-        within.append(np.abs(found.values - true) <= 1.645 * found.errors)
-        gain.append((found.values - true) ** 2 - (values - true) ** 2)
+        pooled = pool(values, variances)
+        assert pooled is not None
+        within.append(np.abs(pooled.values - true) <= 1.645 * pooled.errors)
+        gain.append((pooled.values - true) ** 2 - (values - true) ** 2)
     assert np.mean(within) >= 0.885
     assert np.mean(within) <= (1 if spread == 0 else 0.94)
     assert np.mean(gain) < 0

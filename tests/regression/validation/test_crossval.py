@@ -105,8 +105,8 @@ def test_folds_lacking_a_signal_are_an_error() -> None:
 def test_the_hash_of_a_drive_decides_its_fold_for_ever() -> None:
     assert [hash_fold(f"drive-{i}", 5) for i in range(8)] == [4, 4, 1, 4, 3, 1, 1, 1]
     ids = [f"d{i}" for i in range(200)]
-    few, many = by_hash(ids[:100], 5), by_hash(ids, 5)
-    np.testing.assert_array_equal(few.fold, many.fold[:100])
+    subset, many = by_hash(ids[:100], 5), by_hash(ids, 5)
+    np.testing.assert_array_equal(subset.fold, many.fold[:100])
     sizes = np.bincount(by_hash([f"d{i}" for i in range(10_000)], 5).fold)
     assert sizes.min() > 1800
     assert sizes.max() < 2200
@@ -114,9 +114,9 @@ def test_the_hash_of_a_drive_decides_its_fold_for_ever() -> None:
 
 def test_folds_that_no_drive_falls_into_are_left_out() -> None:
     ids = [f"drive-{i}" for i in range(4)]
-    few = by_hash(ids, 50)
-    assert few.names == tuple(str(n + 1) for n in sorted({hash_fold(i, 50) for i in ids}))
-    assert [few.names[fold] for fold in few.fold] == [str(hash_fold(i, 50) + 1) for i in ids]
+    folds = by_hash(ids, 50)
+    assert folds.names == tuple(str(n + 1) for n in sorted({hash_fold(i, 50) for i in ids}))
+    assert [folds.names[fold] for fold in folds.fold] == [str(hash_fold(i, 50) + 1) for i in ids]
 
 
 def test_single_folds_are_errors() -> None:
@@ -162,7 +162,7 @@ def test_a_gain_that_is_real_and_worth_nothing_buys_no_signal() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 2.0])
-def test_what_a_model_lacks_does_not_depend_on_the_noise_of_the_label(noise: float) -> None:
+def test_the_shortfall_of_a_model_does_not_depend_on_label_noise(noise: float) -> None:
     small = candidate("small", 3, 0.985, *(math.hypot(0.5, noise) for _ in range(2)))
     best = candidate("best", 5, 0.990, *(math.hypot(0.4, noise) for _ in range(2)))
     assert choose([small, best], 0.301).model is small
@@ -179,12 +179,12 @@ def test_a_gain_that_is_not_real_buys_no_signal_however_large() -> None:
 
 def test_the_standard_error_of_a_shortfall_is_that_of_a_paired_t_test() -> None:
     cohort = cohort_of(random_drives(1, inputs=6), [0, 1, 2] * 4)
-    one, other = (cross_validated(str(k), cohort, names(6)[:k]) for k in (3, 5))
-    chosen = choose([one, other])
-    rest = next(s for s in chosen.gaps if s.model is not chosen.best)
-    a, b = ([fold.rmse for fold in m.folds] for m in (rest.model, chosen.best))
+    smaller, other = (cross_validated(str(k), cohort, names(6)[:k]) for k in (3, 5))
+    chosen = choose([smaller, other])
+    gap = next(s for s in chosen.gaps if s.model is not chosen.best)
+    a, b = ([fold.rmse for fold in m.folds] for m in (gap.model, chosen.best))
     expected = np.mean(np.subtract(a, b)) / stats.ttest_rel(a, b).statistic
-    assert rest.standard_error == pytest.approx(expected, rel=1e-9)
+    assert gap.standard_error == pytest.approx(expected, rel=1e-9)
 
 
 def test_models_of_other_rows_are_compared_without_pairs() -> None:
@@ -223,11 +223,11 @@ def test_a_json_document_has_what_is_promised() -> None:
 def test_bands_are_contiguous_and_whole(values: list[int], count: int) -> None:
     if len(set(values)) < 2:
         return
-    found = by_value(values, count)
-    assert len(found.names) == min(count, len(set(values)))
+    bands = by_value(values, count)
+    assert len(bands.names) == min(count, len(set(values)))
     by_fold = [
-        {v for v, f in zip(values, found.fold, strict=True) if f == fold}
-        for fold in range(len(found.names))
+        {v for v, f in zip(values, bands.fold, strict=True) if f == fold}
+        for fold in range(len(bands.names))
     ]
     assert all(max(low) < min(high) for low, high in pairwise(by_fold))
     sizes = [len(band) for band in by_fold]
@@ -260,19 +260,19 @@ def compare(groups: Sequence[np.ndarray]) -> RmseGap:
 
 def draw(rng: np.random.Generator, groups: int) -> list[np.ndarray]:
     """Groups of unequal size, each with a truth of its own around that of both models."""
-    found = []
+    drives = []
     for _ in range(groups):
         x, z, noise = rng.normal(0, 100, (3, int(rng.integers(20, 80))))
         y = 2 * x + rng.normal(0.5, 0.4) * z + noise
-        found.append(np.rint(np.stack([x, z, y], axis=1)).astype(np.int64))
-    return found
+        drives.append(np.rint(np.stack([x, z, y], axis=1)).astype(np.int64))
+    return drives
 
 
 def test_the_error_is_the_spread_of_many_repetitions() -> None:
     rng = np.random.default_rng(1)
-    made = [compare(draw(rng, 12)) for _ in range(120)]
-    spread = np.std([one.rmse for one in made])
-    assert np.mean([one.standard_error for one in made]) == pytest.approx(spread, rel=0.2)
+    results = [compare(draw(rng, 12)) for _ in range(120)]
+    spread = np.std([result.rmse for result in results])
+    assert np.mean([result.standard_error for result in results]) == pytest.approx(spread, rel=0.2)
 
 
 def test_rows_of_a_group_are_not_taken_for_independent() -> None:

@@ -184,10 +184,10 @@ FORMATS: dict[str, Format] = {
 @cache
 def sound_file(name: str) -> bytes:
     """Return a file of a format in which nothing is wrong, made once in a process."""
-    one = FORMATS[name]
+    log_format = FORMATS[name]
     with tempfile.TemporaryDirectory() as folder, redirect_stdout(io.StringIO()):
-        file = Path(folder, f"log{one.suffix}")
-        one.write(file)
+        file = Path(folder, f"log{log_format.suffix}")
+        log_format.write(file)
         return file.read_bytes()
 
 

@@ -81,13 +81,13 @@ def mutate_tree(rng: random.Random, tree: Any) -> Any:
 
 def _somewhere(rng: random.Random, tree: Any) -> Any:
     """Return a dictionary or list of the tree; deep ones as often as shallow ones."""
-    found = tree
+    place = tree
     while True:
-        children = found.values() if isinstance(found, dict) else found
+        children = place.values() if isinstance(place, dict) else place
         inner = [child for child in children if isinstance(child, dict | list) and child]
         if not inner or rng.random() < 0.3:
-            return found
-        found = rng.choice(inner)
+            return place
+        place = rng.choice(inner)
 
 
 def _mutate_dict(rng: random.Random, parent: dict[str, Any]) -> None:
@@ -103,7 +103,7 @@ def _mutate_dict(rng: random.Random, parent: dict[str, Any]) -> None:
         case 2:
             parent[rng.choice(list(parent))] = parent[key]
         case _:
-            parent[key] = _near(rng, parent[key])
+            parent[key] = _neighbour(rng, parent[key])
 
 
 def _mutate_list(rng: random.Random, parent: list[Any]) -> None:
@@ -119,10 +119,10 @@ def _mutate_list(rng: random.Random, parent: list[Any]) -> None:
         case 2:
             parent.insert(at, scalar(rng))
         case _:
-            parent[at] = _near(rng, parent[at])
+            parent[at] = _neighbour(rng, parent[at])
 
 
-def _near(rng: random.Random, value: Any) -> Any:
+def _neighbour(rng: random.Random, value: Any) -> Any:
     """Return another value, often of the same kind: these get further into a program."""
     if isinstance(value, int | float | Decimal) and rng.random() < 0.7:
         factor = rng.choice([0, -1, 2, 1000, 10**6, 10**12])

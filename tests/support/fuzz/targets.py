@@ -1,4 +1,4 @@
-"""What is attacked. A target makes one hostile input and calls what the command line calls.
+"""Targets of the fuzzer. Each makes one hostile input and calls the function behind a command.
 
 It may raise `FleetSlipError`, which is an answer, and nothing else; and what it asserts must hold.
 """
@@ -192,8 +192,8 @@ def _template(temporary: str) -> Path:
         warehouse.logs.snapshot().commit(Change(add=[action], transactions=[transaction]))
     program = "from fleet_slip.cli.main import main; main()"
     command = [sys.executable, "-c", program, "--root", str(root)]
-    own = write_list(root.with_name("list.toml"), *nested("ax,ay"))
-    for arguments in (["gram"], ["publish", MODEL, "--models", own, "--force"]):
+    list_path = write_list(root.with_name("list.toml"), *nested("ax,ay"))
+    for arguments in (["gram"], ["publish", MODEL, "--models", list_path, "--force"]):
         subprocess.run([*command, *arguments], check=True, capture_output=True)
     return root
 
@@ -209,13 +209,15 @@ _DAY = np.datetime64("2024-05-01").astype(object)
 
 
 def _drive(drive_id: str, counts: np.ndarray[Any, Any]) -> pa.Table:
-    known = {"drive_id": drive_id, "vehicle_id": "car", "source": "simulated", "campaign": "fuzz"}
-    given = dict(zip(("ax", "ay", "yaw_rate", "steering_wheel", "sideslip"), counts.T, strict=True))
+    facts = {"drive_id": drive_id, "vehicle_id": "car", "source": "simulated", "campaign": "fuzz"}
+    signals = dict(
+        zip(("ax", "ay", "yaw_rate", "steering_wheel", "sideslip"), counts.T, strict=True)
+    )
     rows = len(counts)
     columns = {
-        field.name: pa.array(given[field.name], field.type)
-        if field.name in given
-        else pa.array([known.get(field.name)] * rows, field.type)
+        field.name: pa.array(signals[field.name], field.type)
+        if field.name in signals
+        else pa.array([facts.get(field.name)] * rows, field.type)
         for field in SIGNALS.log_schema
     }
     columns["day"] = pa.array([_DAY] * rows, pa.date32())
