@@ -19,6 +19,7 @@ from fleet_slip.catalog.definitions import (
     limit_of,
     parity,
     plain_column,
+    rows_behind,
 )
 from fleet_slip.catalog.features import (
     PLAIN,
@@ -103,11 +104,6 @@ class FirstStageModel(Config):
         fold = drive_id if self.hashed is None else str(hash_fold(drive_id, self.hashed) + 1)
         return fold if fold in self.folds else None
 
-    def in_fold(self, fold: str | None) -> Combination:
-        """Return the fit without a fold; the fit to all drives if there is no such fold."""
-        fit = self.folds.get(fold, self.fitted) if fold is not None else self.fitted
-        return fit.model_copy(update={"line": self.digest})
-
 
 def substitute_estimate(
     part: Any, estimate: str, fit: Combination, copies: dict[int, Any] | None = None
@@ -123,16 +119,11 @@ def substitute_estimate(
         return part
     if id(part) not in copies:
         values = {name: getattr(part, name) for name in type(part).model_fields}
-        is_estimate = isinstance(part, Definition) and part.made and part.of == estimate
-        new = (
-            {"made": fit}
-            if is_estimate
-            else {
-                name: substitute_estimate(value, estimate, fit, copies)
-                for name, value in values.items()
-            }
-        )
-        changes = {name: value for name, value in new.items() if value != values[name]}
+        if isinstance(part, Definition) and part.made and part.of == estimate:
+            changes: dict[str, Any] = {"made": fit}
+        else:
+            new = {n: substitute_estimate(v, estimate, fit, copies) for n, v in values.items()}
+            changes = {name: value for name, value in new.items() if value != values[name]}
         copies[id(part)] = part.model_copy(update=changes) if changes else part
     return copies[id(part)]
 
@@ -185,9 +176,7 @@ class Catalog:
     configs: Configs = SHIPPED_CONFIGS
     first_stage_models: FirstStageModels | None = None
     _identities: dict[str, str] = field(default_factory=dict, repr=False, compare=False)
-    _estimates: dict[str, str | None] = field(default_factory=dict, repr=False, compare=False)
-    """Identity of each set, and the estimate that it needs: computed once, shared by copies, as
-    they follow from the content alone."""
+    """Identity of each set: computed once, shared by copies, as it follows from the content."""
 
     @property
     def features(self) -> Mapping[str, Feature]:
@@ -242,10 +231,10 @@ class Catalog:
 
     def rows(self, names: Iterable[str]) -> dict[str, Definition]:
         """Return the definitions of the features among names, as columns of one row."""
-        features = {name: self.features[name] for name in names if name in self.features}
         return {
             name: plain_column(name, feature.sql, feature.bits)
-            for name, feature in features.items()
+            for name in names
+            if (feature := self.features.get(name))
         }
 
     def definitions(self, name: str, fold: str | None = None) -> dict[str, Definition]:
@@ -258,7 +247,8 @@ class Catalog:
         definitions = {window: self.time_columns[window].definition for window in windows}
         if model is None:
             return definitions
-        fit, copies = model.in_fold(fold), dict[int, Any]()
+        fit = model.folds.get(fold, model.fitted) if fold is not None else model.fitted
+        fit, copies = fit.model_copy(update={"line": model.digest}), dict[int, Any]()
         return {
             window: substitute_estimate(definition, model.estimate, fit, copies)
             for window, definition in definitions.items()
@@ -288,17 +278,12 @@ class Catalog:
     @cached_property
     def stacked_sets(self) -> Mapping[str, str]:
         """Sets whose columns need a first-stage model, and the estimate that each needs."""
-        estimates = {name: self._estimate_of(name) for name in self.sets}
-        return {name: estimate for name, estimate in estimates.items() if estimate}
-
-    def _estimate_of(self, name: str) -> str | None:
-        """Return the estimate that a set's columns are made of; None without one."""
-        if name not in self._estimates:
-            seen = set[int]()
-            windows = (self.time_columns[w].definition for w in self.feature_set(name).windows)
-            rows = (row.of for definition in windows for row in definition.rows(seen))
-            self._estimates[name] = next((row for row in rows if row in self.estimates), None)
-        return self._estimates[name]
+        stacked = {}
+        for name in self.sets if self.estimates else ():
+            rows = rows_behind(self.definitions(name))
+            if estimates := [row for row in rows if row in self.estimates]:
+                stacked[name] = estimates[0]
+        return stacked
 
     def feature_set(self, name: str) -> FeatureSet:
         """Return a feature set, its families replaced by their members.
@@ -315,34 +300,31 @@ class Catalog:
         if base not in self.sets:
             names = ", ".join((PLAIN, *self.sets))
             raise QuestionError(f"no feature set is called {name!r}. Feature sets: {names}.")
-        entry = self.sets[base]
-        return self.resolve(entry)
+        return self.resolve(self.sets[base])
 
     def resolve(self, entry: FeatureSetEntry) -> FeatureSet:
-        """Return a feature set as the file states it with its families replaced by members."""
+        """Return a feature set as the file states it, its families replaced by their members.
+
+        A set of changes has the columns of its source that change.
+        """
         members = [member for window in entry.windows for member in self.members(window)]
         content = {**dict(entry), "windows": tuple(dict.fromkeys(members))}
         feature_set = FeatureSet.model_construct(label=self.signals.label, **content)
         if entry.of is None:
             return feature_set
-        return self._add_changing_columns(feature_set, self.feature_set(entry.of))
-
-    def _add_changing_columns(self, feature_set: FeatureSet, source: FeatureSet) -> FeatureSet:
-        """Return a set of changes with the informative columns of its source.
-
-        Left out are: sums of the yaw rate, whose gyroscope noise also enters the course label;
-        means since the drive began, which hardly change; and numbers of the car, which are
-        constant.
-        """
-
-        def columns(kind: str) -> tuple[str, ...]:
+        source = self.feature_set(entry.of)
+        columns = {}
+        for kind in ("signals", "features", "windows", "calibrated"):
             names = dict.fromkeys((*getattr(source, kind), *getattr(feature_set, kind)))
-            return tuple(name for name in names if self._changes(name))
-
-        kinds = ("signals", "features", "windows", "calibrated")
-        return feature_set.model_copy(update={kind: columns(kind) for kind in kinds})
+            columns[kind] = tuple(name for name in names if self._changes(name))
+        return feature_set.model_copy(update=columns)
 
     def _changes(self, name: str) -> bool:
+        """Return True if the changes of a column contain information.
+
+        Others are sums of the yaw rate, whose gyroscope noise also enters the course label; means
+        since the drive began, which hardly change; and numbers of the car, which are constant.
+        """
         if name not in self.time_columns:
             return True
         column = self.time_columns[name].definition
@@ -406,52 +388,48 @@ class Catalog:
         """
         if name == PLAIN:
             return PLAIN
-        self.first_stage_model(name)  # raises without the model, which another root may have
-        if name not in self._identities:
-            self._identities[name] = self._identity(name)
-        return self._identities[name]
-
-    def _identity(self, name: str) -> str:
+        model = self.first_stage_model(name)  # raises without the model
+        if name in self._identities:
+            return self._identities[name]
         feature_set, signals = self.feature_set(name), self.signals
+        features = {feature: self.features[feature] for feature in feature_set.features}
+        windows = {window: self.time_columns[window] for window in feature_set.windows}
         content: dict[str, Any] = {
             "columns": list(feature_set.columns),
             "signals": {signal: str(signals[signal].scale) for signal in signals.inputs},
             "features": {
-                feature: self._feature_content(feature) for feature in feature_set.features
+                feature: {
+                    "sql": declared.sql,
+                    "scale": str(declared.scale),
+                    "unit": declared.unit,
+                    **({} if declared.bits == COUNT_BITS else {"bits": str(declared.bits)}),
+                }
+                for feature, declared in features.items()
             },
             "regimes": {},  # these three keep the identities of sets of earlier releases
             "row_folds": None,
             "lagged": False,
         }
-        if model := self.first_stage_model(name):
+        if model:
             content["line"] = {"sha256": model.sha256}
-        if extras := self._extras(feature_set):
+        used = {*feature_set.signals}.union(
+            *(feature.inputs for feature in features.values()),
+            *(window.definition.signals for window in windows.values()),
+        )
+        if extras := [name for name in signals.extras if name in used]:
             content["extras"] = {extra: str(signals[extra].scale) for extra in extras}
         if feature_set.block_ticks:
             content["block_ticks"] = feature_set.block_ticks
         if feature_set.change_ticks:
             ticks = list(feature_set.change_ticks)
             content["change"] = {"ticks": ticks, **vars(course_units(signals))}
-        if feature_set.windows:
+        if windows:
             content["windows"] = {
-                window: self.time_columns[window].model_dump(mode="json", exclude={"description"})
-                for window in feature_set.windows
+                window: column.model_dump(mode="json", exclude={"description"})
+                for window, column in windows.items()
             }
-        return f"{name}-{sha256_of(canonical_json(content))[:12]}"
-
-    def _extras(self, feature_set: FeatureSet) -> tuple[str, ...]:
-        """Return the extra signals that a set is made of."""
-        names = {*feature_set.signals}
-        for feature in feature_set.features:
-            names |= set(self.features[feature].inputs)
-        for window in feature_set.windows:
-            names |= set(self.time_columns[window].definition.signals)
-        return tuple(name for name in self.signals.extras if name in names)
-
-    def _feature_content(self, name: str) -> Mapping[str, str]:
-        feature = self.features[name]
-        content = {"sql": feature.sql, "scale": str(feature.scale), "unit": feature.unit}
-        return content if feature.bits == COUNT_BITS else content | {"bits": str(feature.bits)}
+        digest = sha256_of(canonical_json(content))[:12]
+        return self._identities.setdefault(name, f"{name}-{digest}")
 
     def name_of(self, identity: str) -> str:
         """Return the name of the set that Gram rows are of, if its definition is unchanged.

@@ -62,15 +62,12 @@ CalibrationParameterName = Literal[
     "slip_compliance",
 ]
 
-ColumnUnit = SIUnit | Literal["1"]
-"""An SI unit, or "1"."""
-
 
 @dataclass(frozen=True)
 class CalibrationParameter:
     """One calibration parameter: its unit, grain and meaning."""
 
-    unit: ColumnUnit
+    unit: SIUnit
     grain: Decimal
     description: str
 
@@ -86,7 +83,7 @@ def round_number(value: Fraction, grain: Fraction) -> int | None:
     return count if abs(count) <= COUNT_MAX else None
 
 
-_PARAMETERS: tuple[tuple[CalibrationParameterName, ColumnUnit, str, str], ...] = (
+_PARAMETERS: tuple[tuple[CalibrationParameterName, SIUnit, str, str], ...] = (
     ("yaw_rate_offset", "rad/s", "0.00000625",
      "What the gyroscope says when the car does not turn, by ay over speed"),
     ("ay_offset", "m/s^2", "0.0000625",
@@ -151,13 +148,18 @@ def limit_of(bits: int) -> int:
     return int(2 ** (bits - 1) - 1)
 
 
-def _ratio(value: Fraction) -> Fraction:
-    if not 0 < value.numerator <= LARGEST_RATIO or value.denominator > LARGEST_RATIO:
-        raise ValueError(
-            f"the scales are {value} to one: choose scales whose ratio has no numerator or "
-            f"denominator above {LARGEST_RATIO}"
-        )
-    return value
+def _bounded(largest_numerator: int, largest_denominator: int) -> AfterValidator:
+    """Return a validator of a positive ratio with bounded numerator and denominator."""
+
+    def validate(value: Fraction) -> Fraction:
+        if not 0 < value.numerator <= largest_numerator or value.denominator > largest_denominator:
+            raise ValueError(
+                f"the scales are {value} to one: choose scales whose ratio has a numerator up to "
+                f"{largest_numerator} and a denominator up to {largest_denominator}"
+            )
+        return value
+
+    return AfterValidator(validate)
 
 
 def _signals_of(info: ValidationInfo) -> SignalCatalog | None:
@@ -189,7 +191,7 @@ def _not_unknowable(name: str, info: ValidationInfo) -> str:
     return name
 
 
-Ratio = Annotated[Fraction, AfterValidator(_ratio)]
+Ratio = Annotated[Fraction, _bounded(LARGEST_RATIO, LARGEST_RATIO)]
 
 LARGEST_DIVISOR = 2**46
 
@@ -226,10 +228,8 @@ class AttributeFactor(Config):
     @model_validator(mode="after")
     def _fits_its_type(self, info: ValidationInfo) -> "AttributeFactor":
         signals = _signals_of(info)
-        if signals is None:
-            return self
-        text = signals.drive[self.name].type == "string"
-        if text != (self.equals is not None):
+        text = signals is not None and signals.drive[self.name].type == "string"
+        if signals and text != (self.equals is not None):
             raise ValueError(f"{self.name} {'needs' if text else 'is a number without'} equals")
         return self
 
@@ -309,15 +309,15 @@ class Composite(Config):
     @property
     def columns(self) -> tuple["Definition", ...]:
         """The columns that it is made of, in the order of its fields."""
-        return tuple(_definitions_in(self))
 
+        def definitions(part: object) -> Iterator["Definition"]:
+            if isinstance(part, Definition):
+                yield part
+            elif isinstance(part, Config | tuple):
+                for value in part if isinstance(part, tuple) else vars(part).values():
+                    yield from definitions(value)
 
-def _definitions_in(part: object) -> Iterator["Definition"]:
-    if isinstance(part, Definition):
-        yield part
-    elif isinstance(part, Config | tuple):
-        for value in part if isinstance(part, tuple) else vars(part).values():
-            yield from _definitions_in(value)
+        return tuple(definitions(self))
 
 
 class Combination(Composite):
@@ -332,25 +332,11 @@ class Combination(Composite):
     line: Annotated[LineId | None, _LEFT_OUT] = None
 
 
-def _product_ratio(value: Fraction) -> Fraction:
-    if not 0 < value.numerator <= 2**12 or value.denominator > 2**40:
-        raise ValueError(f"the scale of its factors is {value} of its own: choose another")
-    return value
-
-
 class Product(Composite):
     """The product of up to two columns and `ratio`."""
 
     of: tuple["Definition", ...] = Field(max_length=2)
-    ratio: Annotated[Fraction, AfterValidator(_product_ratio)] = Fraction(1)
-
-
-def _weight(value: Fraction) -> Fraction:
-    if not 0 < value <= 1 or value.denominator > LARGEST_WEIGHT:
-        raise ValueError(
-            f"a weight is above 0, at most 1, with a denominator up to {LARGEST_WEIGHT}"
-        )
-    return value
+    ratio: Annotated[Fraction, _bounded(2**12, 2**40)] = Fraction(1)
 
 
 class Equation(Config):
@@ -361,7 +347,7 @@ class Equation(Config):
 
     y: "Definition"
     x: tuple["Definition | Whole", ...] = Field(min_length=1, max_length=4)
-    weight: Annotated[Fraction, AfterValidator(_weight)] = Fraction(1)
+    weight: Annotated[Fraction, Field(le=1), _bounded(LARGEST_WEIGHT, LARGEST_WEIGHT)] = Fraction(1)
 
 
 class Slope(Composite):
@@ -374,14 +360,12 @@ class Slope(Composite):
 
     equations: tuple[Equation, ...] = Field(min_length=1, max_length=4)
     ridge: tuple[Annotated[int, Field(ge=1, le=2**40)], ...]
-    ratio: Annotated[Fraction, Field(gt=0)] = Fraction(1)
+    ratio: Annotated[Fraction, _bounded(LARGEST_SLOPE, LARGEST_SLOPE)] = Fraction(1)
 
     @model_validator(mode="after")
     def _consistent(self) -> "Slope":
         if any(len(equation.x) != len(self.ridge) for equation in self.equations):
             raise ValueError("each equation has as many columns as there are unknowns")
-        if max(self.ratio.numerator, self.ratio.denominator) > LARGEST_SLOPE:
-            raise ValueError(f"the ratio of a slope has no part above {LARGEST_SLOPE}")
         if any(equation.bits > COUNT_BITS for equation in self.columns):
             raise ValueError(f"the columns of a slope have {COUNT_BITS} bits")
         return self
@@ -524,22 +508,15 @@ class Definition(Config):
     number: Annotated[ParameterFactor | None, _LEFT_OUT] = None
 
     @model_validator(mode="after")
-    def _ticks_fit(self) -> "Definition":
+    def _consistent(self, info: ValidationInfo) -> "Definition":
         if (self.over in {"mean", "sum", "lag", "change"}) != bool(self.ticks):
             raise ValueError("ticks is for mean, sum, lag and change, which must have it")
-        return self
-
-    @model_validator(mode="after")
-    def _of_is_known(self, info: ValidationInfo) -> "Definition":
-        logged = not (self.sql or self.made)
         if self.sql and self.made:
             raise ValueError(f"{self.of} is a feature, or made of columns, not both")
-        signals = _signals_of(info)
-        if signals is None:
-            return self
-        if logged and self.of not in signals.feature_inputs:
+        logged, signals = not (self.sql or self.made), _signals_of(info)
+        if signals and logged and self.of not in signals.feature_inputs:
             raise ValueError(f"{self.of} is not an input signal")
-        if not logged and self.of in {*signals.signals, *signals.drive, "tick", "day"}:
+        if signals and not logged and self.of in {*signals.signals, *signals.drive, "tick", "day"}:
             raise ValueError(f"{self.of} is the name of a column of the logs")
         return self
 
@@ -603,13 +580,8 @@ def rows_behind(definitions: Mapping[str, Definition]) -> dict[str, Definition]:
             raise QuestionError(f"the feature {row.of} is defined in two ways.")
     for name, definition in definitions.items():
         computed = name in rows and (rows[name].sql or rows[name].made)
-        if computed and (
-            definition.over
-            or definition.fact
-            or definition.gate
-            or definition.number
-            or definition.of != name
-        ):
+        changed = definition.over or definition.fact or definition.gate or definition.number
+        if computed and (changed or definition.of != name):
             raise QuestionError(f"{name} is a column, and a feature that another looks back on.")
     return rows
 
@@ -643,32 +615,28 @@ def parity(column: Definition) -> int:
     if column.gate:
         return parity(column.ungated) if parity(column.gate.by) == 1 else 0
     if column.number:
-        base_parity = (
-            1 if column.number.alone else parity(column.model_copy(update={"number": None}))
+        sign = -1 if column.number.name in OFFSETS else 1
+        base = column.model_copy(update={"number": None})
+        return sign if column.number.alone else sign * parity(base)
+    pairs = []
+    for row in _trial_rows(column):
+        mirrored = {
+            name: -row[name] if name in OPPOSITE else row[EXCHANGED.get(name, name)] for name in row
+        }
+        pairs.append(
+            [evaluate(column.sql, r) if column.sql else r[column.of] for r in (row, mirrored)]
         )
-        return -base_parity if column.number.name in OFFSETS else base_parity
-    values = [(_value(column, row), _value(column, _mirrored(row))) for row in _trial_rows(column)]
-    if all(a == b for a, b in values):
+    if all(a == b for a, b in pairs):
         return 1
-    return -1 if all(a is not None and b == -a for a, b in values) else 0
+    return -1 if all(a is not None and b == -a for a, b in pairs) else 0
 
 
-def _value(column: Definition, row: Mapping[str, int]) -> int | None:
-    return evaluate(column.sql, row) if column.sql else row[column.of]
-
-
-def _trial_rows(definition: Definition) -> tuple[Mapping[str, int], ...]:
+def _trial_rows(definition: Definition) -> list[dict[str, int]]:
     """Return reproducible counts of moving cars with different left and right wheels."""
     draw = Random(1)  # noqa: S311 - no secret
     names = sorted({*definition.signals, *EXCHANGED})
-    return tuple(
+    return [
         {name: draw.randint(4000, 6000) for name in names}
         | {name: draw.choice((-1, 1)) * draw.randint(500, 3000) for name in sorted(OPPOSITE)}
         for _ in range(TRIALS)
-    )
-
-
-def _mirrored(row: Mapping[str, int]) -> Mapping[str, int]:
-    return {
-        name: -row[name] if name in OPPOSITE else row[EXCHANGED.get(name, name)] for name in row
-    }
+    ]

@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
-from importlib.resources.abc import Traversable
-from itertools import pairwise
 from typing import Any, Literal
 
 from pydantic import (
@@ -36,7 +34,6 @@ from fleet_slip.catalog.definitions import (
     AttributeText,
     Bits,
     CalibrationParameterName,
-    ColumnUnit,
     Combination,
     Definition,
     Equation,
@@ -128,53 +125,56 @@ class TimeColumn(Scaled):
     """One column over time: its definition and scale."""
 
     definition: Definition
-    unit: ColumnUnit
+    unit: SIUnit
     column: Identifier
     description: str
 
 
-class NotYetMadeError(Exception):
-    """A column depends on one that has not been made yet."""
-
-
 @dataclass
 class ColumnSources:
-    """Sources of columns: signals, features, and the columns over time made so far.
+    """Sources of columns: signals, features, and columns over time, which are made on first use.
 
-    `missing` contains the names of columns that have not been made yet.
+    Attributes
+    ----------
+    families
+        By the name of each column over time: place in the file, name and entry of its family.
+    columns
+        The columns over time that were made so far.
     """
 
     signals: SignalCatalog
     features: Mapping[str, Feature]
-    over_time: dict[str, TimeColumn] = field(default_factory=dict)
-    missing: frozenset[str] = frozenset()
+    families: dict[str, tuple[str, str, "ColumnFamily"]] = field(default_factory=dict)
+    columns: dict[str, TimeColumn] = field(default_factory=dict)
+    _begun: set[str] = field(default_factory=set)
 
-    def find(self, name: str) -> Signal | Feature | TimeColumn:
-        """Return an input by name. Raises `ValueError` if unknown, and `NotYetMadeError`."""
-        if name in self.missing:
-            raise NotYetMadeError
-        if column := self.over_time.get(name) or self.features.get(name):
-            return column
+    def find(self, name: str) -> tuple[Definition, Signal | Feature | TimeColumn]:
+        """Return an input and its definition. Raises `ValueError` if unknown."""
+        if name in self.families:
+            column = self.over_time(name)
+            return column.definition, column
+        if feature := self.features.get(name):
+            return Definition(of=name, sql=feature.sql, of_bits=feature.bits), feature
         if name not in self.signals.feature_inputs:
             raise ValueError(f"{name} is no input signal or feature")
-        return self.signals[name]
+        return Definition(of=name), self.signals[name]
 
-    def definition(self, name: str) -> Definition:
-        """Return the definition of an input. Raises `ValueError` if unknown."""
-        column = self.find(name)
-        if isinstance(column, TimeColumn):
-            return column.definition
-        if isinstance(column, Feature):
-            return Definition(of=name, sql=column.sql, of_bits=column.bits)
-        return Definition(of=name)
-
-    def columns(self, *names: str) -> list[TimeColumn]:
-        """Return columns over time. Raises `ValueError` if unknown, and `NotYetMadeError`."""
-        if not self.missing.isdisjoint(names):
-            raise NotYetMadeError
-        if unknown := [name for name in names if name not in self.over_time]:
-            raise ValueError(f"{', '.join(unknown)}: no column over time")
-        return [self.over_time[name] for name in names]
+    def over_time(self, name: str) -> TimeColumn:
+        """Return a column over time. Raises `ValueError` if unknown, or made of itself."""
+        if name in self.columns:
+            return self.columns[name]
+        if name not in self.families:
+            raise ValueError(f"{name}: no column over time")
+        where, family_name, family = self.families[name]
+        if where in self._begun:
+            raise ValueError(f"{where}: it is made of itself")
+        self._begun.add(where)
+        try:
+            self.columns |= family.make(family_name, self)
+        except ValueError as error:
+            reason = faults_of(error) if isinstance(error, ValidationError) else error
+            raise ValueError(f"{where}: {reason}") from None
+        return self.columns[name]
 
 
 class ColumnFamily(Config):
@@ -186,8 +186,8 @@ class ColumnFamily(Config):
         """Return the names of the columns."""
         return (name,)
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
-        """Return the columns by name. Raises `ValueError`, and `NotYetMadeError`."""
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
+        """Return the columns by name. Raises `ValueError`."""
         raise NotImplementedError
 
     def _column(self, definition: Definition, **other: Any) -> TimeColumn:
@@ -197,11 +197,25 @@ class ColumnFamily(Config):
         return TimeColumn(definition=definition, **shared, **other)
 
 
+class ScaledFamily(ColumnFamily):
+    """A family whose columns have the scale and unit that the file states."""
+
+    scale: Decimal = Field(gt=0)
+    unit: SIUnit
+    column: str = Field(min_length=1, max_length=60)
+
+    def _composite(
+        self, name: str, composite: Made, bits: int = LARGEST_BITS
+    ) -> dict[str, TimeColumn]:
+        """Return the column of a composite."""
+        return {name: self._column(Definition(of=name, made=composite, of_bits=bits, bits=bits))}
+
+
 TICKS = "{ticks}"
 """Placeholder for the number of ticks in the name of a window's column."""
 
 
-class Window(ColumnFamily):
+class Window(ScaledFamily):
     """A family of windows over a signal, feature, product or estimate.
 
     The column of N ticks is called NAME_N; the mean since the start of the drive is called NAME.
@@ -210,33 +224,24 @@ class Window(ColumnFamily):
     of: Identifier
     over: Over
     ticks: tuple[int, ...] = ()
-    scale: Decimal = Field(gt=0)
     bits: Bits = 20
-    unit: SIUnit
-    column: str = Field(min_length=1, max_length=60)
 
     @model_validator(mode="after")
     def _ticks_fit(self) -> "Window":
-        if (self.over != "running_mean") != bool(self.ticks):
-            raise ValueError("ticks is for mean, sum, lag and change, which must have it")
-        if len(set(self.ticks)) < len(self.ticks):
-            raise ValueError("a number of ticks appears twice")
         if any(not 1 <= n <= MAX_CHANGE_TICKS for n in self.ticks):
             raise ValueError(f"ticks must lie in 1..{MAX_CHANGE_TICKS}")
-        if bool(self.ticks) != (TICKS in self.column):
-            raise ValueError(f"column must have {TICKS} in it if there are ticks, and only then")
         return self
 
     def names(self, name: str) -> tuple[str, ...]:
         """Return the name of each length, or that of the mean since the drive began."""
         return tuple(f"{name}_{n}" for n in self.ticks) or (name,)
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return a column for each length."""
-        row = columns.definition(self.of)
-        if self.of in columns.over_time and not (row.made and row.of == self.of):
+        row, source = sources.find(self.of)
+        if self.of in sources.families and not (row.made and row.of == self.of):
             raise ValueError(f"{self.of} is no input signal or feature")
-        ratio, members = columns.find(self.of).exact_scale / Fraction(self.scale), {}
+        ratio, members = source.exact_scale / Fraction(self.scale), {}
         for member, ticks in zip(self.names(name), self.ticks or (0,), strict=True):
             definition = Definition(
                 of=row.of,
@@ -256,26 +261,23 @@ class Window(ColumnFamily):
         return members
 
 
-class Factor(ColumnFamily):
+class Factor(ScaledFamily):
     """A column times a vehicle attribute: a number minus `less`, or 1 if it `equals` a text."""
 
     of: Identifier
     fact: Identifier
     less: int = 0
     equals: AttributeText | None = None
-    scale: Decimal = Field(gt=0)
-    unit: SIUnit
-    column: Identifier
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return the product."""
-        base = columns.definition(self.of)
+        base, source = sources.find(self.of)
         if base.fact is not None:
             raise ValueError(f"{self.of} has a factor already")
-        ratio = columns.find(self.of).exact_scale / Fraction(self.scale)
+        ratio = source.exact_scale / Fraction(self.scale)
         fact = AttributeFactor.model_validate(
             {"name": self.fact, "less": self.less, "equals": self.equals, "ratio": ratio},
-            context=columns.signals,
+            context=sources.signals,
         )
         return {name: self._column(base.model_copy(update={"fact": fact}))}
 
@@ -290,22 +292,19 @@ class Calibrated(ColumnFamily):
     running: Identifier | None = None
     column: Identifier
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return the column times a number.
 
         Raises `ValueError` if `running` has another grain than the number, or `less` is between
         counts.
         """
-        base, source, number = (
-            columns.definition(self.of),
-            columns.find(self.of),
-            CALIBRATION_PARAMETERS[self.number],
-        )
+        base, source = sources.find(self.of)
+        number = CALIBRATION_PARAMETERS[self.number]
         if isinstance(source, Feature):  # the count itself, as it stands in the rows
             base = base.model_copy(update={"bits": base.of_bits})
         if base.number is not None:
             raise ValueError(f"{self.of} has a number already")
-        running = columns.columns(self.running)[0] if self.running else None
+        running = sources.over_time(self.running) if self.running else None
         if running is not None and running.scale != number.grain:
             raise ValueError(
                 f"{self.running} has the scale {running.scale}, {self.number} {number.grain}"
@@ -329,43 +328,29 @@ class Calibrated(ColumnFamily):
         return {name: column}
 
 
-class MadeColumn(ColumnFamily):
-    """A composite of other columns."""
-
-    scale: Decimal = Field(gt=0)
-    unit: SIUnit
-    column: Identifier
-
-    def _single(
-        self, name: str, composite: Made, bits: int = LARGEST_BITS
-    ) -> dict[str, TimeColumn]:
-        return {name: self._column(Definition(of=name, made=composite, of_bits=bits, bits=bits))}
-
-
-class EstimateColumn(MadeColumn):
+class EstimateColumn(ScaledFamily):
     """The estimate of a first-stage model, which the `line` of a model list names."""
 
     unit: Literal["rad"] = "rad"
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:  # noqa: ARG002
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:  # noqa: ARG002
         """Return the estimate of a model that has not been fitted."""
-        return self._single(name, Combination(line=""))
+        return self._composite(name, Combination(line=""))
 
 
-class ProductColumn(MadeColumn):
+class ProductColumn(ScaledFamily):
     """The product of two columns, signals or features; of none, 1."""
 
     of: tuple[Identifier, ...] = Field(max_length=2)
     bits: Bits = 20
 
-    def make(self, name: str, columns: ColumnSources) -> dict[str, TimeColumn]:
+    def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return the product."""
-        factors = tuple(map(columns.definition, self.of))
-        scale = math.prod(
-            (columns.find(factor).exact_scale for factor in self.of), start=Fraction(1)
-        )
-        return self._single(
-            name, Product(of=factors, ratio=scale / Fraction(self.scale)), self.bits
+        factors = [sources.find(factor) for factor in self.of]
+        ratio = math.prod((source.exact_scale for _, source in factors), start=Fraction(1))
+        columns = tuple(definition for definition, _ in factors)
+        return self._composite(
+            name, Product(of=columns, ratio=ratio / Fraction(self.scale)), self.bits
         )
 
 
@@ -381,47 +366,38 @@ class EquationColumns(Config):
     beside: tuple[Identifier | int, ...] = ()
     weight: Decimal = Decimal(1)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its columns."""
-        return (*self.y, self.of, *(column for column in self.beside if isinstance(column, str)))
 
-
-class SlopeColumn(MadeColumn):
+class SlopeColumn(ScaledFamily):
     """The first unknown of equations, by ridge regression over the drive so far."""
 
     equations: tuple[EquationColumns, ...] = Field(min_length=1)
     ridge: tuple[int, ...] = Field(min_length=1)
 
     def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
-        """Return a slope. Raises `ValueError` if a scale of its equations does not fit others."""
-        equations, values = [], set()
+        """Return a slope. Raises `ValueError` if the scales of its equations differ."""
+        equations, ratios = [], set()
         for number, equation in enumerate(self.equations, 1):
-            sources.columns(*equation.names)
-            columns = sources.over_time
-            of_y = {columns[name_y].exact_scale for name_y in equation.y}
-            if len(of_y) > 1:
-                raise ValueError(f"{', '.join(equation.y)} differ in scale")
-            terms = tuple((sign, columns[name_y].definition) for name_y, sign in equation.y.items())
+            parts = [(sign, sources.over_time(column)) for column, sign in equation.y.items()]
+            of = sources.over_time(equation.of)
+            ratios |= {part.exact_scale / of.exact_scale for _, part in parts}
             y = Definition(
                 of=f"{name}_{number}",
-                made=Combination(terms=terms),
+                made=Combination(terms=tuple((sign, part.definition) for sign, part in parts)),
                 of_bits=COUNT_BITS,
                 bits=COUNT_BITS,
             )
-            x = (equation.of, *equation.beside)
-            factors = tuple(
-                columns[regressor].definition if isinstance(regressor, str) else regressor
-                for regressor in x
-            )
-            equations.append(Equation(y=y, x=factors, weight=Fraction(equation.weight)))
-            values.add(of_y.pop() / columns[equation.of].exact_scale)
-        if len(values) > 1:
-            raise ValueError(
-                "the scales of y and `regressor` have another ratio from one equation to the next"
-            )
-        ratio = values.pop() / Fraction(self.scale)
-        return self._single(name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio))
+            beside = [
+                sources.over_time(column).definition if isinstance(column, str) else column
+                for column in equation.beside
+            ]
+            x = (of.definition, *beside)
+            equations.append(Equation(y=y, x=x, weight=Fraction(equation.weight)))
+        if len(ratios) > 1:
+            raise ValueError("the scales of y and of differ in ratio between its equations")
+        ratio = ratios.pop() / Fraction(self.scale)
+        return self._composite(
+            name, Slope(equations=tuple(equations), ridge=self.ridge, ratio=ratio)
+        )
 
 
 class GateFamily(ColumnFamily):
@@ -439,14 +415,6 @@ class GateFamily(ColumnFamily):
     columns: tuple[Identifier, ...] = Field(min_length=1)
     """Columns over time that are gated."""
 
-    @model_validator(mode="after")
-    def _knots_rise(self) -> "GateFamily":
-        if any(high <= low for low, high in pairwise(self.knots)):
-            raise ValueError("the knots of a gate must increase")
-        if len(set(self.columns)) < len(self.columns):
-            raise ValueError("a column appears twice")
-        return self
-
     def names(self, name: str) -> tuple[str, ...]:
         """Return the names of the columns of each knot."""
         knots = range(1, len(self.knots))
@@ -454,7 +422,8 @@ class GateFamily(ColumnFamily):
 
     def make(self, name: str, sources: ColumnSources) -> dict[str, TimeColumn]:
         """Return the columns of each knot."""
-        by, *bases = sources.columns(self.of, *self.columns)
+        by = sources.over_time(self.of)
+        bases = [sources.over_time(column) for column in self.columns]
         counts = [round(Fraction(knot) / by.exact_scale) for knot in self.knots]
         members = []
         for knot, peak in enumerate(counts[1:], 1):
@@ -502,19 +471,14 @@ class FeatureSetEntry(Config):
         return value if isinstance(value, list | tuple) else (value,)
 
     @model_validator(mode="after")
-    def _consistent(self, info: ValidationInfo) -> "FeatureSetEntry":
-        signals = info.context if isinstance(info.context, SignalCatalog) else None
-        unknown = ", ".join(
-            name for name in self.signals if signals and name not in signals.feature_inputs
-        )
+    def _consistent(self) -> "FeatureSetEntry":
         ticks = self.change_ticks
         names = (*self.signals, *self.features, *self.windows)
         out_of_range = any(not 0 < n <= MAX_COURSE_CHANGE_TICKS for n in ticks)
         longest = f"{MAX_COURSE_CHANGE_TICKS * float(SAMPLE_TIME_S):g}"
         for wrong, message in (
             (self.of is None and not self.signals, "a set has signals, or is of another set"),
-            (self.of is not None and not self.change_s, "a set of another has change_s"),
-            (unknown, f"not input signals: {unknown}"),
+            (self.of is not None and not ticks, "a set of another has change_s"),
             (len(set(names)) < len(names), "a column appears twice"),
             (ticks and self.block_s, "a set with change_s does not divide rows"),
             (ticks and not (self.windows or self.of), "a set with change_s has windows"),
@@ -597,30 +561,41 @@ class FeatureFile(Config):
         signals = info.context
         if not isinstance(signals, SignalCatalog):
             raise TypeError("the validation of features needs the signals as context")
-        taken = {*signals.signals, *(s.column for s in signals.signals.values()), *signals.drive}
-        over_time = self._time_columns = _make_time_columns(self, signals)
-        columns: dict[str, Feature | TimeColumn] = {**self.features, **over_time}
-        taken |= {"day", "tick", "clipped", *AUXILIARY}
-        names = [*columns, *(column.column for column in columns.values())]
-        twice = sorted(n for n, number in Counter(names).items() if n in taken or number > 1)
-        if twice:
+        sources = ColumnSources(signals, self.features)
+        for kind in FAMILIES:
+            for name, family in getattr(self, kind).items():
+                for member in family.names(name):
+                    if member in sources.families:
+                        raise ValueError(f"{kind}.{name}: {member} appears twice")
+                    sources.families[member] = (f"{kind}.{name}", name, family)
+        self._time_columns = {name: sources.over_time(name) for name in sources.families}
+        columns: dict[str, Feature | TimeColumn] = {**self.features, **self._time_columns}
+        names = [*signals.names, "clipped", *AUXILIARY, *columns]
+        names += [column.column for column in columns.values()]
+        if twice := sorted(name for name, number in Counter(names).items() if number > 1):
             raise ValueError(f"names must differ, from those of signals too: {', '.join(twice)}")
         for name, purpose in ((PLAIN, "the catalog's own signals"), (RECEIVED, "what cars sent")):
             if name in self.sets:
                 raise ValueError(f"{name!r} is the set of {purpose}")
+        windows = {*self.windows, *self.gates, *self._time_columns} - self.calibrated.keys()
         for name, entry in self.sets.items():
-            unknown = [f for f in entry.features if f not in self.features]
-            names_of_windows = {*self.windows, *self.gates, *over_time}
-            unknown += [
-                w for w in entry.windows if w not in names_of_windows or w in self.calibrated
+            unknown = [
+                column
+                for columns_of_set, available in (
+                    (entry.signals, signals.feature_inputs),
+                    (entry.features, self.features),
+                    (entry.windows, windows),
+                    (entry.calibrated, self.calibrated),
+                    ((entry.of,) if entry.of else (), self.sets),
+                )
+                for column in columns_of_set
+                if column not in available
             ]
-            unknown += [c for c in entry.calibrated if c not in self.calibrated]
-            unknown += [entry.of] if entry.of and entry.of not in self.sets else []
             if unknown:
                 raise ValueError(f"sets.{name}: unknown {', '.join(unknown)}")
-            still = [c for c in entry.calibrated if entry.change_s and self.calibrated[c].alone]
-            if still:
-                raise ValueError(f"sets.{name}: {', '.join(still)}: a number does not change")
+            constant = [c for c in entry.calibrated if entry.change_s and self.calibrated[c].alone]
+            if constant:
+                raise ValueError(f"sets.{name}: {', '.join(constant)}: a number does not change")
         return self
 
     @property
@@ -629,56 +604,14 @@ class FeatureFile(Config):
         return self._time_columns
 
 
-def _make_time_columns(features: FeatureFile, signals: SignalCatalog) -> dict[str, TimeColumn]:
-    """Return every column over time: windows, products, estimates, slopes, factors, gates.
-
-    Raises `ValueError` for a column that refers to an unknown one, or for a repeated name.
-    """
-    columns = ColumnSources(signals, features.features)
-    waiting: list[tuple[str, str, ColumnFamily]] = [
-        (f"{kind}.{name}", name, family)
-        for kind in FAMILIES
-        for name, family in getattr(features, kind).items()
-    ]
-    while waiting:
-        columns.missing = frozenset(n for _, name, family in waiting for n in family.names(name))
-        postponed = [entry for entry in waiting if not _make(*entry, columns)]
-        if len(postponed) == len(waiting):
-            raise ValueError(f"{waiting[0][0]}: it is made of itself")
-        waiting = postponed
-    return columns.over_time
-
-
-def _make(where: str, name: str, family: ColumnFamily, columns: ColumnSources) -> bool:
-    """Add the columns of a family; return False if it refers to columns not made yet."""
-    try:
-        members = family.make(name, columns)
-    except NotYetMadeError:
-        return False
-    except ValueError as error:
-        reason = faults_of(error) if isinstance(error, ValidationError) else error
-        raise ValueError(f"{where}: {reason}") from None
-    if repeated := [member for member in members if member in columns.over_time]:
-        raise ValueError(f"{where}: {repeated[0]} appears twice")
-    columns.over_time.update(members)
-    return True
-
-
 def load_features(configs: Configs, signals: SignalCatalog) -> FeatureFile:
-    """Return the shipped features, with the user's file laid over them. Raises `ConfigError`."""
-    shipped, chosen = folder("configs") / "features.toml", configs.file("features.toml")
-    if str(chosen) == str(shipped):
-        return load_config(shipped, FeatureFile, signals)
-    return load_features_over(shipped, chosen, signals)
+    """Return the shipped features, with the user's file laid over them.
 
-
-def load_features_over(
-    shipped: Traversable, override: Traversable, signals: SignalCatalog
-) -> FeatureFile:
-    """Read a file of features laid over another: its entries are added, or replace others.
-
-    Raises `ConfigError`.
+    The user's entries are added, or replace others. Raises `ConfigError`.
     """
+    shipped, override = folder("configs") / "features.toml", configs.file("features.toml")
+    if str(override) == str(shipped):
+        return load_config(shipped, FeatureFile, signals)
     content = load_toml(shipped)
     for kind, entries in load_toml(override).items():
         if kind not in content or not isinstance(entries, dict):

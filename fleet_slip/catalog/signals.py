@@ -165,12 +165,15 @@ class SignalCatalog(Config):
                 f"the drive columns {', '.join(missing)} are missing. Copy them from the shipped "
                 "catalog, configs/signals.toml"
             )
-        names = [*self.signals, *(s.column for s in self.signals.values()), *self.drive]
-        names += ["day", "tick", "time_s"]
-        twice = sorted(name for name, number in Counter(names).items() if number > 1)
-        if twice:
+        if twice := sorted(name for name, number in Counter(self.names).items() if number > 1):
             raise ValueError(f"names must differ: {', '.join(twice)}")
         return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns of logs, as counts and in SI units."""
+        columns = (signal.column for signal in self.signals.values())
+        return (*self.signals, *columns, *self.drive, "day", "tick", "time_s")
 
     def __getitem__(self, name: str) -> Signal:
         """Return a signal by name. Raises `QuestionError` for an unknown one."""

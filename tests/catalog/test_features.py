@@ -28,7 +28,7 @@ from fleet_slip.catalog.definitions import (
     limit_of,
     parity,
 )
-from fleet_slip.catalog.features import FeatureFile, load_features_over
+from fleet_slip.catalog.features import FeatureFile
 from fleet_slip.columns.column_sql import with_columns
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, compute_columns
 from fleet_slip.config import load_config
@@ -343,7 +343,6 @@ def test_a_search_among_changes_knows_odd_and_short_columns_alone() -> None:
 
 
 BY = Definition(of="ay")
-SHIPPED = folder("configs") / "features.toml"
 
 knots = st.lists(st.integers(-2000, 2000), min_size=2, max_size=6, unique=True).map(sorted)
 
@@ -418,10 +417,9 @@ def test_members_have_the_scale_of_their_column_and_neighbours_share_a_knot() ->
     ],
 )
 def test_faults_are_named(tmp_path: Path, text: str, words: str) -> None:
-    own = tmp_path / "features.toml"
-    own.write_text(f'[gates.mine]\n{text}\ndescription = "x"\n')
+    gates = f'[gates.mine]\n{text}\ndescription = "x"\n'
     with pytest.raises(ConfigError, match=words) as caught:
-        load_features_over(SHIPPED, own, SIGNALS)
+        load_catalog(configs_with(tmp_path / "configs", features=gates))
     assert "gates.mine" in str(caught.value)
 
 
