@@ -20,21 +20,20 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.held_out import (
+from fleet_slip.evaluation.identify import IdentifiedVehicle, identify, vehicle_with_fit
+from fleet_slip.evaluation.labelled_drives import LabelledDrive, Segments
+from fleet_slip.evaluation.measured_evaluation import (
     LATERAL_ROWS,
-    CombinedModel,
     Learner,
-    combine,
+    cross_validate_combination,
+    prepare_drive,
     read_measured_drives,
+    training_drives,
 )
-from fleet_slip.evaluation.identify import IdentifiedVehicle, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import LabelledDrive
-from fleet_slip.evaluation.measured_evaluation import prepare_drive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
-from fleet_slip.models.score import calibrated_cars
 from fleet_slip.models.summary import Selection
-from fleet_slip.regression.combination import CLIP_STD
+from fleet_slip.regression.combination import CLIP_STD, CombinationChoice
 from fleet_slip.vehicle.measures import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 
@@ -130,28 +129,22 @@ def with_filter(
             for drive in read_measured_drives(warehouse, load_cohort(warehouse, predicate))
         ]
         learner = Learner.prepare(warehouse, selection.request, predicate, drives)
-        is_calibrated = warehouse.catalog.feature_set(learner.plan.feature_set).calibrated
-        combined = combine(
-            learner,
-            measures,
-            frozenset(),
-            executor,
-            cars=calibrated_cars(warehouse) if is_calibrated else {},
-            prior=selection.cohort.prior,
+        nothing: Segments = frozenset()
+        vehicle = identify(measures, training_drives(drives, nothing), executor)
+        choice = cross_validate_combination(
+            learner, measures, vehicle, nothing, executor, selection.cohort.prior
         )
-        observer = observer_of_drives(combined.vehicle, warehouse.catalog.signals, drives)
+        observer = observer_of_drives(vehicle, warehouse.catalog.signals, drives)
     except (DataError, QuestionError) as error:
         combination = CombinedWithFilter(
             method="line", rmse_deg={}, worst_rmse_deg={}, groups=0, measures=measures,
             reason=str(error),
         )  # fmt: skip
         return manifest.model_copy(update={"combination": combination})
-    choice = combined.choice
+    is_line = choice.method == "line"
     combination = CombinedWithFilter(
         method=choice.method,
-        term=None
-        if choice.method == "line"
-        else combined_term(warehouse.catalog, manifest, combined, observer),
+        term=None if is_line else combined_term(warehouse.catalog, manifest, choice, observer),
         rmse_deg={name: math.degrees(rad) for name, rad in choice.rmse_rad.items()},
         worst_rmse_deg={name: math.degrees(rad) for name, rad in choice.worst_rmse_rad.items()},
         groups=choice.groups,
@@ -180,10 +173,10 @@ def observer_of_drives(
 
 
 def combined_term(
-    catalog: Catalog, manifest: Manifest, combined: CombinedModel, observer: Observer
+    catalog: Catalog, manifest: Manifest, choice: CombinationChoice, observer: Observer
 ) -> ModelTerm:
     """Return the column of a combination as the only term of an estimate."""
-    combination, is_alone = combined.choice.combination, combined.choice.method == "filter"
+    combination, is_alone = choice.combination, choice.method == "filter"
     several = len(combination.knots_mps2) > 1
     ay_mps2 = float(catalog.signals["ay"].scale)
     blend = Blend(

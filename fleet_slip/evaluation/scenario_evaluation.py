@@ -25,8 +25,8 @@ from fleet_slip.evaluation.filters import (
     filter_bank,
     train_models,
 )
-from fleet_slip.evaluation.held_out import combined_estimate, pair_estimates
 from fleet_slip.evaluation.labelled_drives import predict_drive
+from fleet_slip.evaluation.measured_evaluation import combined_estimate, pair_estimates
 from fleet_slip.evaluation.test_drives import (
     TestDrive,
     blind_scenarios,

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.evaluation import held_out as held_out_module
-from fleet_slip.evaluation import measured_evaluation
+from fleet_slip.evaluation import filter_column, measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
-from fleet_slip.evaluation.held_out import MAX_GROUPS, inner_groups
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
 from fleet_slip.evaluation.labelled_drives import QUARTERS, LabelledDrive, Segments
+from fleet_slip.evaluation.measured_evaluation import MAX_GROUPS, inner_groups
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations
 from fleet_slip.models.manifest import LINE_ALONE
@@ -51,7 +50,7 @@ def usual_car(
 
 @pytest.fixture
 def car(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(held_out_module, "identify", usual_car)
+    monkeypatch.setattr(filter_column, "identify", usual_car)
     monkeypatch.setattr(measured_evaluation, "identify", usual_car)
     file = tmp_path / "car.toml"
     file.write_text(CAR)
@@ -138,13 +137,14 @@ def test_every_estimate_of_a_group_comes_from_fits_without_it(
         return usual_car(measures, drives)
 
     pairs: list[PairedEstimates] = []
-    monkeypatch.setattr(held_out_module, "identify", record)
+    monkeypatch.setattr(filter_column, "identify", record)
+    monkeypatch.setattr(measured_evaluation, "identify", record)
 
     def choose(found: PairedEstimates, kinds: PairedEstimates | None) -> CombinationChoice:
         pairs.append(found)
         return choose_combination(found, kinds)
 
-    monkeypatch.setattr(held_out_module, "choose_combination", choose)
+    monkeypatch.setattr(measured_evaluation, "choose_combination", choose)
     done_on(smoke_copy, "publish", "both", "--models", "table1", "--with-filter", car, "--force")
     whole, *inner = trained
     assert len(inner) >= len(pairs[0].groups) > 1

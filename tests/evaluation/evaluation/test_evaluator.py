@@ -15,9 +15,8 @@ from fleet_slip.evaluation.evaluator import (
     pooled_statistics,
     variation_between_drives,
 )
-from fleet_slip.evaluation.held_out import folds_of
 from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
-from fleet_slip.evaluation.measured_evaluation import FittedEstimator, cross_fitted
+from fleet_slip.evaluation.measured_evaluation import FittedEstimator, cross_fitted, folds_of
 
 ROWS = 100
 

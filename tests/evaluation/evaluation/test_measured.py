@@ -11,10 +11,15 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, filters, measured_evaluation
-from fleet_slip.evaluation.held_out import Learner, folds_by_kind, folds_of, read_measured_drives
 from fleet_slip.evaluation.identify import IdentifiedVehicle, TuningResult, vehicle_with_fit
 from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
-from fleet_slip.evaluation.measured_evaluation import prepare_drive
+from fleet_slip.evaluation.measured_evaluation import (
+    Learner,
+    folds_by_kind,
+    folds_of,
+    prepare_drive,
+    read_measured_drives,
+)
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.grams.update import update_grams
 from fleet_slip.models.request import SelectionRequest
