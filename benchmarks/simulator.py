@@ -18,7 +18,7 @@ from highway_env.vehicle.dynamics import BicycleVehicle
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.roads import SpeedLimits, load_track, speed_profile
-from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, Road, simulate_blocks
+from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, Road
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.highway import FourWheelVehicle
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -77,7 +77,7 @@ def lanes_rate(
     def work(_: int) -> int:
         samples, start = 0, time.perf_counter()
         while time.perf_counter() - start < seconds:
-            samples += sum(len(b.channels["vx_mps"]) for b in simulate_blocks(drives, steps))
+            samples += sum(len(b.channels["vx_mps"]) for b in simulate_drives(drives, steps))
         return samples
 
     start = time.perf_counter()

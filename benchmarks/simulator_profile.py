@@ -17,11 +17,11 @@ import numpy as np
 from benchmarks.harness import durations
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
-from fleet_slip.simulation.sensors import Recorder
+from fleet_slip.simulation.sensors import measure
 from fleet_slip.simulation.simulate import lane_drive, simulate_logs, tabulate
 from fleet_slip.storage.data_files import checksum_of
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
+from fleet_slip.vehicle.batch import LaneDrive, simulate_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
 
@@ -35,7 +35,7 @@ def best(function: Callable[[], Any]) -> float:
 
 def drive(drives: list[LaneDrive]) -> None:
     """Run the kernel and drop what it says."""
-    for _ in simulate_blocks(drives):
+    for _ in simulate_drives(drives):
         pass
 
 
@@ -45,26 +45,18 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
     logs = simulate_logs(SIGNALS, batch.drives)
     rows = tabulate(SIGNALS, batch, logs)
     signals = [name for name in SIGNALS.signals if name in rows.schema.names]
-    blocks = [
-        (block.drive, {name: values.copy() for name, values in block.channels.items()})
-        for block in simulate_blocks(lanes)
-    ]
+    truths = [(batch.drives[t.drive], t.channels) for t in simulate_drives(lanes)]
 
-    def measure() -> None:
-        recorders = [
-            Recorder(SIGNALS, s.sensors, s.generator(), s.distortion()) for s in batch.drives
-        ]
-        for drive, truth in blocks:
-            recorders[drive].record(truth)
+    def record() -> None:
+        for spec, truth in truths:
+            measure(SIGNALS, spec.sensors, spec.generator("sensors"), spec.distorted(truth))
 
     def distort() -> None:
-        sensors = [spec.distortion() for spec in batch.drives]
-        for drive, truth in blocks:
-            if sensor := sensors[drive]:
-                sensor.apply(truth)
+        for spec, truth in truths:
+            spec.distorted(truth)
 
     noise = np.empty(len(rows), dtype=np.float32)
-    generator = batch.drives[0].generator()
+    generator = batch.drives[0].generator("sensors")
     noisy = len(batch.drives[0].sensors.bias_and_std)
     encoded = warehouse.logs.encode(rows)
     draw_s = noisy * best(lambda: generator.standard_normal(out=noise, dtype=np.float32))
@@ -78,7 +70,7 @@ def stages(batch: Batch, warehouse: Warehouse) -> tuple[int, dict[str, float]]:
         "kernel": best(lambda: drive(lanes)),
         "sensors: draw the noise": draw_s,
         "sensors: imperfections": distort_s,
-        "sensors: add it, round, clip": best(measure) - draw_s - distort_s,
+        "sensors: add it, round, clip": best(record) - draw_s - distort_s,
         "tabulate": best(lambda: tabulate(SIGNALS, batch, logs)),
         "encode: signals": best(lambda: warehouse.logs.encode(rows.select(signals))),
         "encode: tick and metadata": best(lambda: warehouse.logs.encode(rows.select(remaining))),

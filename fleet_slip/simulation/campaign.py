@@ -34,7 +34,7 @@ from fleet_slip.simulation.drive_plans import (
 )
 from fleet_slip.simulation.imperfections import NONE, NotNegative, Positive
 from fleet_slip.simulation.roads import SpeedProfile, random_generator, speed_profile, surface
-from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Distortion, Receiver, Receivers, Sensors
+from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ, Receiver, Receivers, Sensors, distort
 from fleet_slip.vehicle.batch import Surface
 
 ROAD_SPACING_M = 1.0
@@ -72,7 +72,7 @@ class DriveSpec(CarOnRoad):
             return None
         from fleet_slip.simulation.traffic import drive_in_traffic  # noqa: PLC0415 - imports highway-env
 
-        generator = self._generator("traffic", self.drive_id)
+        generator = self.generator("traffic")
         return drive_in_traffic(
             self.traffic, self.limits, self.speed_factor, ROAD_SPACING_M, generator
         )
@@ -99,30 +99,24 @@ class DriveSpec(CarOnRoad):
         time_s = self.profile.time_s(self.laps) / self.speed_factor
         return math.ceil(time_s * SAMPLE_RATE_HZ)
 
-    def generator(self) -> np.random.Generator:
-        """Return a new generator of the sensor noise."""
-        return self._generator("sensors", self.drive_id)
-
-    def satellite_generator(self) -> np.random.Generator:
-        """Return a new generator of the satellite receiver's errors."""
-        return self._generator("satellites", self.drive_id)
-
-    def _generator(self, purpose: str, identity: str) -> np.random.Generator:
+    def generator(self, purpose: str, identity: str = "") -> np.random.Generator:
+        """Return a new generator for a purpose, of the drive or of another identity."""
+        identity = identity or self.drive_id
         if self.drawn_as:
             identity = self.drawn_as + identity.removeprefix(self.campaign)
         return random_generator(self.seed, purpose, identity)
 
-    def distortion(self) -> Distortion | None:
-        """Return the imperfect sensors at the start of the drive; None if they are ideal."""
+    def distorted(self, truth: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return the drive as its imperfect sensors measure it, before bias and noise."""
         if self.flaws == NONE:
-            return None
-        car_rng = self._generator("pulses", self.vehicle_id)
-        return Distortion(self.flaws, car_rng, self._generator("gps", self.drive_id))
+            return truth
+        car_rng = self.generator("pulses", self.vehicle_id)
+        return distort(truth, self.flaws, car_rng, self.generator("gps"))
 
     def surface(self, station_m: FloatArray) -> Surface | None:
         """Return the surface of the road at the stations of the profile."""
         track_rng = random_generator(self.seed, "slopes", self.track.name)
-        drive_rng = self._generator("weather", self.drive_id)
+        drive_rng = self.generator("weather")
         track = self.in_traffic.track if self.in_traffic else self.track
         return surface(self.flaws.road, track, station_m, track_rng, drive_rng)
 

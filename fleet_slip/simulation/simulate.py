@@ -28,12 +28,11 @@ from fleet_slip.simulation.sensors import (
     GPS_SIGNALS,
     SAMPLE_RATE_HZ,
     Measurement,
-    ReceiverLog,
-    Recorder,
+    measure,
+    receive,
 )
 from fleet_slip.storage.table import AppTransaction, Change, Snapshot, retry_conflicts, retrying
-from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_blocks
+from fleet_slip.vehicle.batch import LaneDrive, Road, simulate_drives, simulate_lanes
 from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -154,40 +153,30 @@ def simulate_logs(
     channels: Sequence[str] = (),
     engine: Engine = "kernel",
 ) -> list[DriveLog]:
-    """Simulate drives together and measure each block by block with its own sensors.
+    """Simulate drives together and measure each with its own sensors.
 
     `motion` of the logs contains the named channels of the truth.
     """
-    recorders = [Recorder(signals, s.sensors, s.generator(), s.distortion()) for s in specs]
-    receivers = [
-        ReceiverLog(signals, s.receiver, s.satellite_generator()) if s.receiver else None
-        for s in specs
-    ]
-    motions: list[dict[str, list[FloatArray]]] = [{name: [] for name in channels} for _ in specs]
-    logs: dict[int, DriveLog] = {}
     drives = [lane_drive(spec) for spec in specs]
-    simulate_lanes: Callable[..., None] = batch_kernel.simulate_lanes
+    engine_lanes: Callable[..., None] = simulate_lanes
     if engine == "highway-env":
         from fleet_slip.vehicle.highway import HighwayLanes  # noqa: PLC0415 - imports highway-env
 
-        simulate_lanes = HighwayLanes(drives)
-    for block in simulate_blocks(drives, simulate_lanes=simulate_lanes):
-        recorder, receiver = recorders[block.drive], receivers[block.drive]
-        truth = at_reference(block.channels, specs[block.drive].vehicle.body.reference_m)
-        for name, values in motions[block.drive].items():
-            values.append(truth[name].copy())
-        recorder.record(truth)
-        if receiver:
-            receiver.record(truth)
-        if block.last:
-            lost = block.lost_control_tick
-            logs[block.drive] = DriveLog(
-                specs[block.drive],
-                recorder.measurement(),
-                None if lost is None else lost / SAMPLE_RATE_HZ,
-                receiver.measurement() if receiver else None,
-                {name: np.concatenate(values) for name, values in motions[block.drive].items()},
-            )
+        engine_lanes = HighwayLanes(drives)
+    logs: dict[int, DriveLog] = {}
+    for drive in simulate_drives(drives, simulate_lanes=engine_lanes):
+        spec, lost = specs[drive.drive], drive.lost_control_tick
+        truth = at_reference(drive.channels, spec.vehicle.body.reference_m)
+        generator, fixes = spec.generator("sensors"), None
+        if spec.receiver:
+            fixes = receive(signals, spec.receiver, spec.generator("satellites"), truth)
+        logs[drive.drive] = DriveLog(
+            spec,
+            measure(signals, spec.sensors, generator, spec.distorted(truth)),
+            None if lost is None else lost / SAMPLE_RATE_HZ,
+            fixes,
+            {name: truth[name] for name in channels},
+        )
     return [logs[drive] for drive in range(len(specs))]
 
 

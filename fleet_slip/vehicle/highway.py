@@ -21,9 +21,8 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.batch import LaneDrive, simulate_blocks
-from fleet_slip.vehicle.batch_kernel import CHANNELS
+from fleet_slip.vehicle import batch
+from fleet_slip.vehicle.batch import CHANNELS, LaneDrive
 from fleet_slip.vehicle.driver import SAMPLE_S
 from fleet_slip.vehicle.dynamics import (
     CALM,
@@ -314,7 +313,7 @@ class LinearTyreVehicle(FourWheelVehicle):
 
 
 class HighwayLanes:
-    """Advances lanes as `batch_kernel.simulate_lanes`, each car by `FourWheelVehicle.step`.
+    """Advances lanes as `batch.simulate_lanes`, each car by `FourWheelVehicle.step`.
 
     Roads, drivers and records are those of the kernel.
     """
@@ -334,37 +333,37 @@ class HighwayLanes:
         truth: FloatArray,
         results: IntArray,
     ) -> None:
-        """Simulate sample by sample until the block of a lane is complete."""
+        """Simulate sample by sample until a drive ends."""
         del steps
-        lanes = memory.reshape(batch_kernel.ROWS, batch_kernel.LANES).T
-        complete = 0
-        while complete == 0:
-            batch_kernel.begin_sample(routes, roads, surfaces, memory, lane_table, truth, results)
-            for lane, drive in enumerate(lane_table[batch_kernel.DRIVE].tolist()):
-                if drive != batch_kernel.ABSENT:
+        lanes = memory.reshape(batch.ROWS, batch.LANES).T
+        ended = 0
+        while ended == 0:
+            batch.begin_sample(routes, roads, surfaces, memory, lane_table, truth, results)
+            for lane, drive in enumerate(lane_table[batch.DRIVE].tolist()):
+                if drive != batch.ABSENT:
                     self._step(drive, lanes[lane])
-            complete = batch_kernel.finish_sample(routes, memory, lane_table, truth, results)
+            ended = batch.finish_sample(routes, memory, lane_table, truth, results)
 
     def _step(self, drive: int, column: FloatArray) -> None:
         """Advance the vehicle of a drive by a sample; `column` is the lane's memory."""
         vehicle = self._vehicles.get(drive)
         if vehicle is None:
             vehicle = self._vehicles[drive] = vehicle_of(self._drives[drive], float(column[0]))
-        demands = Controls(*_read(column, batch_kernel.CONTROLS, Controls))
-        vehicle.environment = Environment(*_read(column, batch_kernel.ENVIRONMENT, Environment))
-        vehicle.path = Path(*_read(column, batch_kernel.PATH, Path))
-        pose = Pose(*_read(column, batch_kernel.POSE, Pose))  # in this lap
+        demands = Controls(*_read(column, batch.CONTROLS, Controls))
+        vehicle.environment = Environment(*_read(column, batch.ENVIRONMENT, Environment))
+        vehicle.path = Path(*_read(column, batch.PATH, Path))
+        pose = Pose(*_read(column, batch.POSE, Pose))  # in this lap
         vehicle.last_motion = vehicle.last_motion._replace(pose=pose)
         wheel = math.atan(demands.steering_wheel / vehicle.parameters.steering.ratio)
         vehicle.act({"steering": wheel, "acceleration": demands.traction})
         vehicle.step(SAMPLE_S)
         motion = vehicle.last_motion
         for row, values in (
-            (batch_kernel.STATE, motion.state),
-            (batch_kernel.SLOPES, motion.slopes),
-            (batch_kernel.POSE, motion.pose),
-            (batch_kernel.FORCE, vehicle.force),
-            (batch_kernel.COMPLIANCE, motion.compliance),
+            (batch.STATE, motion.state),
+            (batch.SLOPES, motion.slopes),
+            (batch.POSE, motion.pose),
+            (batch.FORCE, vehicle.force),
+            (batch.COMPLIANCE, motion.compliance),
         ):
             column[row : row + len(values)] = values
 
@@ -413,8 +412,8 @@ def require_agreement(drive: LaneDrive, name: str, tolerance: float) -> None:
     speed = float(drive.road.speed_mps[0])
     short = replace(drive, laps=CHECKED_S * speed / drive.road.length_m)
     by_kernel, by_vehicle = (
-        next(simulate_blocks([short], simulate_lanes=lanes)).channels
-        for lanes in (batch_kernel.simulate_lanes, HighwayLanes([short]))
+        next(batch.simulate_drives([short], simulate_lanes=lanes)).channels
+        for lanes in (batch.simulate_lanes, HighwayLanes([short]))
     )
     linear = vehicle_of(drive, speed, LinearTyreVehicle)
     bicycle = highway_twin(linear)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
-from fleet_slip.simulation.sensors import Measurement, Receiver, ReceiverLog
+from fleet_slip.simulation.sensors import Measurement, Receiver, receive
 from fleet_slip.simulation.simulate import simulate_logs
 from tests.support.catalog import SIGNALS
 
@@ -38,12 +38,9 @@ def truth(ticks: int = 3000, speed: float = 15.0) -> dict[str, NDArray[np.float6
     }
 
 
-def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]], *cuts: int) -> Measurement:
-    """Return what is logged of a drive that comes in blocks."""
-    log = ReceiverLog(SIGNALS, receiver, np.random.default_rng(5))
-    for begin, end in zip((0, *cuts), (*cuts, len(drive["vx_mps"])), strict=True):
-        log.record({name: values[begin:end] for name, values in drive.items()})
-    return log.measurement()
+def logged(receiver: Receiver, drive: dict[str, NDArray[np.float64]]) -> Measurement:
+    """Return what is logged of a drive."""
+    return receive(SIGNALS, receiver, np.random.default_rng(5), drive)
 
 
 def changes(
@@ -99,14 +96,6 @@ def test_noise_is_of_each_fix_or_lasts() -> None:
         following = np.corrcoef(error[1:], error[:-1])[0, 1]
         assert following == pytest.approx(1.0 if correlated else 0.0, abs=0.1)
         assert key == "wander_std_mps" or error.std() == pytest.approx(0.1, rel=0.05)
-
-
-def test_blocks_change_neither_heading_nor_fixes() -> None:
-    drive = truth()
-    whole, parts = logged(EXACT, drive), logged(EXACT, drive, 7, 1234, 2001)
-    assert (whole.gps_fix == parts.gps_fix).all()
-    for name, counts in whole.counts.items():
-        assert (counts == parts.counts[name]).all()
 
 
 def test_a_campaign_with_receivers_has_the_drives_of_its_base(tmp_path: Path) -> None:

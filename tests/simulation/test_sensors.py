@@ -13,16 +13,16 @@ from fleet_slip.catalog.signals import Signal
 from fleet_slip.simulation.imperfections import Imperfections, SensorImperfections
 from fleet_slip.simulation.sensors import (
     EXACT,
-    Delay,
-    Distortion,
-    GaussMarkov,
     Gps,
-    LowPass,
-    Pulses,
     Sensors,
+    correlated_noise,
+    delayed,
+    distort,
+    low_pass,
     noisy_counts,
+    timed_pulses,
 )
-from fleet_slip.vehicle.batch_kernel import CHANNELS
+from fleet_slip.vehicle.batch import CHANNELS
 from fleet_slip.vehicle.parameters import PERFECT, CarImperfections
 from tests.support.catalog import SIGNALS
 from tests.support.measurements import measure
@@ -132,7 +132,7 @@ def seen(
     of: dict[str, FloatArray], car: CarImperfections = PERFECT, **sensors: float
 ) -> dict[str, FloatArray]:
     flaws = Imperfections(car=car, sensors=SensorImperfections.model_validate(sensors))
-    return Distortion(flaws, np.random.default_rng(1), np.random.default_rng(2)).apply(of)
+    return distort(of, flaws, np.random.default_rng(1), np.random.default_rng(2))
 
 
 def test_a_leaning_body_adds_its_share_of_the_weight() -> None:
@@ -189,7 +189,7 @@ def test_offsets_and_scale_of_angles() -> None:
 @pytest.mark.parametrize("latency_s", [0.01, 0.045, 0.2])
 def test_a_late_sensor_reports_what_was(latency_s: float) -> None:
     signal = 3.0 * TIME_S
-    late = Delay(latency_s).apply(signal)
+    late = delayed(signal, latency_s)
     np.testing.assert_allclose(late[50:], (signal - 3.0 * latency_s)[50:], atol=1e-9)
     assert late[0] == signal[0]
 
@@ -197,61 +197,31 @@ def test_a_late_sensor_reports_what_was(latency_s: float) -> None:
 @pytest.mark.parametrize("bandwidth_hz", [2.0, 10.0])
 def test_a_low_pass_passes_half_of_the_power_at_its_bandwidth(bandwidth_hz: float) -> None:
     wave = np.sin(2 * np.pi * bandwidth_hz * TIME_S)
-    passed = LowPass(bandwidth_hz).apply(wave)[ROWS // 2 :]
+    passed = low_pass(wave, bandwidth_hz)[ROWS // 2 :]
     # The trapezoidal rule warps a frequency f to tan(π f T) / (π T).
     warped = np.tan(np.pi * bandwidth_hz / 100) / (np.pi * bandwidth_hz / 100)
     assert np.var(passed) / np.var(wave) == pytest.approx(1 / (1 + warped**2), rel=0.02)
-    assert LowPass(bandwidth_hz).apply(np.full(10, 7.0))[-1] == 7.0
+    assert low_pass(np.full(10, 7.0), bandwidth_hz)[-1] == 7.0
 
 
 def test_pulses_are_timed_at_any_speed() -> None:
     speed = np.full(ROWS, 60.0)
-    found = Pulses(np.zeros(48)).apply(speed)
+    found = timed_pulses(speed, np.zeros(48))
     np.testing.assert_allclose(found[10:], 60.0, rtol=1e-9)
-    slow = Pulses(np.zeros(48)).apply(np.full(ROWS, 0.8))  # six pulses a second
+    slow = timed_pulses(np.full(ROWS, 0.8), np.zeros(48))  # six pulses a second
     np.testing.assert_allclose(slow[100:], 0.8, rtol=1e-6)
 
 
 def test_uneven_pulses_repeat_with_every_turn() -> None:
     places = 0.02 * np.random.default_rng(3).standard_normal(48)
-    found = Pulses(places).apply(np.full(ROWS, 2 * np.pi * 10))  # a turn is ten samples
+    found = timed_pulses(np.full(ROWS, 2 * np.pi * 10), places)  # a turn is ten samples
     error = found[20:] / (2 * np.pi * 10) - 1
     assert 0.001 < np.std(error) < 0.02
     assert np.corrcoef(error[10:], error[:-10])[0, 1] > 0.99
 
 
-def test_a_drive_in_two_blocks_is_the_drive_in_one() -> None:
-    wave = np.sin(TIME_S)
-    of = truth(
-        ay_mps2=wave,
-        leaning_ay_mps2=wave,
-        sideslip_rad=wave / 50,
-        wheel_fl_rad_s=20 + 19 * wave,
-        steering_wheel_rad=wave,
-    )
-    sensors = SensorImperfections(
-        inertial_bandwidth_hz=10,
-        inertial_latency_s=0.013,
-        steering_latency_s=0.02,
-        wheel_pulses_per_turn=48,
-        wheel_pitch_error=0.01,
-        label_latency_s=0.045,
-        label_bandwidth_hz=8,
-    )
-    flaws = Imperfections(sensors=sensors)
-
-    def sensor() -> Distortion:
-        return Distortion(flaws, np.random.default_rng(1), np.random.default_rng(2))
-
-    whole, parted = sensor().apply(of), sensor()
-    for part in (slice(0, 7), slice(7, 1500), slice(1500, None)):
-        found = parted.apply({name: values[part] for name, values in of.items()})
-        for name, values in found.items():
-            np.testing.assert_array_equal(values, whole[name][part], err_msg=name)
-
-
 def test_lasting_errors_have_their_spread_and_forget_in_their_time() -> None:
-    errors = GaussMarkov(4, 2.0, np.random.default_rng(5)).next(200_000)
+    errors = correlated_noise(4, 200_000, 2.0, np.random.default_rng(5))
     assert np.std(errors, axis=1) == pytest.approx(np.ones(4), rel=0.1)
     for tau_s in (1.0, 2.0):
         ticks = int(tau_s * 100)

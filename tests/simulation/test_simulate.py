@@ -23,7 +23,7 @@ from fleet_slip.simulation.simulate import (
     simulate_campaign,
 )
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle import batch_kernel
+from fleet_slip.vehicle import batch as lanes
 from fleet_slip.vehicle.highway import FourWheelVehicle, HighwayLanes
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import SIGNALS
@@ -106,13 +106,13 @@ def test_days_that_landed_before_they_were_recorded_are_recorded(tmp_path: Path)
 
 
 def broken_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulate = batch_kernel.simulate_lanes
+    simulate = lanes.simulate_lanes
 
     def skewed(*arguments: Any) -> None:
         simulate(*arguments)
         arguments[6][:] *= 1 + 1e-8  # the truth of all lanes
 
-    monkeypatch.setattr(batch_kernel, "simulate_lanes", skewed)
+    monkeypatch.setattr(lanes, "simulate_lanes", skewed)
 
 
 def broken_bicycle(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,7 +180,7 @@ def test_highway_env_drives_whole_drives_as_the_kernel() -> None:
     by_highway_env = simulate_drives(drives, simulate_lanes=HighwayLanes(drives))
     for expected, truth in zip(by_kernel, by_highway_env, strict=True):
         assert truth.lost_control_tick == expected.lost_control_tick
-        for name in batch_kernel.CHANNELS:
+        for name in lanes.CHANNELS:
             values = getattr(truth, name)
             np.testing.assert_allclose(values, getattr(expected, name), rtol=2e-11, atol=2e-11)
     batch = Batch("smoke", smoke.first_day, 0, (replace(specs[1], laps=0.1),))

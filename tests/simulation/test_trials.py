@@ -19,8 +19,7 @@ from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, load_track, road
 from fleet_slip.simulation.scenario import load_scenarios
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.simulation.simulate import DriveLog, simulate_batch, simulate_logs, tabulate
-from fleet_slip.vehicle.batch import LaneDrive, Road
-from fleet_slip.vehicle.batch_kernel import BLOCK, CHANNELS
+from fleet_slip.vehicle.batch import CHANNELS, LaneDrive, Road
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.catalog import SIGNALS
 from tests.support.logs import schema_without
@@ -119,7 +118,7 @@ def synthetic_table(*truths: Truth, lost_control_s: float | None = None) -> pa.T
     batch = short_batch()
     lost = [None] * (len(truths) - 1) + [lost_control_s]
     logs = [
-        DriveLog(spec, measure(truth, spec.sensors, spec.generator()), at_s)
+        DriveLog(spec, measure(truth, spec.sensors, spec.generator("sensors")), at_s)
         for spec, truth, at_s in zip(batch.drives, truths, lost, strict=False)
     ]
     return tabulate(SIGNALS, batch, logs)
@@ -223,20 +222,3 @@ def test_the_angle_of_a_loaded_car_is_that_of_the_place_where_the_empty_one_has_
     for log, expected in zip(logs, (one, other), strict=True):
         measured = np.mean(log.measurement.counts["sideslip"][500:]) * float(label.scale)
         assert measured == pytest.approx(expected, abs=0.0005)
-
-
-def test_a_drive_longer_than_a_block_goes_on_where_the_block_ended() -> None:
-    drive = on_skid_pad(short_batch().drives[0], 4.0)
-    long = replace(drive, laps=2 * BLOCK / drive.expected_rows * 1.1)
-    log, short = simulate_logs(SIGNALS, [long, replace(drive, laps=0.5)])
-    assert log.rows > 2 * BLOCK
-    table = tabulate(SIGNALS, Batch("test", DAY, 0, (long, drive)), [log, short])
-    assert table["tick"].to_pylist() == [*range(log.rows), *range(short.rows)]
-    for name in ("vx", "station", "yaw_rate"):
-        counts = log.measurement.counts[name].astype(int)
-        steps = np.abs(np.diff(counts[BLOCK // 2 :]))
-        at_border = steps[BLOCK // 2 - 1 :: BLOCK]
-        assert at_border.max() <= np.sort(steps)[-len(steps) // 1000], name
-    fixes = np.flatnonzero(log.measurement.gps_fix)
-    assert np.all(fixes % 10 == 0)
-    assert fixes[-1] > 2 * BLOCK

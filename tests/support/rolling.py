@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle import batch_kernel
-from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive, simulate_blocks
-from fleet_slip.vehicle.batch_kernel import CHANNELS
+from fleet_slip.vehicle import batch
+from fleet_slip.vehicle.batch import STEPS_PER_SAMPLE, LaneDrive
 from fleet_slip.vehicle.dynamics import (
     CALM,
     Compliance,
@@ -117,18 +116,12 @@ class Truth:
 def simulate_drives(
     drives: Sequence[LaneDrive],
     steps_per_sample: int = STEPS_PER_SAMPLE,
-    simulate_lanes: Callable[..., None] = batch_kernel.simulate_lanes,
+    simulate_lanes: Callable[..., None] = batch.simulate_lanes,
 ) -> list[Truth]:
-    """Return what happens in each drive as a whole; see `simulate_blocks`."""
-    parts: list[list[dict[str, FloatArray]]] = [[] for _ in drives]
-    lost: dict[int, int | None] = {}
-    for block in simulate_blocks(drives, steps_per_sample, simulate_lanes):
-        parts[block.drive].append({name: x.copy() for name, x in block.channels.items()})
-        lost[block.drive] = block.lost_control_tick
+    """Return what happens in each drive, in their order."""
+    drives_by_end = batch.simulate_drives(drives, steps_per_sample, simulate_lanes)
+    truths = {truth.drive: truth for truth in drives_by_end}
     return [
-        Truth(
-            {name: np.concatenate([part[name] for part in blocks]) for name in CHANNELS},
-            lost[drive],
-        )
-        for drive, blocks in enumerate(parts)
+        Truth(truths[drive].channels, truths[drive].lost_control_tick)
+        for drive in range(len(drives))
     ]
