@@ -54,7 +54,7 @@ from fleet_slip.evaluation.single_track import follow, measured_speed_mps
 from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
-from fleet_slip.grams.compute import DriveBlocks, counts_of, drive_sums, gram_rows
+from fleet_slip.grams.compute import counts_of, drive_sums, gram_rows
 from fleet_slip.ingest.mapping import NO_WHEEL_SPEEDS, ONE_SPEED
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.prior import simulate_prior
@@ -211,7 +211,6 @@ class Learner:
         if feature_set.change_ticks:
             raise DataError("a label-free model needs three drives or more: add some.")
         plan = ColumnPlan.of_set(catalog, name)
-        blocks = DriveBlocks.of_set(feature_set)
         attributes = {row["drive_id"]: row for row in self.cohort.drives.to_pylist()}
         rows: list[dict[str, Any]] = []
         for drive in self.drives:
@@ -219,9 +218,9 @@ class Learner:
             labelled = counts.present.get(label, np.ones(len(drive.rows), dtype=np.bool_))
             for quarter in range(QUARTERS):
                 present = {**counts.present, label: labelled & (drive.quarter == quarter)}
-                sums = drive_sums(plan, blocks, replace(counts, present=present))
+                sums = drive_sums(plan, feature_set, replace(counts, present=present))
                 metadata = {**attributes[drive.name], "quarter": quarter}
-                rows += gram_rows(sums, plan.names, blocks, metadata)
+                rows += gram_rows(sums, feature_set, metadata)
         rows = [row for row in rows if label in row["signals"].split(",")]
         sums_type = pa.list_(pa.int64())
         of_quarter = [("quarter", pa.int64()), ("sums", sums_type), ("products", sums_type)]

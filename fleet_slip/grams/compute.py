@@ -4,10 +4,9 @@ The kernel sums the rows, blocks and course changes of each drive.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import nullcontext
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from math import ceil
@@ -124,33 +123,15 @@ def rows_by_drive(rows: pa.Table) -> Iterator[pa.Table]:
         yield rows.slice(start, stop - start)
 
 
-@dataclass(frozen=True)
-class DriveBlocks:
-    """Division of the rows of a drive into blocks of time, or one block per duration of changes.
+def block_name(feature_set: FeatureSet, number: int) -> str | None:
+    """Return the name of a block of a drive; None for an undivided drive.
 
-    With several durations each block contains all rows.
+    A block is a block of time, or one of several durations of changes. Names sort as numbers do.
     """
-
-    block_ticks: int | None = None
-    durations: tuple[str, ...] = ()
-
-    @classmethod
-    def of_set(cls, feature_set: FeatureSet) -> "DriveBlocks":
-        """Return the division of the drives of a feature set."""
-        durations = tuple(f"{time_s:f} s" for time_s in feature_set.change_s)
-        return cls(feature_set.block_ticks, durations if len(durations) > 1 else ())
-
-    def numbers(self, ticks: NDArray[Any]) -> IntArray:
-        """Return the block number of each row, shape (rows,); 0 without blocks of time."""
-        if not self.block_ticks:
-            return np.zeros(len(ticks), dtype=np.int64)
-        return ticks.astype(np.int64) // self.block_ticks
-
-    def name(self, number: int) -> str | None:
-        """Return the name of a block; names sort as numbers do; None for an undivided drive."""
-        if self.block_ticks:
-            return f"block {number + 1:04}"
-        return self.durations[number] if self.durations else None
+    if feature_set.block_ticks:
+        return f"block {number + 1:04}"
+    durations = feature_set.change_s
+    return f"{durations[number]:f} s" if len(durations) > 1 else None
 
 
 # Gram rows of any feature set by the kernel: equal to those by SQL, faster.
@@ -198,31 +179,29 @@ def _rows_of_drive(
     drive: DriveCounts,
     metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
-    blocks = DriveBlocks.of_set(feature_set)
     try:
         if feature_set.change_ticks:
             delay = (metadata[COURSE_LATE] or 0) if feature_set.in_time else 0
             sums = change_sums(signals, plan, drive, feature_set.change_ticks, delay)
         else:
-            sums = drive_sums(plan, blocks, drive)
+            sums = drive_sums(plan, feature_set, drive)
     except DataError as error:
         raise DataError(f"{metadata['file']}: drive {metadata['drive_id']}: {error}") from None
-    return gram_rows(sums, feature_set.columns, blocks, metadata)
+    return gram_rows(sums, feature_set, metadata)
 
 
 def gram_rows(
     sums_by_pattern: "Mapping[Pattern, BlockSums]",
-    columns: Sequence[str],
-    blocks: DriveBlocks,
+    feature_set: FeatureSet,
     metadata: Mapping[str, Any],
 ) -> Iterator[dict[str, Any]]:
     """Yield the Gram rows of the sums of a drive with its metadata, sorted as by SQL."""
     for absent, block in sorted(sums_by_pattern):
         sums = sums_by_pattern[absent, block]
-        names = [name for i, name in enumerate(columns) if not absent >> i & 1]
+        names = [name for i, name in enumerate(feature_set.columns) if not absent >> i & 1]
         yield {
             **metadata,
-            "part": blocks.name(block),
+            "part": block_name(feature_set, block),
             "signals": ",".join(names),
             "n": sums.n,
             "clipped": sums.clipped,
@@ -231,19 +210,13 @@ def gram_rows(
         }
 
 
-@dataclass
 class BlockSums:
     """Sums over the rows of a drive, or of a block of it, that have the same columns."""
 
-    size: int
-    n: int = 0
-    clipped: int = 0
-    sums: NDArray[np.int64] = field(init=False)
-    products: NDArray[np.int64] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.sums = np.zeros(self.size, dtype=np.int64)
-        self.products = np.zeros((self.size, self.size), dtype=np.int64)
+    def __init__(self, size: int) -> None:
+        self.n, self.clipped = 0, 0
+        self.sums = np.zeros(size, dtype=np.int64)
+        self.products = np.zeros((size, size), dtype=np.int64)
 
     def add(self, values: FloatArray, clipped: FloatArray) -> None:
         """Add complete rows, shape (columns, rows), and the number of clipped values of each.
@@ -264,13 +237,16 @@ Pattern = tuple[int, int]
 
 
 def drive_sums(
-    plan: ColumnPlan, blocks: DriveBlocks, counts: DriveCounts
+    plan: ColumnPlan, feature_set: FeatureSet, counts: DriveCounts
 ) -> dict[Pattern, BlockSums]:
     """Return the sums of the rows of a drive by pattern; raises as `wide_grams`."""
     _require_64_bits(len(counts.ticks), max(plan.limits))
     sums: dict[Pattern, BlockSums] = {}
+    ticks = counts.ticks.astype(np.int64)
+    size = feature_set.block_ticks
+    block_of_row = ticks // size if size else np.zeros_like(ticks)
     for rows, values, clipped in plan.blocks(counts):
-        _add_by_pattern(sums, values, clipped, blocks.numbers(counts.ticks[rows]))
+        _add_by_pattern(sums, values, clipped, block_of_row[rows])
     return sums
 
 
@@ -379,11 +355,7 @@ class Fixes:
         # Straight driving by the yaw rate at both fixes and in between.
         fastest = np.maximum(np.abs(yaw_rate[rows[before]]), np.abs(yaw_rate[rows[now]]))
         straight = (fastest <= units.slow) & (np.abs(turned) <= units.unturned)
-        auxiliary = [
-            _divide_rounded(turned, TURNED_DIVISOR),
-            straight,
-            straight * change,
-        ]  # `AUXILIARY`
+        auxiliary = [_divide_rounded(turned, TURNED_DIVISOR), straight, straight * change]
         # The first row has no change: it records a drive without a course.
         is_start = self.ticks[:1] == 0
         offset, size = int(is_start.sum()), len(self.counts)
@@ -486,10 +458,7 @@ def gram_statement(
     rows = with_columns(logs, used, windows)
     wide = windows or any(feature.bits > COUNT_BITS for feature in used.values())
     kind = "BIGINT" if wide else "INTEGER"
-    sums = [f"sum({name})" for name in names]
-    products = [
-        f"sum({a}::{kind} * {b}::{kind})" for i, a in enumerate(names) for b in names[: i + 1]
-    ]
+    pairs = ((a, b) for i, a in enumerate(names) for b in names[: i + 1])
     return read_sql("jobs", "gram.sql").format(
         drive_columns=", ".join(
             signals.null_sql(name) if name in absent else name for name in signals.drive
@@ -497,8 +466,8 @@ def gram_statement(
         qualified_drive_columns=", ".join(f"drive.{name}" for name in signals.drive),
         absent="0" if complete else _absent_mask(names),
         clipped="sum(clipped)::BIGINT" if used or windows else "0",
-        sums=_SEPARATOR.join(sums),
-        products=_SEPARATOR.join(products),
+        sums=_SEPARATOR.join(f"sum({name})" for name in names),
+        products=_SEPARATOR.join(f"sum({a}::{kind} * {b}::{kind})" for a, b in pairs),
         counts=rows,
         # Not grouped by a constant: DuckDB would hash a dictionary row by row.
         group="drive_id" if complete else "drive_id, absent",
@@ -549,36 +518,23 @@ def compute_grams(
     local = LocalThreads(cpu_count() or 1) if wide and not executor else nullcontext(executor)
     with local as workers:
         size = ceil(len(files) / in_flight(executor)) if executor else FILES_PER_QUERY
-        groups = _groups(files, 1 if wide else min(FILES_PER_QUERY, size))
+        step = 1 if wide else min(FILES_PER_QUERY, size)
+        groups = [files[first : first + step] for first in range(0, len(files), step)]
         threads = 1 if executor else None
         compute = partial(wide_grams, delays=delays) if wide else partial(by_sql, threads=threads)
         task = partial(compute, warehouse, feature_set=feature_set)
-        yield from _run_in_order(workers, task, groups, progress)
+        total = sum(file.rows for file in files)
+        early: dict[str, pa.Table] = {}  # by the first file of a group
+        pending = deque(group[0].path for group in groups)
+        for group, rows in run_tasks(workers, task, groups, _describe_task):
+            early[group[0].path] = rows
+            progress(sum(file.rows for file in group), total)
+            while pending and pending[0] in early:
+                yield early.pop(pending.popleft())
 
 
-def _run_in_order(
-    executor: Executor | None,
-    task: Callable[[Sequence[TableFile]], pa.Table],
-    groups: list[Sequence[TableFile]],
-    progress: Progress,
-) -> Iterator[pa.Table]:
-    """Yield the results of tasks in the order of their files."""
-    total = sum(file.rows for group in groups for file in group)
-
-    def name_of(group: Sequence[TableFile]) -> str:
-        return f"the Gram rows of {pluralize(len(group), 'log file')} from {group[0].path}"
-
-    early: dict[str, pa.Table] = {}
-    pending = deque(group[0].path for group in groups)
-    for group, rows in run_tasks(executor, task, groups, name_of):
-        early[group[0].path] = rows
-        progress(sum(file.rows for file in group), total)
-        while pending and pending[0] in early:
-            yield early.pop(pending.popleft())
-
-
-def _groups(files: Sequence[TableFile], step: int) -> list[Sequence[TableFile]]:
-    return [files[first : first + step] for first in range(0, len(files), step)]
+def _describe_task(group: Sequence[TableFile]) -> str:
+    return f"the Gram rows of {pluralize(len(group), 'log file')} from {group[0].path}"
 
 
 def by_sql(

@@ -45,7 +45,7 @@ from fleet_slip.catalog.features import PLAIN, Feature
 from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S, Signal
 from fleet_slip.config import read_named_file
 from fleet_slip.errors import InputError, RepeatedError
-from fleet_slip.grams.compute import DriveBlocks
+from fleet_slip.grams.compute import block_name
 from fleet_slip.grams.update import (
     files_to_rewrite,
     gram_digests,
@@ -151,7 +151,7 @@ def _onboard_feature_set(catalog: Catalog, name: str, identity: str) -> OnboardF
         {column: _range(catalog, column, resolved.change_ticks) for column in resolved.columns},
         tuple(sources),
         resolved.change_ticks,
-        DriveBlocks.of_set(resolved).durations or (None,),
+        tuple(block_name(resolved, i) for i in range(len(resolved.change_s) or 1)),
         resolved.in_time,
         int.from_bytes(bytes.fromhex(digest[:16]), "little"),
     )
