@@ -22,6 +22,8 @@ from fleet_slip.errors import (
     RepeatedError,
 )
 from fleet_slip.ingest.log_files import find_logs
+from fleet_slip.ingest.mapping import load_mapping
+from fleet_slip.models.publish import Publication, is_current
 from fleet_slip.models.registry import CANDIDATE
 from fleet_slip.models.request import (
     COURSE_MODELS,
@@ -30,6 +32,7 @@ from fleet_slip.models.request import (
     SelectionRequest,
     load_model_list,
 )
+from fleet_slip.operations.forget import load_retention, marked_models
 from fleet_slip.operations.night import Baseline, NightlyLog, NightReport, NightStep, State
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.storage.runs import step
@@ -41,7 +44,6 @@ if TYPE_CHECKING:
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.logs import IngestReport
     from fleet_slip.ingest.mapping import Mapping
-    from fleet_slip.models.publish import Publication
     from fleet_slip.models.summary import Selection
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.sensor_screen import SensorFault
@@ -99,25 +101,16 @@ class Training:
 
     def current_champion(self, fleet: "Fleet") -> "Publication | None":
         """Return the champion if it was selected from the same data, list and program."""
-        from fleet_slip.models.publish import Publication, is_current
-        from fleet_slip.operations.forget import marked_models
-
         champion = fleet.models.registry.champion(self.name)
         if champion is None or champion.reference in marked_models(fleet.warehouse):
             return None
-        manifest = champion.manifest
-        if not is_current(manifest, fleet.warehouse, self.cohort, self.models):
+        manifest, warehouse = champion.manifest, fleet.warehouse
+        measures = manifest.combination.measures if manifest.combination else None
+        if self.vehicle not in (None, measures):
             return None
-        combination = manifest.combination
-        if self.vehicle and (combination is None or combination.measures != self.vehicle):
+        if not is_current(manifest, warehouse, self.cohort, self.models):
             return None
         return Publication(champion, False, "The champion was trained with the same data and list.")
-
-    def select(self, fleet: "Fleet") -> "Selection":
-        """Compare the models of the list on the cohort, whose drives are checked already."""
-        request = SelectionRequest(models=self.models, label=self.label)
-        cohort = fleet.cohort(self.cohort, include_faulty=True)
-        return cohort.select(request, nested=True)
 
     def publish(
         self, fleet: "Fleet", *, candidate: bool = False, replace_marked: bool = False
@@ -127,22 +120,21 @@ class Training:
         There is no selection if the champion is up to date. With `replace_marked`, a champion that
         was trained on erased drives is always replaced.
         """
-        from fleet_slip.operations.forget import marked_models
-
         if current := self.current_champion(fleet):
             return None, current, ""
-        with step("select"):
-            selection = self.select(fleet)
+        request = SelectionRequest(models=self.models, label=self.label)
+        with step("select"):  # the drives are checked already
+            checked = fleet.cohort(self.cohort, include_faulty=True)
+            selection = checked.select(request, nested=True)
         champion = fleet.models.registry.champion(self.name) if replace_marked else None
-        force = champion is not None and champion.reference in marked_models(fleet.warehouse)
+        options = {
+            "force": champion is not None and champion.reference in marked_models(fleet.warehouse),
+            "candidate": candidate,
+        }
         try:
             with step("publish"):
                 published = fleet.models.publish(
-                    self.name,
-                    selection,
-                    force=force,
-                    candidate=candidate,
-                    with_filter=self.vehicle,
+                    self.name, selection, with_filter=self.vehicle, **options
                 )
         except RefusedError as error:
             return selection, None, str(error)
@@ -164,20 +156,15 @@ class Trained(Answer):
     seconds: float
 
     @property
-    def new(self) -> bool:
-        """True if rows were read or a version was published."""
-        is_published = self.publication is not None and self.publication.new
-        return is_published or any(report.changed for report in self.grams)
-
-    @property
     def publish(self) -> "Publication | dict[str, Any]":
         """The publication, or the reason of the refusal."""
         return self.publication or {"new": False, "reason": self.refusal}
 
     @property
     def changed(self) -> bool:
-        """True if there was anything to do."""
-        return self.new
+        """True if Gram rows changed or a version was published."""
+        is_published = self.publication is not None and self.publication.new
+        return is_published or any(report.changed for report in self.grams)
 
     def training_parts(
         self, subject: str, before: Iterable[Part], everything: bool
@@ -229,7 +216,7 @@ class RunReport(Trained):
     @property
     def changed(self) -> bool:
         """True if there was anything to do."""
-        return self.new or self.simulation.changed
+        return super().changed or self.simulation.changed
 
 
 @dataclass(frozen=True)
@@ -254,7 +241,7 @@ class LearnReport(Trained):
     @property
     def changed(self) -> bool:
         """True if there was anything to do."""
-        return self.new or any(report.new for report in self.ingested)
+        return super().changed or any(report.new for report in self.ingested)
 
     @property
     def problem(self) -> FleetSlipError | None:
@@ -278,8 +265,8 @@ class LearnReport(Trained):
             for log in reversed(self.ingested)
             for fault in log.suspicions
         }
-        steps = map(Remark, (ingested, *suspicions.values()))
-        yield from self.training_parts(self.model, steps, everything)
+        before = map(Remark, (ingested, *suspicions.values()))
+        yield from self.training_parts(self.model, before, everything)
         if self.assumed:
             yield Remark(f"assumptions, since {self.mapping} has no other values:")
             yield from (Remark(f"  {value}") for value in self.assumed)
@@ -406,8 +393,6 @@ class NightlyPipeline:
         )
 
     def _ingest(self) -> StepResult:
-        from fleet_slip.ingest.mapping import load_mapping
-
         mapping = load_mapping(self.mapping, self.fleet.warehouse.catalog)
         if not self.inbox.is_dir():
             raise InputError(
@@ -434,17 +419,12 @@ class NightlyPipeline:
         problem = problem or next(alarms, "")
         rows = self.fleet.warehouse.logs.snapshot().rows - self.baseline.rows
         replaced = sum(report.drives_replaced for report in reports)
-        sentences = (
-            f"{pluralize(max(rows, 0), 'new row')}.",
-            f"The mapping was corrected: {pluralize(replaced, 'drive')} replaced." * bool(replaced),
-            logs.describe_passed_over(),
-            problem,
-        )
-        return "attention" if problem else "done", " ".join(filter(None, sentences))
+        text = f"The mapping was corrected: {pluralize(replaced, 'drive')} replaced."
+        sentences = text * bool(replaced), logs.describe_passed_over(), problem
+        summary = " ".join(filter(None, (f"{pluralize(max(rows, 0), 'new row')}.", *sentences)))
+        return "attention" if problem else "done", summary
 
     def _retain(self) -> StepResult:
-        from fleet_slip.operations.forget import load_retention
-
         warehouse = self.fleet.warehouse
         retention = load_retention(self.retention, warehouse.configs)
         before = date.today() - timedelta(days=retention.drives_days)
