@@ -18,7 +18,7 @@ from fleet_slip.arrays import BoolArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.config import Config, load_config
-from fleet_slip.errors import DataError, QuestionError, RefusedError, StorageError
+from fleet_slip.errors import DataError, QuestionError, StorageError
 from fleet_slip.grams.cohort import (
     FOLD_KEYS,
     Cohort,
@@ -60,11 +60,6 @@ class PublishThresholds(Config):
     tolerance_deg: float = Field(ge=0)
     max_columns_per_drive: float = Field(default=3.0, gt=0)
     min_rows_per_column: int = Field(default=100, ge=1)
-
-    @property
-    def tolerance(self) -> float:
-        """RMSE gap to the champion that is no reason to refuse a challenger."""
-        return math.radians(self.tolerance_deg)
 
 
 def load_thresholds(configs: Configs) -> PublishThresholds:
@@ -148,8 +143,8 @@ class ChallengerEvaluation:
 
     Attributes
     ----------
-    name
-        The challenger's.
+    selection
+        Its winner is the challenger.
     signals
         Inputs of the challenger and all incumbents.
     by
@@ -158,18 +153,13 @@ class ChallengerEvaluation:
         Fits the challenger; searches its columns again if a search found them.
     incumbents
         Published models in counts, by reference.
-    tolerance
-        RMSE gap that is no reason to refuse the challenger.
     """
 
-    catalog: Catalog
-    name: str
+    selection: Selection
     signals: tuple[str, ...]
     by: FoldKey
     procedure: Procedure
     incumbents: dict[str, LinearModel]
-    tolerance: float
-    has_intercept: bool = True
 
     @classmethod
     def prepare(
@@ -186,58 +176,56 @@ class ChallengerEvaluation:
             models[version.reference] = version.manifest.counts_model(catalog, feature_set)
         winner, search = selection.winner.model, selection.searched_winner
         label = catalog.signals.label
-        inputs = winner.signals if search is None else search.inputs
+        if search is None:
+            inputs, procedure = winner.signals, least_squares(winner.signals, label)
+        else:
+            inputs = search.inputs
+            procedure = search_procedure(label, search, len(winner.signals))
         incumbent_signals = (name for model in models.values() for name in model.signals)
         signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))
         cars = selection.cohort.count_vehicles_with((*signals, label))
         by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
-        if search is None:
-            procedure = least_squares(inputs, label)
+        return cls(selection, signals, by, procedure, models)
+
+    def groups(self, cohort: Cohort, mask: BoolArray | None = None) -> Folds:
+        """Return the drives that have all signals, by group, or the masked drives of each group.
+
+        Raises `DataError` without.
+        """
+        if mask is None:
+            folds = cohort.folds(self.by, MAX_GROUPS)
         else:
-            procedure = search_procedure(label, search, len(winner.signals))
-        tolerance = load_thresholds(catalog.configs).tolerance
-        has_intercept = selection.compared.intercept
-        return cls(catalog, winner.name, signals, by, procedure, models, tolerance, has_intercept)
-
-    def groups_of(self, cohort: Cohort) -> Folds:
-        """Return the drives that have all signals, by group. Raises `DataError` without."""
-        return self._complete(cohort.folds(self.by, MAX_GROUPS))
-
-    def groups_within(self, cohort: Cohort, mask: BoolArray) -> Folds:
-        """Return the masked drives in the groups of the whole cohort. Raises `DataError`."""
-        values = cohort.drives[FOLD_KEYS[self.by]].to_pylist()
-        groups = assign_folds(values, self.by, MAX_GROUPS)
-        used, fold = np.unique(groups.fold[mask], return_inverse=True)
-        assignment = FoldAssignment(fold, tuple(groups.names[number] for number in used.tolist()))
-        drives = cohort.filter(mask)
-        return self._complete(
-            CohortFolds.from_tables(drives.tables, assignment, drives.drive_numbers)
-        )
-
-    def _complete(self, folds: CohortFolds) -> Folds:
-        folds = replace(folds, has_intercept=self.has_intercept)
-        return folds.complete_cases(self.signals, self.catalog.signals.label, sparse=True)
+            values = cohort.drives[FOLD_KEYS[self.by]].to_pylist()
+            groups = assign_folds(values, self.by, MAX_GROUPS)
+            used, fold = np.unique(groups.fold[mask], return_inverse=True)
+            names = tuple(groups.names[number] for number in used.tolist())
+            drives = cohort.filter(mask)
+            folds = CohortFolds.from_tables(
+                drives.tables, FoldAssignment(fold, names), drives.drive_numbers
+            )
+        folds = replace(folds, has_intercept=self.selection.compared.intercept)
+        return folds.complete_cases(self.signals, cohort.catalog.signals.label, sparse=True)
 
     def as_published(self, reference: str, tested: Folds) -> CrossValidation:
         """Return the figures of an incumbent without refitting it."""
         model = self.incumbents[reference]
         sums = [error_sums(model, test) for test in tested.grams]
-        return assemble(reference, tested, sums, model, self.catalog.input_scales)
+        return assemble(reference, tested, sums, model, self.selection.cohort.catalog.input_scales)
 
     def compare(self, training: Folds, tested: Folds) -> Comparison:
         """Fit the challenger without each group of `training` and compare on `tested`."""
+        catalog = self.selection.cohort.catalog
         tests = dict(zip(tested.names, tested.grams, strict=True))
         sums = [
             held_out_errors(self.procedure(remaining), remaining, tests[name])
             for name, (remaining, _) in zip(training.names, training.splits(), strict=True)
             if name in tests
         ]
-        fitted = self.procedure(training.total)
-        challenger = assemble(self.name, tested, sums, fitted, self.catalog.input_scales)
+        fitted, name = self.procedure(training.total), self.selection.winner.model.name
+        challenger = assemble(name, tested, sums, fitted, catalog.input_scales)
         incumbents = tuple(self.as_published(name, tested) for name in self.incumbents)
-        gaps = tuple(
-            compare_paired(challenger, incumbent, self.tolerance) for incumbent in incumbents
-        )
+        tolerance = math.radians(load_thresholds(catalog.configs).tolerance_deg)
+        gaps = tuple(compare_paired(challenger, incumbent, tolerance) for incumbent in incumbents)
         return Comparison(self.by, challenger, incumbents, gaps)
 
 
@@ -247,71 +235,65 @@ MAX_REVIEWED_DRIVES = 20_000
 _HEX = 4
 
 
-@dataclass(frozen=True)
-class TrainingSplit:
-    """The drives of a selection, with the mask of those that an incumbent was trained on."""
+def _split_drives(
+    registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
+) -> tuple[Cohort, BoolArray]:
+    """Return the drives of a selection, and the mask of those that a version was trained on.
 
-    cohort: Cohort
-    is_trained: BoolArray
+    Raises `StorageError` if a training set cannot be read.
+    """
+    training_sets = [registry.trained_drives(version.manifest) for version in versions]
+    cohort = selection.cohort
+    if cohort.source is not None and cohort.sums is not None:
+        predicate, drives = cohort.predicate, cohort.drive_count
+        if drives > MAX_REVIEWED_DRIVES:
+            below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
+            sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
+            predicate &= parse_predicate(cohort.catalog.signals, sample)
+        cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
+    hashes = hash_names(cohort.drives["drive_id"])
+    return cohort, np.any([drives.among(hashes) for drives in training_sets], axis=0)
 
-    @classmethod
-    def load(
-        cls, registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
-    ) -> "TrainingSplit | None":
-        """Split the drives; return None if all are of one kind.
 
-        Raises `StorageError` if a training set cannot be read.
-        """
-        training_sets = [registry.trained_drives(version.manifest) for version in versions]
-        cohort = selection.cohort
-        if cohort.source is not None and cohort.sums is not None:
-            predicate, drives = cohort.predicate, cohort.drive_count
-            if drives > MAX_REVIEWED_DRIVES:
-                below = 16**_HEX * MAX_REVIEWED_DRIVES // drives
-                sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
-                predicate &= parse_predicate(cohort.catalog.signals, sample)
-            cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
-        hashes = hash_names(cohort.drives["drive_id"])
-        is_trained = np.any([drives.among(hashes) for drives in training_sets], axis=0)
-        return cls(cohort, is_trained) if is_trained.any() and not is_trained.all() else None
+def _compare_unseen(
+    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray
+) -> Comparison | None:
+    """Compare on drives that no incumbent was trained on: elsewhere it has an advantage.
 
-    def compare_unseen(self, evaluation: ChallengerEvaluation) -> Comparison | None:
-        """Compare on drives that no incumbent was trained on: elsewhere it has an advantage.
-
-        Returns None if they are of fewer than `MIN_VEHICLES` groups. Raises `DataError`.
-        """
-        groups = evaluation.groups_within(self.cohort, np.ones_like(self.is_trained))
-        unseen = evaluation.groups_within(self.cohort, ~self.is_trained)
-        if len(unseen.names) < MIN_VEHICLES:
-            return None
-        return replace(evaluation.compare(groups, unseen), unseen=True)
-
-    def problems(self, evaluation: ChallengerEvaluation, champion: str) -> list[str]:
-        """Return a reason to refuse if the challenger is better on unusual new drives alone.
-
-        Such drives make it better on them, held out or not. If the champion's error on new drives
-        is much larger than on its training set, both are compared on that training set.
-        """
-        groups, old, new = (
-            evaluation.groups_within(self.cohort, mask)
-            for mask in (np.ones_like(self.is_trained), self.is_trained, ~self.is_trained)
-        )
-        on_old, on_new = (
-            evaluation.as_published(champion, tested).pooled.rmse_deg for tested in (old, new)
-        )
-        if on_new <= OUTLIER_RATIO * on_old:
-            return []
-        comparison = evaluation.compare(groups, old)
-        if champion not in comparison.better:
-            return []
-        return [
-            "the improvement comes only from unusual new drives, on which the champion has "
-            f"{on_new:.4f} deg: on its training set, {comparison}. Check them before training"
-        ]
+    Returns None if they are of fewer than `MIN_VEHICLES` groups. Raises `DataError`.
+    """
+    unseen = evaluation.groups(cohort, ~is_trained)
+    if len(unseen.names) < MIN_VEHICLES:
+        return None
+    groups = evaluation.groups(cohort, np.ones_like(is_trained))
+    return replace(evaluation.compare(groups, unseen), unseen=True)
 
 
 OUTLIER_RATIO = 2.0
 """Drives are unusual if the champion's RMSE on them exceeds this multiple of its usual RMSE."""
+
+
+def _unusual_drives(
+    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray, champion: str
+) -> list[str]:
+    """Return a reason to refuse if the challenger is better on unusual new drives alone.
+
+    Such drives make it better on them, held out or not. If the champion's error on new drives is
+    much larger than on its training set, both are compared on that training set.
+    """
+    old, new = (evaluation.groups(cohort, mask) for mask in (is_trained, ~is_trained))
+    on_old, on_new = (
+        evaluation.as_published(champion, tested).pooled.rmse_deg for tested in (old, new)
+    )
+    if on_new <= OUTLIER_RATIO * on_old:
+        return []
+    comparison = evaluation.compare(evaluation.groups(cohort, np.ones_like(is_trained)), old)
+    if champion not in comparison.better:
+        return []
+    return [
+        "the improvement comes only from unusual new drives, on which the champion has "
+        f"{on_new:.4f} deg: on its training set, {comparison}. Check them before training"
+    ]
 
 
 def threshold_violations(
@@ -320,15 +302,16 @@ def threshold_violations(
     """Return the thresholds that a manifest does not reach, as phrases."""
     figures, trained = manifest.cross_validation, manifest.trained_on
     start = "without the filter, its" if manifest.line_remark else "its"
-    violations = []
-    if figures.correlation < thresholds.min_correlation:
-        violations.append(
-            f"{start} correlation is {figures.correlation:.4f}, below {thresholds.min_correlation}"
-        )
-    if figures.rmse_deg > thresholds.max_rmse_deg:
-        violations.append(
-            f"{start} RMSE is {figures.rmse_deg:.4f} deg, above {thresholds.max_rmse_deg} deg"
-        )
+    checks = [
+        (
+            figures.correlation < thresholds.min_correlation,
+            f"{start} correlation is {figures.correlation:.4f}, below {thresholds.min_correlation}",
+        ),
+        (
+            figures.rmse_deg > thresholds.max_rmse_deg,
+            f"{start} RMSE is {figures.rmse_deg:.4f} deg, above {thresholds.max_rmse_deg} deg",
+        ),
+    ]
     share = thresholds.min_part_of_champion if champion else 0.0
     before = champion.trained_on if champion else trained
     for count, noun, minimum, reference in (
@@ -336,29 +319,33 @@ def threshold_violations(
         (trained.vehicles, "car", thresholds.min_vehicles, before.vehicles),
     ):
         required = max(minimum, math.ceil(share * reference))
-        if count < required:
-            text = f"it was trained on {pluralize(count, noun)}, fewer than {required:,}"
-            champions = f" ({share:.0%} of the champion's {reference:,})"
-            violations.append(text + champions * (required > minimum))
-    return violations
+        text = f"it was trained on {pluralize(count, noun)}, fewer than {required:,}"
+        if required > minimum:
+            text += f" ({share:.0%} of the champion's {reference:,})"
+        checks.append((count < required, text))
+    return [text for is_violated, text in checks if is_violated]
 
 
 def missing_evidence(thresholds: PublishThresholds, manifest: Manifest) -> list[str]:
     """Return why a first champion of measured drives has too many columns for its data."""
     if manifest.learned_from is not None:
         return []
-    reasons = []
     columns, trained = len(manifest.terms), manifest.trained_on
     has_prior = manifest.prior is not None and manifest.prior.weight
-    if not has_prior and columns > thresholds.max_columns_per_drive * trained.drives:
-        drives = pluralize(trained.drives, "drive")
-        maximum = f"{thresholds.max_columns_per_drive:g}"
-        reasons.append(f"it has {columns} columns on {drives}, more than {maximum} a drive")
-    if trained.rows < thresholds.min_rows_per_column * columns:
-        rows = pluralize(trained.rows, "row")
-        minimum = f"{thresholds.min_rows_per_column} for each of its {columns} columns"
-        reasons.append(f"it was trained on {rows}, fewer than {minimum}")
-    return reasons
+    max_columns, min_rows = thresholds.max_columns_per_drive, thresholds.min_rows_per_column
+    checks = (
+        (
+            not has_prior and columns > max_columns * trained.drives,
+            f"it has {columns} columns on {pluralize(trained.drives, 'drive')}, more than "
+            f"{max_columns:g} a drive",
+        ),
+        (
+            trained.rows < min_rows * columns,
+            f"it was trained on {pluralize(trained.rows, 'row')}, fewer than {min_rows} for each "
+            f"of its {columns} columns",
+        ),
+    )
+    return [text for is_missing, text in checks if is_missing]
 
 
 def _require_same_columns(catalog: Catalog, version: ModelVersion, feature_set: str) -> None:
@@ -401,14 +388,6 @@ class Review:
         text = "; ".join(self.problems) or self.compared
         return f"{text[:1].upper()}{text[1:]}."
 
-    def require_passed(self, name: str) -> None:
-        """Raise `RefusedError` if there are problems."""
-        if self.problems:
-            raise RefusedError(
-                f"{name} was not published: {'; '.join(self.problems)}. Check the data. To "
-                "publish it anyway: --force"
-            )
-
 
 def review_challenger(
     registry: Registry,
@@ -423,13 +402,20 @@ def review_challenger(
     if champion is None:
         return Review(tuple(problems), "It is the first version")
     if _has_another_line(catalog, champion, selection.cohort.feature_set):
-        return _review_another_line(champion, selection, thresholds, problems)
+        # Its columns are in no Gram row of this feature set: compare cross-validated RMSEs.
+        old, new = (m.cross_validation.rmse_deg for m in (champion.manifest, manifest))
+        compared = (
+            f"its first-stage model was fitted again; its cross-validated RMSE is {new:.4f} deg, "
+            f"that of {champion.reference} was {old:.4f} deg"
+        )
+        problems += [compared] if new > old + thresholds.tolerance_deg else []
+        return Review(tuple(problems), compared)
     best = registry.history(manifest.name).best_of(CHAMPION)
     earlier = [] if best in (None, champion.version) else [registry.load(manifest.name, best)]
     incumbents = [champion, *earlier]
     try:
         evaluation = ChallengerEvaluation.prepare(selection, incumbents)
-        groups = evaluation.groups_of(selection.cohort)
+        groups = evaluation.groups(selection.cohort)
         comparison = evaluation.compare(groups, groups)
     except (DataError, QuestionError) as error:
         feature_set, _, _ = champion.manifest.trained_on.feature_set.partition("-")
@@ -439,12 +425,13 @@ def review_challenger(
         )
         return Review(tuple(problems), "")
     try:
-        split = TrainingSplit.load(registry, selection, incumbents)
-        if split and comparison.better:
-            comparison = split.compare_unseen(evaluation) or comparison
+        cohort, is_trained = _split_drives(registry, selection, incumbents)
+        has_both = is_trained.any() and not is_trained.all()
+        if has_both and comparison.better:
+            comparison = _compare_unseen(evaluation, cohort, is_trained) or comparison
         problems += _comparison_problems(comparison, champion, manifest)
-        if split and not problems:
-            problems += split.problems(evaluation, champion.reference)
+        if has_both and not problems:
+            problems += _unusual_drives(evaluation, cohort, is_trained, champion.reference)
     except StorageError as error:
         problems.append(f"no comparison on the champion's training set: {error}")
     except DataError as error:
@@ -455,32 +442,12 @@ def review_challenger(
 
 
 def _has_another_line(catalog: Catalog, version: ModelVersion, feature_set: str) -> bool:
-    """Return True if a version has the same set with another first-stage model.
-
-    Its columns are then in no Gram row of this feature set.
-    """
+    """Return True if a version has the same set with another first-stage model."""
     model = catalog.first_stage_model(feature_set)
     identity = version.manifest.trained_on.feature_set
     if model is None or identity == catalog.identity(feature_set):
         return False
     return identity.startswith(feature_set.removesuffix(model.digest))
-
-
-def _review_another_line(
-    champion: ModelVersion,
-    selection: Selection,
-    thresholds: PublishThresholds,
-    problems: list[str],
-) -> Review:
-    """Compare cross-validated RMSEs: the first-stage model was refitted, so no row has both."""
-    old = champion.manifest.cross_validation.rmse_deg
-    new = selection.winner.model.pooled.rmse_deg
-    compared = (
-        f"its first-stage model was fitted again; its cross-validated RMSE is {new:.4f} deg, that "
-        f"of {champion.reference} was {old:.4f} deg"
-    )
-    worse = [compared] if new > old + thresholds.tolerance_deg else []
-    return Review((*problems, *worse), compared)
 
 
 def _comparison_problems(

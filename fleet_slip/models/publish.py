@@ -485,7 +485,11 @@ def decide(
     else:
         review = review_challenger(registry, champion, manifest, selection)
         if not force and not candidate:
-            review.require_passed(name)
+            if review.problems:
+                raise RefusedError(
+                    f"{name} was not published: {'; '.join(review.problems)}. Check the data. To "
+                    "publish it anyway: --force"
+                )
             if review.is_significantly_worse and not held:
                 reason = f"The champion stays: it is significantly better. {review.reason}"
                 return Decision(reason, champion)

@@ -32,7 +32,7 @@ LABEL = SIGNALS.label
 def compare(selection: Selection, champion: ModelVersion) -> champion_rules.Comparison:
     """Compare the winner of a selection with a version on all rows."""
     evaluation = champion_rules.ChallengerEvaluation.prepare(selection, [champion])
-    groups = evaluation.groups_of(selection.cohort)
+    groups = evaluation.groups(selection.cohort)
     return evaluation.compare(groups, groups)
 
 
