@@ -50,9 +50,7 @@ CANDIDATE = "candidate"
 Command = Literal["publish", "promote", "rollback", "pin", "unpin"]
 
 HOLDING: frozenset[Command] = frozenset({"rollback", "pin"})
-"""After these commands no publication moves the alias, until one of `RELEASING`."""
-
-RELEASING: frozenset[Command] = frozenset({"promote", "unpin"})
+"""After these commands no publication moves the alias, until `promote` or `unpin`."""
 
 T = TypeVar("T")
 
@@ -85,9 +83,14 @@ class AliasHistory:
             file = self.documents.file(number)
             yield parse_document(document.content, AliasMove, file, "this move of an alias")
 
+    def latest(self, alias: str) -> AliasMove | None:
+        """Return the newest move of an alias, or None."""
+        return next((move for move in self.latest_moves() if move.alias == alias), None)
+
     def pointed_at(self, alias: str) -> int | None:
         """Return the version that an alias points at, or None."""
-        return next((move.version for move in self.latest_moves() if move.alias == alias), None)
+        last = self.latest(alias)
+        return None if last is None else last.version
 
     def before(self, alias: str) -> int | None:
         """Return the version that an alias pointed at before, or None.
@@ -109,7 +112,7 @@ class AliasHistory:
 
         Returns None if the alias points at no version.
         """
-        last = next((move for move in self.latest_moves() if move.alias == alias), None)
+        last = self.latest(alias)
         return None if last is None else last.best or last.version
 
     def published_at(self, version: int) -> datetime | None:
@@ -121,7 +124,7 @@ class AliasHistory:
     def held_by(self, alias: str) -> AliasMove | None:
         """Return the move that keeps publications from moving an alias; None without."""
         moves = (move for move in self.latest_moves() if move.alias == alias)
-        last = next((move for move in moves if move.command in HOLDING | RELEASING), None)
+        last = next((move for move in moves if move.command != "publish"), None)
         return last if last is not None and last.command in HOLDING else None
 
     def aliases(self) -> dict[str, int]:
@@ -140,11 +143,6 @@ class AliasHistory:
         self, alias: str, version: int, command: Command, *, after: int, best: int | None = None
     ) -> bool:
         """Point an alias at a version; return False if there were moves after the one given."""
-        if not re.fullmatch(IDENTIFIER_PATTERN, alias):
-            raise QuestionError(
-                f"{alias!r} cannot be an alias: use small letters, digits and _, beginning with a "
-                "letter, at most 41."
-            )
         move = AliasMove(
             alias=alias,
             version=version,
@@ -364,7 +362,7 @@ class Registry:
     def trained_drives(self, manifest: Manifest) -> TrainedDrives:
         """Return what drives made a version. Raises `StorageError`."""
         expected = manifest.trained_on.drives_sha256
-        folder, file = self.folder_of(manifest.name), _drives_file(expected)
+        folder, file = self.folder_of(manifest.name), f"drives-{expected}.bin"
         content = folder.read(file)
         if checksum_of_drives(content) != expected:
             raise StorageError(
@@ -380,7 +378,7 @@ class Registry:
         it.
         """
         name, versions = manifest.name, self._versions(manifest.name)
-        self.folder_of(name).create(_drives_file(checksum_of_drives(drives)), drives)
+        versions.folder.create(f"drives-{checksum_of_drives(drives)}.bin", drives)
 
         def next_version(latest: int) -> int | None:
             if latest in versions.numbers() and self.load(name, latest).manifest.same_estimator(
@@ -390,8 +388,7 @@ class Registry:
             document = versions.create(latest + 1, manifest.model_dump(mode="json"))
             return document.number if document else None
 
-        version = versions.after_newest(next_version)
-        return self.load(name, version)
+        return self.load(name, versions.after_newest(next_version))
 
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
@@ -400,9 +397,8 @@ class Registry:
         ends: one `rollback` undoes a repeated command.
         """
         self.load(name, version)
-        history = self.history(name)
 
-        def target() -> int | None:
+        def target(history: AliasHistory) -> int | None:
             is_best = history.pointed_at(alias) == history.best_of(alias) == version
             return None if is_best and not history.held_by(alias) else version
 
@@ -411,9 +407,8 @@ class Registry:
     def hold(self, name: str, alias: str, command: Literal["pin", "unpin"]) -> int:
         """Pin or unpin an alias; return its version. Raises `QuestionError` if there is none."""
         version = self.resolve(f"{name}@{alias}").version
-        history = self.history(name)
 
-        def target() -> int | None:
+        def target(history: AliasHistory) -> int | None:
             return None if bool(history.held_by(alias)) == (command == "pin") else version
 
         self._move(name, alias, command, target)
@@ -422,8 +417,8 @@ class Registry:
     def rollback(self, name: str, alias: str) -> int:
         """Point an alias back; return its version. Raises `RefusedError`, and as `load`."""
 
-        def target() -> int:
-            version = self.history(name).before(alias)
+        def target(history: AliasHistory) -> int:
+            version = history.before(alias)
             if version is None:
                 raise RefusedError(
                     f"{name}@{alias} never pointed at another version, so there is nothing to go "
@@ -434,13 +429,13 @@ class Registry:
         return self._move(name, alias, "rollback", target)
 
     def _move(
-        self, name: str, alias: str, command: Command, target: Callable[[], int | None]
+        self, name: str, alias: str, command: Command, target: Callable[[AliasHistory], int | None]
     ) -> int:
         """Point an alias at the target, unless that is None; return its version."""
         history = self.history(name)
 
         def move(newest: int) -> int | None:
-            version = target()
+            version = target(history)
             if version is None:
                 return history.pointed_at(alias)
             return version if history.move(alias, version, command, after=newest) else None
@@ -482,15 +477,18 @@ class Registry:
         for number in self.versions(name):
             version = self.load(name, number)
             manifest = version.manifest
-            figures, trained = manifest.cross_validation, manifest.trained_on
-            columns = {
-                "version": number,
-                "aliases": ",".join(aliases.get(number, [])),
-                "signals": ",".join(manifest.signals),
-                "published_at": published.get(number),
-                "sha256": version.sha256,
-            }
-            rows.append({**vars(trained), **vars(figures), "name": name, **columns})
+            rows.append(
+                {
+                    **vars(manifest.trained_on),
+                    **vars(manifest.cross_validation),
+                    "name": name,
+                    "version": number,
+                    "aliases": ",".join(aliases.get(number, [])),
+                    "signals": ",".join(manifest.signals),
+                    "published_at": published.get(number),
+                    "sha256": version.sha256,
+                }
+            )
         return rows
 
     def _versions(self, name: str) -> DocumentFolder:
@@ -501,10 +499,6 @@ def _unknown(name: str, label: str, labels: Sequence[int | str]) -> QuestionErro
     """Return the error for a version or alias that a model does not have."""
     available = ", ".join(map(str, labels))
     return QuestionError(f"{name} has no version or alias {label!r}. It has: {available}.")
-
-
-def _drives_file(sha256: str) -> str:
-    return f"drives-{sha256}.bin"
 
 
 # Differences of two versions: entries of their manifests, and their training drives.
@@ -569,10 +563,16 @@ class Difference(Answer):
 
 def compare_versions(registry: Registry, first: ModelVersion, second: ModelVersion) -> Difference:
     """Compare two versions. Raises `StorageError` if a file of training drives is damaged."""
+    import numpy as np  # noqa: PLC0415 - not for show
+
     a, b = (dict(_entries(version)) for version in (first, second))
     names = [name for name in dict.fromkeys([*a, *b]) if a.get(name) != b.get(name)]
     facts = {name: (a.get(name), b.get(name)) for name in names}
-    return Difference(first, second, facts, _count_drives(registry, first, second))
+    if first.manifest.name != second.manifest.name:  # their drives are salted differently
+        return Difference(first, second, facts, None)
+    c, d = (registry.trained_drives(version.manifest).salted for version in (first, second))
+    both = len(np.intersect1d(c, d, assume_unique=True))
+    return Difference(first, second, facts, (len(c) - both, len(d) - both, both))
 
 
 def _entries(version: ModelVersion) -> Iterator[tuple[str, Any]]:
@@ -593,16 +593,3 @@ def _flat(content: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:
 def _shown(value: Any) -> str:
     text = "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
     return shorten(text, _LONGEST_SHOWN, placeholder="…")
-
-
-def _count_drives(
-    registry: Registry, first: ModelVersion, second: ModelVersion
-) -> tuple[int, int, int] | None:
-    """Return the training drives of the first alone, the second alone, and both."""
-    import numpy as np  # noqa: PLC0415 - not for show
-
-    if first.manifest.name != second.manifest.name:  # their hashes are salted differently
-        return None
-    a, b = (registry.trained_drives(version.manifest).salted for version in (first, second))
-    both = len(np.intersect1d(a, b, assume_unique=True))
-    return len(a) - both, len(b) - both, both

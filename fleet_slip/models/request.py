@@ -43,7 +43,7 @@ COURSE_MODELS = COURSE_FEATURES = "course"
 
 DEFAULT_MAX_FEATURES = 24
 
-_TOLERANCE = re.compile(r"(\d+(?:\.\d*)?|\.\d+) ?deg")
+_TOLERANCE = re.compile(r"\s*(\d+(?:\.\d*)?|\.\d+) ?deg\s*")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,48 +113,36 @@ class SelectionRequest:
     def check(self) -> None:
         """Raise `UsageError` for options that exclude each other."""
         parse_tolerance(self.tolerance)
-        conflicts = (
-            (
-                self.models and self.is_ordered,
-                "models are compared by cross-validation: leave out models, or order, ranking and "
-                "criterion, which choose from an order of inputs.",
-            ),
-            (
-                self.model and (self.models or self.is_ordered or self.search),
-                "model names the inputs: leave out model, or models, order, ranking, criterion and "
-                "search.",
-            ),
-            (
-                self.search and (self.ranking or self.criterion),
-                "a search is judged by folds alone: leave out ranking and criterion, or search.",
-            ),
-            (
-                self.max_features and not self.search,
-                "max_features limits a search: add search, or leave it out.",
-            ),
-            (
-                self.prior and (self.label or self.is_ordered),
-                "a prior works with a model list, one model or a search: leave out label, ranking, "
-                "criterion, and order without search.",
-            ),
-            (
-                self.half_life is not None and self.half_life < 1,
-                "half_life: give a whole number of days, at least 1.",
-            ),
-        )
-        for applies, message in conflicts:
+        other_models = self.models or self.is_ordered or self.search
+        has_criterion = self.ranking or self.criterion
+        is_short = self.half_life is not None and self.half_life < 1
+        conflicts = {
+            "leave out models, or order, ranking and criterion": self.models and self.is_ordered,
+            "leave out model, or models, order and search": self.model and other_models,
+            "leave out search, or ranking and criterion": self.search and has_criterion,
+            "max_features limits a search: add search": self.max_features and not self.search,
+            "a prior works with a model list, one model or a search: leave out label, ranking, "
+            "criterion, and order": self.prior and (self.label or self.is_ordered),
+            "half_life: give a whole number of days, at least 1": is_short,
+        }
+        for message, applies in conflicts.items():
             if applies:
-                raise UsageError(message)
+                raise UsageError(f"{message}.")
+
+
+def check_tolerance(text: str) -> str:
+    """Return the text of a tolerance. Raises `ValueError` if it is none."""
+    if not _TOLERANCE.fullmatch(text):
+        raise ValueError("write an angle such as 0.025deg")
+    return text
 
 
 def parse_tolerance(text: str | None) -> float:
     """Return a tolerance in rad from text such as `0.025deg`. Raises `UsageError`."""
-    if text is None:
-        return DEFAULT_TOLERANCE
-    match = _TOLERANCE.fullmatch(text.strip())
-    if match is None:
+    match = _TOLERANCE.fullmatch(text or "")
+    if text and not match:
         raise UsageError(f"tolerance = {text}: write an angle such as 0.025deg.")
-    return math.radians(float(match[1]))
+    return math.radians(float(match[1])) if match else DEFAULT_TOLERANCE
 
 
 # Model lists: the candidates that a selection compares, read from `configs/models/*.toml`.
@@ -165,14 +153,9 @@ MAX_LISTED_INPUTS = 30
 
 def expand_families(names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
     """Replace a family of windows or gates by its members; needs the `Catalog` as context."""
-    if (catalog := _catalog_of(info)) is None:
+    if not isinstance(catalog := info.context, Catalog):
         return names
     return tuple(member for name in names for member in catalog.members(name))
-
-
-def _catalog_of(info: ValidationInfo) -> Catalog | None:
-    """Return the catalog to check names against: the context of a model list that is read."""
-    return info.context if isinstance(info.context, Catalog) else None
 
 
 Members = Annotated[tuple[Identifier, ...], AfterValidator(expand_families)]
@@ -245,7 +228,7 @@ class ModelList(Config):
     line: Annotated[str, Field(min_length=1)] | None = None
     """Model list of the first-stage model whose estimate is in the feature set."""
     folds: Folding = Folding()
-    tolerance: str | None = None
+    tolerance: Annotated[str, AfterValidator(check_tolerance)] | None = None
     intercept: bool = True
     model: tuple[CandidateModel, ...] = ()
     search: tuple[Search, ...] = ()
@@ -260,15 +243,6 @@ class ModelList(Config):
         contents = [entry.as_dict(exclude_defaults=True) for entry in search]
         return contents[0] if len(contents) == 1 else contents  # the checksum of one search
 
-    @field_validator("tolerance")
-    @classmethod
-    def _is_tolerance(cls, tolerance: str | None) -> str | None:
-        try:
-            parse_tolerance(tolerance)
-        except UsageError as error:
-            raise ValueError(str(error)) from None
-        return tolerance
-
     @model_validator(mode="after")
     def _names_differ(self) -> "ModelList":
         if not (self.model or self.search):
@@ -276,21 +250,6 @@ class ModelList(Config):
         names = [candidate.name for candidate in self.model]
         if len(set(names)) < len(names):
             raise ValueError("two models have the same name")
-        return self
-
-    @model_validator(mode="after")
-    def _feature_set_has_the_inputs(self, info: ValidationInfo) -> "ModelList":
-        if (catalog := _catalog_of(info)) is None:
-            return self
-        try:
-            inputs = catalog.feature_set(self.features).inputs
-        except QuestionError:
-            raise ValueError(f"features: no feature set is called {self.features!r}") from None
-        if absent := self.absent_from(inputs):
-            raise ValueError(
-                f"{', '.join(absent)} is not in the feature set {self.features!r}. Its inputs: "
-                f"{name_inputs(catalog, inputs)}"
-            )
         return self
 
     def absent_from(self, inputs: Sequence[str]) -> list[str]:
@@ -308,23 +267,19 @@ class ModelList(Config):
     def as_toml(self) -> str:
         """Return the text of a file with this list."""
         excluded = {"folds", "model", "search"}
-        content = self.model_dump(mode="json", exclude_defaults=True, exclude=excluded)
-        tables = [("[folds]", self.folds.model_dump(mode="json"))]
-        tables += [("[[model]]", candidate.model_dump(mode="json")) for candidate in self.model]
-        tables += [
-            ("[[search]]", search.model_dump(mode="json", exclude_none=True))
-            for search in self.search
-        ]
-        parts = [("", content), *tables]
-        return "\n".join(
-            "".join(f"{line}\n" for line in [*filter(None, [head]), *_toml_lines(table)])
-            for head, table in parts
-        )
+        lines = _toml_lines("", self.model_dump(exclude_defaults=True, exclude=excluded))
+        lines += _toml_lines("[folds]", self.folds.model_dump())
+        for candidate in self.model:
+            lines += _toml_lines("[[model]]", candidate.model_dump())
+        for search in self.search:
+            lines += _toml_lines("[[search]]", search.model_dump(exclude_none=True))
+        return "\n".join([*lines, ""]).lstrip()
 
 
-def _toml_lines(table: Mapping[str, Any]) -> list[str]:
-    """Return keys and values as TOML, which has JSON's texts, numbers and lists."""
-    return [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+def _toml_lines(head: str, table: Mapping[str, Any]) -> list[str]:
+    """Return a table as TOML, which has JSON's texts, numbers and lists."""
+    entries = (f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items())
+    return ["", head, *entries]
 
 
 def load_model_list(catalog: Catalog, name_or_path: str) -> ModelList:
@@ -358,20 +313,21 @@ def require_inputs(catalog: Catalog, names: Sequence[str], feature_set: str) -> 
         )
     if len(set(order)) < len(order):
         raise UsageError(f"{','.join(order)}: an input appears twice.")
-    require_odd(catalog, order, feature_set)
+    if reason := even_columns(catalog, order, feature_set):
+        raise QuestionError(reason)
     return order
 
 
-def require_odd(catalog: Catalog, names: Sequence[str], feature_set: str) -> None:
-    """Raise `QuestionError` for columns of changes that are not odd in left and right."""
-    if not catalog.feature_set(feature_set).change_ticks:
-        return
-    if even := [name for name in names if not catalog.is_odd(name)]:
-        raise QuestionError(
-            f"{', '.join(even)}: does not change sign where left and right are exchanged, as the "
-            "side-slip angle does. Trained on course changes it would get a wrong constant: "
-            "leave it out."
-        )
+def even_columns(catalog: Catalog, names: Sequence[str], feature_set: str) -> str:
+    """Return which columns of changes are not odd in left and right, as a sentence; "" if none."""
+    has_changes = bool(catalog.feature_set(feature_set).change_ticks)
+    even = [name for name in names if has_changes and not catalog.is_odd(name)]
+    if not even:
+        return ""
+    return (
+        f"{', '.join(even)}: does not change sign where left and right are exchanged, as the "
+        "side-slip angle does: its constant would be wrong. Leave it out."
+    )
 
 
 def name_inputs(catalog: Catalog, inputs: Iterable[str]) -> str:
@@ -447,12 +403,6 @@ class SelectionPlan:
     def is_default(self) -> bool:
         """True if the default model list is compared because the request names none."""
         return self.original.models is None and self.request.models == DEFAULT_MODELS
-
-    @property
-    def needs_drives(self) -> bool:
-        """True if the Gram rows of single drives are needed, not the sums of folds alone."""
-        request = self.request
-        return bool(request.is_ordered or request.robust or request.half_life)
 
 
 def _default_list(request: SelectionRequest) -> str | None:

@@ -5,7 +5,7 @@ The functions stand in the order in which they run.
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from fractions import Fraction
 
 import numpy as np
@@ -42,9 +42,9 @@ from fleet_slip.models.request import (
     SelectionPlan,
     SelectionRequest,
     checksum_of_list,
+    even_columns,
     inputs_of,
     parse_tolerance,
-    require_odd,
 )
 from fleet_slip.models.summary import NestedErrors, SearchedModels, Selection, group_reasons
 from fleet_slip.regression.choice import (
@@ -216,13 +216,16 @@ def cross_validate_choice(cohort: Cohort, plan: SelectionPlan) -> NestedErrors |
 
 def load_training_set(warehouse: Warehouse, plan: SelectionPlan, predicate: str) -> Cohort:
     """Read the Gram rows of a plan, of its prior too; the sums of folds alone if they suffice."""
-    folding = None if plan.needs_drives else plan.folds
-    cohort = load_cohort(warehouse, predicate, plan.feature_set, folding)
-    if not plan.request.prior:
+    request = plan.request
+    needs_drives = request.is_ordered or request.robust or request.half_life
+    cohort = load_cohort(
+        warehouse, predicate, plan.feature_set, None if needs_drives else plan.folds
+    )
+    if not request.prior:
         return cohort
     from fleet_slip.models.prior import simulate_prior  # noqa: PLC0415 - only here simulated
 
-    prior = simulate_prior(warehouse.catalog, plan.request.prior, plan.feature_set)
+    prior = simulate_prior(warehouse.catalog, request.prior, plan.feature_set)
     return replace(cohort, prior=prior)
 
 
@@ -238,13 +241,12 @@ def select_models(cohort: Cohort, plan: SelectionPlan) -> Selection:
         full *= FULL if weighted else 1
     if plan.compared is None:
         selection = _select_order(cohort, plan)
-    elif cohort.prior:
-        selection = _select_with_prior(cohort, cohort.prior, plan.compared)
     else:
-        selection = select(cohort, plan.compared)
-    if plan.compared is not None:
-        name = plan.request.models or (GIVEN if plan.request.model else None)
-        if name is None:
+        selection = select(replace(cohort, prior=None), plan.compared)
+        if cohort.prior:
+            selection = _join_prior(selection, cohort, cohort.prior)
+        name = plan.request.models or GIVEN
+        if plan.request.search:
             (search,) = plan.compared.search
             name = f"search:{search.method} {search.max_features}"
         checksum = checksum_of_list(plan.compared)
@@ -291,22 +293,28 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
     drives have, and searches that need more drives. Raises `DataError` if none is left, or no drive
     has the label.
     """
-    catalog, folds = cohort.catalog, _labelled_folds(cohort, compared)
+    catalog, label, folds = cohort.catalog, cohort.catalog.signals.label, folds_of(cohort, compared)
+    if not folds.tables_with([label]):
+        raise DataError(
+            f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
+            "log their course, learn from it: fleet-slip select --label course"
+        )
     skipped: dict[str, str] = {}
-    candidates = [c for c in compared.model if _is_allowed(c, cohort, skipped)]
-    searches = [s for s in compared.search if _has_drives(s, cohort, skipped)]
+    allowed, searches = _allow(cohort, compared, skipped)
     columns = [name for name in cohort.inputs if any(search.among([name]) for search in searches)]
-    rows = find_complete_cases(folds, catalog.signals.label, candidates, columns, skipped)
+    shared, candidates, shared_columns = find_complete_cases(
+        folds, label, allowed, columns, skipped
+    )
     models = []
-    for candidate in rows.candidates:
+    for candidate in candidates:
         name, signals = candidate.name, candidate.signals
         try:
-            models.append(_cross_validate(name, signals, rows.folds, catalog))
+            models.append(_cross_validate(name, signals, shared, catalog))
         except DataError as error:
             skipped[name] = str(error)
     searched = []
     for search in searches:
-        among = search.among(rows.columns)
+        among = search.among(shared_columns)
         if rare := [name for name in search.among(columns) if name not in among]:
             skipped[f"{search.title} (columns)"] = (
                 "not comparable: more than a tenth of the drives lack "
@@ -314,9 +322,8 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
             )
         if not among:
             continue
-        bounded = _bounded(search, cohort, compared.folds)
         try:
-            searched.append(search_models(rows.folds, among, catalog, bounded))
+            searched.append(search_models(shared, among, catalog, search))
         except DataError as error:  # no drive, or not one in each fold, has all inputs
             skipped[f"{search.title} (search)"] = str(error)
     models += [model for search_result in searched for model in search_result.models]
@@ -325,9 +332,34 @@ def select(cohort: Cohort, compared: ModelList) -> Selection:
         reasons = [text if len(groups) == 1 else f"{names}: {text}" for names, text in groups]
         raise DataError(f"no candidate model can be fitted: {'; '.join(reasons)}.")
     winner = choose_by(compared, models)
-    if winner.model.name in {candidate.name for candidate in rows.candidates}:
-        winner = _refit(winner, folds, rows, catalog)
+    name, signals = winner.model.name, winner.model.signals
+    is_listed = name in {candidate.name for candidate in candidates}
+    if is_listed and len(folds.tables_with([*signals, label])) > len(shared.tables):
+        winner = replace(winner, model=_cross_validate(name, signals, folds, catalog))
     return Selection(cohort, compared, tuple(models), winner, skipped, searched=tuple(searched))
+
+
+def _allow(
+    cohort: Cohort, compared: ModelList, skipped: dict[str, str]
+) -> tuple[list[CandidateModel], list[Search]]:
+    """Return the candidates and the bounded searches that a cohort permits; note the others."""
+    candidates, searches = list[CandidateModel](), list[Search]()
+    for candidate in compared.model:
+        if reason := even_columns(cohort.catalog, candidate.signals, cohort.feature_set):
+            skipped[candidate.name] = reason
+        else:
+            candidates.append(candidate)
+    drives = cohort.drive_count
+    for search in compared.search:
+        limit = search.max_features
+        if search.max_features_per_drive and compared.folds.by != PARTS:
+            limit = min(limit, search.max_features_per_drive * drives)
+        if drives >= search.min_drives:
+            searches.append(search.model_copy(update={"max_features": limit}))
+        else:
+            reason = f"it needs {search.min_drives} drives, and there are {drives}"
+            skipped[f"{search.title} (search)"] = reason
+    return candidates, searches
 
 
 def folds_of(cohort: Cohort, compared: ModelList) -> CohortFolds:
@@ -336,64 +368,14 @@ def folds_of(cohort: Cohort, compared: ModelList) -> CohortFolds:
     return replace(folds, has_intercept=compared.intercept)
 
 
-def _labelled_folds(cohort: Cohort, compared: ModelList) -> CohortFolds:
-    """Divide a cohort into folds. Raises `DataError` if no drive has the label."""
-    folds, label = folds_of(cohort, compared), cohort.catalog.signals.label
-    if not folds.tables_with([label]):
-        raise DataError(
-            f"no drive of the cohort {cohort.predicate.quoted} has the label, {label}. Where cars "
-            "log their course, learn from it: fleet-slip select --label course"
-        )
-    return folds
-
-
-def _is_allowed(candidate: CandidateModel, cohort: Cohort, skipped: dict[str, str]) -> bool:
-    """Return True if a candidate may be trained on the feature set; else note why not."""
-    try:
-        require_odd(cohort.catalog, candidate.signals, cohort.feature_set)
-    except QuestionError as error:
-        skipped[candidate.name] = str(error)
-        return False
-    return True
-
-
-def _has_drives(search: Search, cohort: Cohort, skipped: dict[str, str]) -> bool:
-    """Return True if a cohort has the drives that a search needs; else note why not."""
-    drives = cohort.drive_count
-    if drives >= search.min_drives:
-        return True
-    reason = f"it needs {search.min_drives} drives, and there are {drives}"
-    skipped[f"{search.title} (search)"] = reason
-    return False
-
-
-@dataclass(frozen=True)
-class ComparedRows:
-    """The rows on which all candidates are compared.
-
-    Attributes
-    ----------
-    folds
-        Rows that have the signals of all candidates and all columns.
-    candidates
-        The comparable candidates, in their order.
-    columns
-        The comparable columns of searches, in their order.
-    """
-
-    folds: CohortFolds
-    candidates: tuple[CandidateModel, ...]
-    columns: tuple[str, ...]
-
-
 def find_complete_cases(
     folds: CohortFolds,
     label: str,
     candidates: Sequence[CandidateModel],
     columns: Sequence[str],
     skipped: dict[str, str],
-) -> ComparedRows:
-    """Find the rows that all comparable candidates and columns can use; note the others.
+) -> tuple[CohortFolds, list[CandidateModel], list[str]]:
+    """Return the rows with the signals of all comparable candidates and columns, and these two.
 
     Candidates, and then columns, join one by one, the most common first, unless fewer drives would
     have all signals than 1 - `MAX_LOST_SHARE` of the drives of the most common.
@@ -425,11 +407,10 @@ def find_complete_cases(
             )
             if absent := [signal for signal in names if not drives_with([signal])]:
                 skipped[name] = f"these drives lack {', '.join(absent)}."
-    chosen = sorted(comparable)
-    return ComparedRows(
+    return (
         folds.with_signals([*common, label]),
-        tuple(candidates[i] for i in chosen if i < len(candidates)),
-        tuple(entries[i][0] for i in chosen if i >= len(candidates)),
+        [candidate for i, candidate in enumerate(candidates) if i in comparable],
+        [name for i, name in enumerate(columns, len(candidates)) if i in comparable],
     )
 
 
@@ -441,14 +422,6 @@ def _cross_validate(
     complete = folds.complete_cases(signals, label, sparse=True)
     procedure = least_squares(signals, label)
     return cross_validate(name, complete, procedure, catalog.input_scales)
-
-
-def _bounded(search: Search, cohort: Cohort, folding: Folding) -> Search:
-    """Return a search with at most the columns that it may take for so many drives."""
-    if not search.max_features_per_drive or folding.by == PARTS:
-        return search
-    limit = search.max_features_per_drive * cohort.drive_count
-    return search.model_copy(update={"max_features": min(search.max_features, limit)})
 
 
 def search_models(
@@ -508,15 +481,6 @@ def choose_by(compared: ModelList, models: Sequence[CrossValidation]) -> Winner:
     return Winner(best, best, reason)
 
 
-def _refit(winner: Winner, folds: CohortFolds, rows: ComparedRows, catalog: Catalog) -> Winner:
-    """Fit a winner to all rows that have its signals, where these are more than the compared."""
-    signals = winner.model.signals
-    if len(folds.tables_with([*signals, catalog.signals.label])) == len(rows.folds.tables):
-        return winner
-    model = _cross_validate(winner.model.name, signals, folds, catalog)
-    return replace(winner, model=model)
-
-
 PRIOR_SHARE = Fraction(1, 8)
 """Weight of all rows of a prior together, where those of the cohort have 1 (docs/measured.md)."""
 
@@ -535,9 +499,9 @@ def keeps_prior(with_prior: float, without: float, drives: int) -> bool:
     return with_prior <= without * (1 + min(MAX_PRIOR_COST, 1 / drives))
 
 
-def _select_with_prior(cohort: Cohort, prior: Cohort, compared: ModelList) -> Selection:
-    """Fit all inputs with the prior (no search: the prior regularises), or select without it."""
-    selection = select(replace(cohort, prior=None), compared)
+def _join_prior(selection: Selection, cohort: Cohort, prior: Cohort) -> Selection:
+    """Fit all inputs with the prior (no search: the prior regularises); keep the better fit."""
+    compared = selection.compared
     alone = selection.winner.model
     searched = next((search.inputs for search in compared.search if search.inputs), ())
     signals = tuple(name for name in searched if name in cohort.inputs) or alone.signals

@@ -147,7 +147,8 @@ def test_a_champion_has_no_advantage_on_drives_that_made_it(
 ) -> None:
     """Few rows, many columns: on its own drives the champion is better than any held-out model."""
     monkeypatch.setattr("tests.models.acceptance.test_champion_rules.ROWS", 12)
-    monkeypatch.setattr(champion_rules.PublishThresholds, "tolerance", 0.0)
+    strict = champion_rules.load_thresholds(CATALOG.configs).model_copy(update={"tolerance_deg": 0})
+    monkeypatch.setattr(champion_rules, "load_thresholds", lambda _: strict)
     every = ",".join((*CHOICE, *WEAK))
     write(warehouse, "good", 48, noise=400.0)
     first = run_selection(warehouse, SelectionRequest(model=every))
