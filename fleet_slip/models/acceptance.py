@@ -3,12 +3,10 @@
 The challenger is judged on held-out rows: neither its coefficients nor its columns saw them. A
 search is repeated without them for the same number of columns. The champion is compared with its
 published coefficients on the same rows, so the standard error is that of a paired difference,
-clustered by car, or by drive where there are few cars. The best champion so far is compared too:
-many small losses must not add up.
+clustered by car, or by drive where there are few cars.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +26,7 @@ from fleet_slip.grams.cohort import (
     load_cohort,
 )
 from fleet_slip.models.manifest import Manifest
-from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
+from fleet_slip.models.registry import ModelVersion, Registry
 from fleet_slip.models.select import search_procedure
 from fleet_slip.models.summary import Selection
 from fleet_slip.regression.choice import RmseGap, compare_paired
@@ -79,7 +77,7 @@ MAX_GROUPS = 20
 
 @dataclass(frozen=True)
 class Comparison:
-    """A challenger and published versions on the same held-out rows.
+    """A challenger and the champion on the same held-out rows.
 
     Attributes
     ----------
@@ -87,93 +85,73 @@ class Comparison:
         What was held out, vehicle or drive.
     challenger
         Refitted without each group that it is tested on.
-    incumbents
-        The champion, and the best champion so far if it is another version.
-    gaps
-        RMSE gap of the challenger to each incumbent.
+    champion
+        With its published coefficients.
+    gap
+        RMSE gap of the challenger to the champion.
     unseen
-        True if no incumbent was trained on these rows.
+        True if the champion was not trained on these rows.
     """
 
     by: FoldKey
     challenger: CrossValidation
-    incumbents: tuple[CrossValidation, ...]
-    gaps: tuple[RmseGap, ...]
+    champion: CrossValidation
+    gap: RmseGap
     unseen: bool = False
-
-    @property
-    def better(self) -> tuple[str, ...]:
-        """The incumbents that the challenger is worse than."""
-        pairs = zip(self.incumbents, self.gaps, strict=True)
-        return tuple(incumbent.name for incumbent, gap in pairs if not gap.negligible)
 
     @property
     def is_significantly_worse(self) -> bool:
         """True if the challenger is worse than the champion by many standard errors."""
-        gap = self.gaps[0]
         has_groups = len(self.challenger.folds) >= MIN_VEHICLES
-        return has_groups and gap.rmse > MAX_STANDARD_ERRORS * gap.standard_error
-
-    @property
-    def best(self) -> str | None:
-        """The best incumbent if it is better than the challenger, else None."""
-        best = min(self.incumbents, key=lambda incumbent: incumbent.pooled.rmse)
-        return best.name if best.pooled.rmse < self.challenger.pooled.rmse else None
+        return has_groups and self.gap.rmse > MAX_STANDARD_ERRORS * self.gap.standard_error
 
     def __str__(self) -> str:
-        challenger = self.challenger.pooled
-        incumbents = "; ".join(
-            f"{incumbent.name} as published has {incumbent.pooled.rmse_deg:.4f} deg and "
-            f"{incumbent.pooled.correlation:.4f}, difference {gap}"
-            for incumbent, gap in zip(self.incumbents, self.gaps, strict=True)
-        )
+        challenger, champion = self.challenger.pooled, self.champion.pooled
         return (
             f"on the same {pluralize(challenger.rows, 'row')} of "
             f"{pluralize(self.challenger.drives, 'drive')}"
             f"{' that are new to both' if self.unseen else ''}, held out in "
             f"{len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; "
-            f"{incumbents}"
+            f"{self.champion.name} as published has {champion.rmse_deg:.4f} deg and "
+            f"{champion.correlation:.4f}, difference {self.gap}"
         )
 
 
 @dataclass(frozen=True)
 class ChallengerEvaluation:
-    """How to refit a challenger without held-out groups, and the incumbents to compare it with.
+    """How to refit a challenger without held-out groups, and the champion to compare it with.
 
     Attributes
     ----------
     selection
         Its winner is the challenger.
+    reference, model
+        The champion, in counts.
     signals
-        Inputs of the challenger and all incumbents.
+        Inputs of the challenger and the champion.
     by
         What is held out, vehicle or drive.
     procedure
         Fits the challenger; searches its columns again if a search found them.
-    incumbents
-        Published models in counts, by reference.
     """
 
     selection: Selection
+    reference: str
+    model: LinearModel
     signals: tuple[str, ...]
     by: FoldKey
     procedure: Procedure
-    incumbents: dict[str, LinearModel]
 
     @classmethod
-    def prepare(
-        cls, selection: Selection, incumbents: Sequence[ModelVersion]
-    ) -> "ChallengerEvaluation":
-        """Prepare the comparison of a selection's winner with published versions.
+    def prepare(cls, selection: Selection, champion: ModelVersion) -> "ChallengerEvaluation":
+        """Prepare the comparison of a selection's winner with the champion.
 
-        Raises `DataError` or `QuestionError` if columns of a version are defined differently now.
+        Raises `DataError` or `QuestionError` if columns of it are defined differently now.
         """
         catalog, feature_set = selection.cohort.catalog, selection.cohort.feature_set
-        models = {}
-        for version in incumbents:
-            _require_same_columns(catalog, version, feature_set)
-            models[version.reference] = version.manifest.counts_model(catalog, feature_set)
+        _require_same_columns(catalog, champion, feature_set)
+        model = champion.manifest.counts_model(catalog, feature_set)
         winner, search = selection.winner.model, selection.searched_winner
         label = catalog.signals.label
         if search is None:
@@ -181,11 +159,10 @@ class ChallengerEvaluation:
         else:
             inputs = search.inputs
             procedure = search_procedure(label, search, len(winner.signals))
-        incumbent_signals = (name for model in models.values() for name in model.signals)
-        signals = tuple(dict.fromkeys((*inputs, *incumbent_signals)))
+        signals = tuple(dict.fromkeys((*inputs, *model.signals)))
         cars = selection.cohort.count_vehicles_with((*signals, label))
         by: FoldKey = "vehicle" if cars >= MIN_VEHICLES else "drive"
-        return cls(selection, signals, by, procedure, models)
+        return cls(selection, champion.reference, model, signals, by, procedure)
 
     def groups(self, cohort: Cohort, mask: BoolArray | None = None) -> Folds:
         """Return the drives that have all signals, by group, or the masked drives of each group.
@@ -206,11 +183,11 @@ class ChallengerEvaluation:
         folds = replace(folds, has_intercept=self.selection.compared.intercept)
         return folds.complete_cases(self.signals, cohort.catalog.signals.label, sparse=True)
 
-    def as_published(self, reference: str, tested: Folds) -> CrossValidation:
-        """Return the figures of an incumbent without refitting it."""
-        model = self.incumbents[reference]
-        sums = [error_sums(model, test) for test in tested.grams]
-        return assemble(reference, tested, sums, model, self.selection.cohort.catalog.input_scales)
+    def as_published(self, tested: Folds) -> CrossValidation:
+        """Return the figures of the champion without refitting it."""
+        sums = [error_sums(self.model, test) for test in tested.grams]
+        scales = self.selection.cohort.catalog.input_scales
+        return assemble(self.reference, tested, sums, self.model, scales)
 
     def compare(self, training: Folds, tested: Folds) -> Comparison:
         """Fit the challenger without each group of `training` and compare on `tested`."""
@@ -223,10 +200,10 @@ class ChallengerEvaluation:
         ]
         fitted, name = self.procedure(training.total), self.selection.winner.model.name
         challenger = assemble(name, tested, sums, fitted, catalog.input_scales)
-        incumbents = tuple(self.as_published(name, tested) for name in self.incumbents)
+        champion = self.as_published(tested)
         tolerance = math.radians(load_thresholds(catalog.configs).tolerance_deg)
-        gaps = tuple(compare_paired(challenger, incumbent, tolerance) for incumbent in incumbents)
-        return Comparison(self.by, challenger, incumbents, gaps)
+        gap = compare_paired(challenger, champion, tolerance)
+        return Comparison(self.by, challenger, champion, gap)
 
 
 MAX_REVIEWED_DRIVES = 20_000
@@ -236,13 +213,13 @@ _HEX = 4
 
 
 def _split_drives(
-    registry: Registry, selection: Selection, versions: Sequence[ModelVersion]
+    registry: Registry, selection: Selection, champion: ModelVersion
 ) -> tuple[Cohort, BoolArray]:
     """Return the drives of a selection, and the mask of those that a version was trained on.
 
-    Raises `StorageError` if a training set cannot be read.
+    Raises `StorageError` if its training set cannot be read.
     """
-    training_sets = [registry.trained_drives(version.manifest) for version in versions]
+    trained_drives = registry.trained_drives(champion.manifest)
     cohort = selection.cohort
     if cohort.source is not None and cohort.sums is not None:
         predicate, drives = cohort.predicate, cohort.drive_count
@@ -251,14 +228,13 @@ def _split_drives(
             sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
             predicate &= parse_predicate(cohort.catalog.signals, sample)
         cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
-    hashes = hash_names(cohort.drives["drive_id"])
-    return cohort, np.any([drives.among(hashes) for drives in training_sets], axis=0)
+    return cohort, trained_drives.among(hash_names(cohort.drives["drive_id"]))
 
 
 def _compare_unseen(
     evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray
 ) -> Comparison | None:
-    """Compare on drives that no incumbent was trained on: elsewhere it has an advantage.
+    """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
 
     Returns None if they are of fewer than `MIN_VEHICLES` groups. Raises `DataError`.
     """
@@ -274,7 +250,7 @@ OUTLIER_RATIO = 2.0
 
 
 def _unusual_drives(
-    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray, champion: str
+    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray
 ) -> list[str]:
     """Return a reason to refuse if the challenger is better on unusual new drives alone.
 
@@ -282,13 +258,11 @@ def _unusual_drives(
     much larger than on its training set, both are compared on that training set.
     """
     old, new = (evaluation.groups(cohort, mask) for mask in (is_trained, ~is_trained))
-    on_old, on_new = (
-        evaluation.as_published(champion, tested).pooled.rmse_deg for tested in (old, new)
-    )
+    on_old, on_new = (evaluation.as_published(tested).pooled.rmse_deg for tested in (old, new))
     if on_new <= OUTLIER_RATIO * on_old:
         return []
     comparison = evaluation.compare(evaluation.groups(cohort, np.ones_like(is_trained)), old)
-    if champion not in comparison.better:
+    if comparison.gap.negligible:
         return []
     return [
         "the improvement comes only from unusual new drives, on which the champion has "
@@ -371,15 +345,12 @@ class Review:
         Reasons to refuse the challenger.
     compared
         The comparison as a phrase.
-    best
-        Number of an earlier champion that is better, None if none is.
     is_significantly_worse
         True if the champion is better, though not by a refusable gap.
     """
 
     problems: tuple[str, ...]
     compared: str
-    best: int | None = None
     is_significantly_worse: bool = False
 
     @property
@@ -395,7 +366,7 @@ def review_challenger(
     manifest: Manifest,
     selection: Selection,
 ) -> Review:
-    """Compare a challenger with the thresholds, the champion, and the best champion so far."""
+    """Compare a challenger with the thresholds and the champion."""
     catalog = selection.cohort.catalog
     thresholds = load_thresholds(catalog.configs)
     problems = threshold_violations(thresholds, manifest, champion.manifest if champion else None)
@@ -410,11 +381,8 @@ def review_challenger(
         )
         problems += [compared] if new > old + thresholds.tolerance_deg else []
         return Review(tuple(problems), compared)
-    best = registry.history(manifest.name).best_of(CHAMPION)
-    earlier = [] if best in (None, champion.version) else [registry.load(manifest.name, best)]
-    incumbents = [champion, *earlier]
     try:
-        evaluation = ChallengerEvaluation.prepare(selection, incumbents)
+        evaluation = ChallengerEvaluation.prepare(selection, champion)
         groups = evaluation.groups(selection.cohort)
         comparison = evaluation.compare(groups, groups)
     except (DataError, QuestionError) as error:
@@ -425,20 +393,19 @@ def review_challenger(
         )
         return Review(tuple(problems), "")
     try:
-        cohort, is_trained = _split_drives(registry, selection, incumbents)
+        cohort, is_trained = _split_drives(registry, selection, champion)
         has_both = is_trained.any() and not is_trained.all()
-        if has_both and comparison.better:
+        if has_both and not comparison.gap.negligible:
             comparison = _compare_unseen(evaluation, cohort, is_trained) or comparison
         problems += _comparison_problems(comparison, champion, manifest)
         if has_both and not problems:
-            problems += _unusual_drives(evaluation, cohort, is_trained, champion.reference)
+            problems += _unusual_drives(evaluation, cohort, is_trained)
     except StorageError as error:
         problems.append(f"no comparison on the champion's training set: {error}")
     except DataError as error:
         problems += _comparison_problems(comparison, champion, manifest)
         LOGGER.warning("new drives were not compared with those of the champion: %s", error)
-    better = next((v.version for v in incumbents if v.reference == comparison.best), None)
-    return Review(tuple(problems), str(comparison), better, comparison.is_significantly_worse)
+    return Review(tuple(problems), str(comparison), comparison.is_significantly_worse)
 
 
 def _has_another_line(catalog: Catalog, version: ModelVersion, feature_set: str) -> bool:
@@ -454,23 +421,16 @@ def _comparison_problems(
     comparison: Comparison, champion: ModelVersion, manifest: Manifest
 ) -> list[str]:
     """Return the reasons to refuse that a comparison on held-out rows gives."""
-    problems = []
-    name, better = champion.reference, comparison.better
-    if any(incumbent.pooled.correlation < 0 for incumbent in comparison.incumbents):
+    problems, name = [], champion.reference
+    if comparison.champion.pooled.correlation < 0:
         problems.append(
             f"the label has the opposite sign of the estimates of {name}. Is it reversed? "
             f"{comparison}"
         )
-    if name in better:
+    if not comparison.gap.negligible:
         problems.append(f"it is worse than the champion: {comparison}")
-    elif better:
-        problems.append(
-            f"it is worse than {better[0]}, the best champion so far, after several small losses: "
-            f"{comparison}. To accept the present champion as the new reference: fleet-slip "
-            f"promote {name}"
-        )
     old = champion.manifest.cross_validation.rmse_deg
-    new = comparison.incumbents[0].pooled.rmse_deg
+    new = comparison.champion.pooled.rmse_deg
     has_reference = champion.manifest.learned_from is None and manifest.learned_from is None
     if has_reference and not problems and new > OUTLIER_RATIO * old:
         problems.append(

@@ -2,9 +2,8 @@
 
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +75,7 @@ class Predictions(Answer):
     predicted: tuple[PredictedDrive, ...]
     rows_quarantined: int
     suspicions: tuple[str, ...]
-    alarms: tuple[str, ...]
+    alarm: str = ""
 
     @property
     def rows(self) -> int:
@@ -112,7 +111,7 @@ class Predictions(Answer):
     @property
     def problem(self) -> AlarmError | None:
         """The first alarm of a file."""
-        return AlarmError(self.alarms[0]) if self.alarms else None
+        return AlarmError(self.alarm) if self.alarm else None
 
 
 def predict_logs(
@@ -149,22 +148,23 @@ def predict_logs(
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     drives: dict[str, PredictedDrive] = {}
     rejected, suspicions, alarms = 0, list[str](), list[str]()
-    predict_drive = partial(_predict_drive, predictor=predictor, cars=cars)
     for log in logs:
         try:
-            predicted, faults, unusable = _predict_log(log, mapping, predict_drive)
+            predicted, faults, unusable = _predict_log(log, mapping, predictor, cars)
         except MissingColumnError as error:
-            if not (without_label := _drop_label(mapping)):
+            label = mapping.signal_catalog.label
+            if label not in mapping.signals:
                 raise
-            predicted, faults, unusable = _predict_log(log, without_label, predict_drive)
+            signals = {name: c for name, c in mapping.signals.items() if name != label}
+            unlabelled = mapping.model_copy(update={"signals": signals})
+            predicted, faults, unusable = _predict_log(log, unlabelled, predictor, cars)
             suspicions.append(f"no reference: {error}")
-        for prediction in predicted:
-            if prediction.drive_id in drives:
+        for drive in predicted:
+            if drive.drive_id in drives:
                 raise InputError(
-                    f"{log}: the drive {prediction.drive_id} is also in another log. Leave out one "
-                    "of them."
+                    f"{log}: the drive {drive.drive_id} is also in another log. Leave out one."
                 )
-            drives[prediction.drive_id] = prediction
+            drives[drive.drive_id] = drive
         rejected += unusable
         suspicions += [f"{log}: {fault}" for fault in faults]
         alarms += [f"{log}: {fault}" for fault in faults if fault.does_harm]
@@ -174,7 +174,7 @@ def predict_logs(
         tuple(drives.values()),
         rejected,
         tuple(suspicions),
-        tuple(alarms),
+        next(iter(alarms), ""),
     )
     if not predictions.rows_estimated:
         raise DataError(
@@ -188,49 +188,31 @@ def predict_logs(
     return predictions
 
 
-def _drop_label(mapping: Mapping) -> Mapping | None:
-    """Return the mapping without the label, or None if it has none."""
-    label = mapping.signal_catalog.label
-    if label not in mapping.signals:
-        return None
-    signals = {name: column for name, column in mapping.signals.items() if name != label}
-    return mapping.model_copy(update={"signals": signals})
-
-
 def _predict_log(
-    log: Path, mapping: Mapping, predict_drive: Callable[[pa.Table, FloatArray], PredictedDrive]
+    log: Path, mapping: Mapping, predictor: Predictor, cars: CarCounts
 ) -> tuple[list[PredictedDrive], tuple[Fault, ...], int]:
     """Predict the drives of a log; return them, the faults, and the number of unusable rows."""
-    drives = []
+    predicted = []
     with open_measured(log, mapping) as stream:
         for drive in stream.drives():
             rows = log_table([drive], mapping)
             label_rad, slow = label_of(mapping.signal_catalog, rows)
-            drives.append(predict_drive(rows, np.where(slow, np.nan, label_rad)))
-        return drives, stream.suspicions(), sum(stream.counts.quarantined.values())
-
-
-def _predict_drive(
-    rows: pa.Table,
-    reference_rad: FloatArray,
-    predictor: Predictor,
-    cars: CarCounts,
-) -> PredictedDrive:
-    """Predict the rows of one drive."""
-    drive_id, vehicle_id = (rows[name][0].as_py() for name in ("drive_id", "vehicle_id"))
-    counts = counts_of(rows, predictor.plan, None, cars.get(vehicle_id))
-    estimate = np.degrees(predictor(counts))
-    columns = {ESTIMATE: estimate, REFERENCE: np.degrees(reference_rad)}
-    table = pa.table(
-        {
-            "drive_id": pa.array([drive_id] * len(rows)).dictionary_encode(),
-            "time_s": rows["tick"].to_numpy() / TICKS_PER_S,
-            **{name: pa.array(angle, from_pandas=True) for name, angle in columns.items()},
-        }
-    )
-    errors = estimate - columns[REFERENCE]
-    estimated = int(np.isfinite(estimate).sum())
-    return PredictedDrive(drive_id, vehicle_id, table, estimated, errors[np.isfinite(errors)])
+            drive_id, vehicle_id = (rows[name][0].as_py() for name in ("drive_id", "vehicle_id"))
+            counts = counts_of(rows, predictor.plan, None, cars.get(vehicle_id))
+            estimate = np.degrees(predictor(counts))
+            reference = np.degrees(np.where(slow, np.nan, label_rad))
+            columns = {
+                "drive_id": pa.array([drive_id] * len(rows)).dictionary_encode(),
+                "time_s": rows["tick"].to_numpy() / TICKS_PER_S,
+                ESTIMATE: pa.array(estimate, from_pandas=True),
+                REFERENCE: pa.array(reference, from_pandas=True),
+            }
+            estimated, errors = int(np.isfinite(estimate).sum()), estimate - reference
+            errors = errors[np.isfinite(errors)]
+            predicted.append(
+                PredictedDrive(drive_id, vehicle_id, pa.table(columns), estimated, errors)
+            )
+        return predicted, stream.suspicions(), sum(stream.counts.quarantined.values())
 
 
 def _encode(suffix: str, tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:
@@ -253,22 +235,15 @@ def _encode(suffix: str, tables: Sequence[pa.Table], about: dict[str, str]) -> b
 def _encode_mdf(tables: Sequence[pa.Table], about: dict[str, str]) -> bytes:
     """Return an MDF 4 file with a channel group for each drive, named after it."""
     with require_extra("logs", "an output in .mf4"):
-        from asammdf import MDF, Signal  # noqa: PLC0415 - an extra
+        from asammdf import MDF  # noqa: PLC0415 - an extra
     stream = io.BytesIO()
     with MDF(version="4.10") as file:
         file.header.comment = "; ".join(f"{key}: {value}" for key, value in about.items())
         for table in tables:
-            time_s, name = table["time_s"].to_numpy(), table["drive_id"][0].as_py()
-            signals = [
-                Signal(
-                    table[column].to_numpy(zero_copy_only=False).astype(np.float64),
-                    time_s,
-                    unit="deg",
-                    name=column.removesuffix("_deg"),
-                )
-                for column in (ESTIMATE, REFERENCE)
-                if table[column].null_count < len(table)
-            ]
-            file.append(signals, acq_name=name, comment=name, common_timebase=True)
+            name, frame = table["drive_id"][0].as_py(), table.drop(["drive_id"]).to_pandas()
+            frame = frame.set_index("time_s").dropna(axis=1, how="all")
+            frame = frame.rename(columns=lambda column: column.removesuffix("_deg"))
+            units = dict.fromkeys(frame.columns, "deg")
+            file.append(frame, acq_name=name, comment=name, common_timebase=True, units=units)
         file.save(stream)
     return stream.getvalue()

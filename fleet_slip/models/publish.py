@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from importlib.metadata import version as package_version
 from typing import Any
@@ -55,14 +55,14 @@ _MODEL_OPTIONS = {"models", "model", "order", "features", "label", "ranking", "c
 _MODEL_OPTIONS |= {"search", "max_features"}
 """Options that define which models are compared: with one of these, none is taken from before."""
 
-_STORED_NAMES = {
+_STORED_NAMES = {field.name: field.name for field in fields(SelectionRequest)} | {
     "order": "nested",
     "ranking": "rank",
     "tolerance": "worth",
     "max_features": "most",
     "group_by": "by",
 }
-"""Names of options in manifests, where they differ: versions of earlier releases have them."""
+"""Names of options in manifests; some differ, as in versions of earlier releases."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def stored_options(selection: Selection) -> dict[str, Any] | None:
     fell_back = not options and selection.model_list == LOGGED_MODELS
     if options.keys() <= {"models"} and not fell_back:  # else the default list next time
         return None
-    stored = {_STORED_NAMES.get(name, name): value for name, value in options.items()}
+    stored = {_STORED_NAMES[name]: value for name, value in options.items()}
     is_screened = selection.asked_condition != selection.cohort.predicate.text
     return {**stored, COHORT: selection.asked_condition} if is_screened else stored
 
@@ -110,8 +110,8 @@ def recipe_for(
 
 def _options(request: SelectionRequest) -> dict[str, Any]:
     """Return the options of a request that differ from the default."""
-    default = asdict(SelectionRequest())
-    return {name: value for name, value in asdict(request).items() if value != default[name]}
+    default = SelectionRequest()
+    return {name: x for name, x in vars(request).items() if x != getattr(default, name)}
 
 
 def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
@@ -121,11 +121,10 @@ def recipe_of(version: ModelVersion) -> tuple[SelectionRequest, str]:
     stored = manifest.selected_by.options
     if stored is None:
         return _request_of_list(version), cohort
-    names = {
-        field.name: _STORED_NAMES.get(field.name, field.name) for field in fields(SelectionRequest)
+    options: dict[str, Any] = {
+        name: stored[key] for name, key in _STORED_NAMES.items() if key in stored
     }
-    options: dict[str, Any] = {name: stored[key] for name, key in names.items() if key in stored}
-    if unknown := stored.keys() - {*names.values(), COHORT}:
+    if unknown := stored.keys() - {*_STORED_NAMES.values(), COHORT}:
         raise QuestionError(
             f"{version.reference} was selected with {', '.join(sorted(unknown))}, which select no "
             "longer has. Name a model list: --models estimator"
@@ -192,10 +191,13 @@ def build_challenger(
     for first measured drives that contradict any car.
     """
     manifest = with_straight_intercept(warehouse, manifest_of(selection, name))
-    manifest = with_assumptions(warehouse, manifest, selection)
+    is_simulated = selection.label_noise_deg is not None  # only campaigns state it
+    assumed = assumptions_of_cohort(warehouse, selection.cohort)
+    if assumed and not manifest.learned_from and not is_simulated:
+        assumed += ("label noise unknown: it is part of the RMSE",)
+    manifest = manifest.model_copy(update={"assumed": assumed})
     if manifest.learned_from and not force:
         require_sound_course(warehouse, manifest)
-    is_simulated = selection.label_noise_deg is not None  # only campaigns state it
     if not (force or candidate or is_simulated):
         champion = registry.champion(name)
         champion_drives = registry.trained_drives(champion.manifest) if champion else None
@@ -209,10 +211,11 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
     catalog = selection.cohort.catalog
     signals = catalog.signals
     winner = selection.winner.model
-    figures, label = winner.pooled, signals[signals.label]
+    figures, compared, label = winner.pooled, selection.compared, signals[signals.label]
+    cohort = selection.cohort
     needed = (*winner.signals, signals.label)
     drives = drives_of(selection, name)
-    definitions = catalog.definitions(selection.cohort.feature_set)
+    definitions = catalog.definitions(cohort.feature_set)
     return Manifest(
         name=name,
         label=ModelLabel(
@@ -220,13 +223,13 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
         ),
         intercept=winner.model.offset,
         intercept_exact=winner.model.intercept,
-        through_origin=not selection.compared.intercept,
+        through_origin=not compared.intercept,
         terms=tuple(
             _term(catalog, signal, exact, definitions)
             for signal, exact in zip(winner.signals, winner.model.coefficients, strict=True)
         ),
         cross_validation=CrossValidated(
-            folds_by=selection.compared.folds.by,
+            folds_by=compared.folds.by,
             folds=len(winner.folds),
             correlation=figures.correlation,
             correlation_standard_error=winner.standard_error,
@@ -237,14 +240,14 @@ def manifest_of(selection: Selection, name: str) -> Manifest:
             label_noise_deg=selection.label_noise_deg,
         ),
         trained_on=TrainedOn(
-            cohort=selection.cohort.predicate.text,
-            feature_set=catalog.identity(selection.cohort.feature_set),
+            cohort=cohort.predicate.text,
+            feature_set=catalog.identity(cohort.feature_set),
             drives=winner.drives,
-            vehicles=selection.cohort.count_vehicles_with(needed),
-            drives_without_log=selection.cohort.count_onboard_with(needed) or None,
+            vehicles=cohort.count_vehicles_with(needed),
+            drives_without_log=cohort.count_onboard_with(needed) or None,
             rows=selection.trained_rows,
-            logs_version=selection.cohort.logs_version,
-            grams_version=selection.cohort.grams_version,
+            logs_version=cohort.logs_version,
+            grams_version=cohort.grams_version,
             drives_sha256=checksum_of_drives(drives),
         ),
         selected_by=SelectedBy(
@@ -319,14 +322,6 @@ def with_straight_intercept(warehouse: Warehouse, manifest: Manifest) -> Manifes
             "terms": (*manifest.terms, *terms),
         }
     )
-
-
-def with_assumptions(warehouse: Warehouse, manifest: Manifest, selection: Selection) -> Manifest:
-    """Return a manifest with the assumptions of the mappings of its drives."""
-    assumed = assumptions_of_cohort(warehouse, selection.cohort)
-    if assumed and not manifest.learned_from and selection.label_noise_deg is None:
-        assumed += ("label noise unknown: it is part of the RMSE",)
-    return manifest.model_copy(update={"assumed": assumed})
 
 
 def assumptions_of_cohort(warehouse: Warehouse, cohort: Cohort) -> tuple[str, ...]:
@@ -451,14 +446,11 @@ class Decision:
         The champion if it stays, and nothing is published.
     waits
         True if the challenger becomes the candidate.
-    best
-        Number of the best champion so far, for `AliasHistory.move`.
     """
 
     reason: str
     champion: ModelVersion | None = None
     waits: bool = False
-    best: int | None = None
 
 
 def decide(
@@ -480,7 +472,6 @@ def decide(
         return Decision("The champion is the same model.", champion)
     held = registry.history(name).held_by(CHAMPION)
     if champion and champion.manifest.same_line(manifest):
-        best: int | None = champion.version
         reason = "The terms are the champion's."
     else:
         review = review_challenger(registry, champion, manifest, selection)
@@ -493,7 +484,7 @@ def decide(
             if review.is_significantly_worse and not held:
                 reason = f"The champion stays: it is significantly better. {review.reason}"
                 return Decision(reason, champion)
-        best, reason = None if review.problems else review.best, review.reason
+        reason = review.reason
     waits = candidate or held is not None
     remarks = [reason, str(manifest.combination or ""), manifest.line_remark]
     if held:
@@ -503,7 +494,7 @@ def decide(
         )
     if waits:
         remarks.append(f"It is a candidate until: fleet-slip promote {name}@{CANDIDATE}")
-    return Decision(" ".join(filter(None, remarks)), None, waits, best)
+    return Decision(" ".join(filter(None, remarks)), None, waits)
 
 
 def publish_challenger(
@@ -526,9 +517,7 @@ def publish_challenger(
             return Publication(decision.champion, False, decision.reason)
         version, alias = add_version(), CANDIDATE if decision.waits else CHAMPION
         is_there = history.pointed_at(alias) == version.version
-        if not is_there and not history.move(
-            alias, version.version, "publish", after=newest_move, best=decision.best
-        ):
+        if not is_there and not history.move(alias, version.version, "publish", after=newest_move):
             return None
         is_new = not (decision.waits and is_there)
         return Publication(version, is_new, decision.reason, decision.waits)

@@ -19,7 +19,12 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
-from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives
+from fleet_slip.models.manifest import (
+    Manifest,
+    TrainedDrives,
+    checksum_of_drives,
+    require_model_name,
+)
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.storage.folder import Folder
@@ -62,8 +67,8 @@ class AliasMove(Config):
     version: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)]
     command: Command
     at: datetime
-    best: Annotated[int, Field(ge=1, lt=10**MAX_DIGITS)] | None = None
-    """For a publication: the best champion so far, if it is another version."""
+    best: int | None = None
+    """Written by development versions; ignored."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +88,9 @@ class AliasHistory:
             file = self.documents.file(number)
             yield parse_document(document.content, AliasMove, file, "this move of an alias")
 
-    def latest(self, alias: str) -> AliasMove | None:
-        """Return the newest move of an alias, or None."""
-        return next((move for move in self.latest_moves() if move.alias == alias), None)
-
     def pointed_at(self, alias: str) -> int | None:
         """Return the version that an alias points at, or None."""
-        last = self.latest(alias)
-        return None if last is None else last.version
+        return next((move.version for move in self.latest_moves() if move.alias == alias), None)
 
     def before(self, alias: str) -> int | None:
         """Return the version that an alias pointed at before, or None.
@@ -106,14 +106,6 @@ class AliasHistory:
             elif trail[-1:] != [move.version]:
                 trail.append(move.version)
         return trail[-2] if len(trail) > 1 else None
-
-    def best_of(self, alias: str) -> int | None:
-        """Return the best version of an alias since a person moved it, as publications judged.
-
-        Returns None if the alias points at no version.
-        """
-        last = self.latest(alias)
-        return None if last is None else last.best or last.version
 
     def published_at(self, version: int) -> datetime | None:
         """Return when a version was published last; None if unknown."""
@@ -139,17 +131,10 @@ class AliasHistory:
         """
         return self.documents.after_newest(decision)
 
-    def move(
-        self, alias: str, version: int, command: Command, *, after: int, best: int | None = None
-    ) -> bool:
+    def move(self, alias: str, version: int, command: Command, *, after: int) -> bool:
         """Point an alias at a version; return False if there were moves after the one given."""
-        move = AliasMove(
-            alias=alias,
-            version=version,
-            command=command,
-            at=datetime.now(UTC),
-            best=None if best == version else best,
-        )
+        now = datetime.now(UTC)
+        move = AliasMove(alias=alias, version=version, command=command, at=now)
         content = move.model_dump(mode="json", exclude_none=True)
         return self.documents.create(after + 1, content) is not None
 
@@ -393,14 +378,15 @@ class Registry:
     def promote(self, name: str, version: int, alias: str) -> None:
         """Point an alias at a version. Raises `QuestionError` for an unknown version.
 
-        Where it points there already nothing is added, unless a hold or a better champion of before
-        ends: one `rollback` undoes a repeated command.
+        Where it points there already nothing is added, unless a hold ends: one `rollback` undoes a
+        repeated command.
         """
+        require_model_name(alias)
         self.load(name, version)
 
         def target(history: AliasHistory) -> int | None:
-            is_best = history.pointed_at(alias) == history.best_of(alias) == version
-            return None if is_best and not history.held_by(alias) else version
+            is_there = history.pointed_at(alias) == version
+            return None if is_there and not history.held_by(alias) else version
 
         self._move(name, alias, "promote", target)
 

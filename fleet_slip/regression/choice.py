@@ -140,12 +140,9 @@ def _gap(
 
 
 def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
-    """Return the standard error of the difference of RMSEs over folds, paired where rows agree."""
-    first, second = ([fold.rmse for fold in model.folds] for model in (candidate, other))
-    rows = [[fold.rows for fold in model.folds] for model in (candidate, other)]
-    if candidate.fold_names == other.fold_names and rows[0] == rows[1]:
-        return error_of_mean([a - b for a, b in zip(first, second, strict=True)])
-    return math.hypot(error_of_mean(first), error_of_mean(second))
+    """Return the standard error of the difference of RMSEs over the same folds."""
+    pairs = zip(candidate.folds, other.folds, strict=True)
+    return error_of_mean([first.rmse - second.rmse for first, second in pairs])
 
 
 def _reason(winner: CrossValidation, best: CrossValidation, contenders: int, total: int) -> str:

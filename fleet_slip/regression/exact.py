@@ -5,7 +5,7 @@ number in a ball (Johansson 2017, IEEE Transactions on Computers 66:1281).
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import TypeVar
 
@@ -137,40 +137,6 @@ def _flat(rows: Sequence[Sequence[Entry]]) -> list[Entry]:
     return [entry for row in rows for entry in row]
 
 
-MAX_PRECISION = 2**14
-"""Bits. A real number that 16,384 bits do not round lies on a boundary between two doubles."""
-
-
-def round_once(compute: Callable[[], arb]) -> float:
-    """Round a real number to the nearest binary64 number.
-
-    Parameters
-    ----------
-    compute : callable
-        Returns a ball that contains the number, at the precision of FLINT's context. Another thread
-        may change that precision: it changes the number of attempts, never the result.
-
-    Returns
-    -------
-    float
-        The number, correctly rounded.
-
-    Raises
-    ------
-    ArithmeticError
-        If no precision up to `MAX_PRECISION` bits determines the result.
-    """
-    precision = 64
-    while precision <= MAX_PRECISION:
-        with ctx.workprec(precision):
-            ball = compute()
-            low, high = float(ball.lower()), float(ball.upper())
-        if low == high:
-            return low
-        precision *= 2
-    raise ArithmeticError(f"{MAX_PRECISION} bits do not determine a rounded number")
-
-
 def sqrt(value: Fraction) -> float:
     """Return the square root of a non-negative rational number, correctly rounded.
 
@@ -189,12 +155,12 @@ def sqrt(value: Fraction) -> float:
     """
     if value < 0:
         raise ValueError(f"square root of {value}")
-
-    def compute() -> arb:
-        ratio = arb(value.numerator) / value.denominator
-        return ratio.sqrt()
-
-    return round_once(compute)
+    numerator, denominator = value.as_integer_ratio()
+    # The root of value * 4**bits has more bits than a float. A bit more marks it as inexact.
+    bits = max(0, 64 - (numerator.bit_length() - denominator.bit_length()) // 2)
+    scaled = Fraction(numerator << 2 * bits, denominator)
+    root = math.isqrt(int(scaled))
+    return float(Fraction(2 * root + (root * root != scaled), 2 << bits))
 
 
 _EIGENVALUE_PRECISION = 256

@@ -215,7 +215,10 @@ def dependence(gram: Gram, inputs: Sequence[str]) -> str:
     """
     part = gram.restrict(inputs)
     relations = [
-        _relation(part, column, weights)
+        f"{part.signals[column]} is a linear combination of "
+        f"{', '.join(part.signals[i] for i in weights)}"
+        if weights
+        else f"{part.signals[column]} is constant"
         for column, weights in exact.dependent_columns(moments(part)).items()
     ]
     if not relations:
@@ -231,14 +234,6 @@ def dependence(gram: Gram, inputs: Sequence[str]) -> str:
 
 MAX_RELATIONS = 3
 """Maximum number of relations in a message."""
-
-
-def _relation(gram: Gram, column: int, weights: Mapping[int, Fraction]) -> str:
-    """Describe a signal as a combination of others."""
-    name = gram.signals[column]
-    if not weights:
-        return f"{name} is constant"
-    return f"{name} is a linear combination of {', '.join(gram.signals[i] for i in weights)}"
 
 
 def correlation_matrix(gram: Gram) -> FloatArray:
