@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from fleet_slip.api.fleet import Fleet
-    from fleet_slip.api.fleet_cohort import FleetCohort
+    from fleet_slip.api.fleet_models import FleetCohort
     from fleet_slip.errors import FleetSlipError
     from fleet_slip.models.registry import ModelVersion
     from fleet_slip.storage.folder import Folder
@@ -36,7 +36,7 @@ __all__ = ["Fleet", "FleetCohort", "FleetSlipError", "ModelVersion", "connect", 
 
 _HOMES = {
     "Fleet": "fleet_slip.api.fleet",
-    "FleetCohort": "fleet_slip.api.fleet_cohort",
+    "FleetCohort": "fleet_slip.api.fleet_models",
     "FleetSlipError": "fleet_slip.errors",
     "ModelVersion": "fleet_slip.models.registry",
     "connect": "fleet_slip.views",

@@ -29,10 +29,9 @@ from fleet_slip.storage.runs import LOGGER, step
 if TYPE_CHECKING:
     import duckdb
 
-    from fleet_slip.api.fleet_cohort import FleetCohort
     from fleet_slip.api.fleet_evaluation import FleetEvaluation
     from fleet_slip.api.fleet_maintenance import FleetMaintenance
-    from fleet_slip.api.fleet_models import FleetModels
+    from fleet_slip.api.fleet_models import FleetCohort, FleetModels
     from fleet_slip.api.pipelines import LearnReport, RunReport
     from fleet_slip.grams.on_board import OnboardImport
     from fleet_slip.grams.update import GramReport
@@ -172,7 +171,7 @@ class Fleet:
         include_faulty
             Include drives with faulty sensors.
         """
-        from fleet_slip.api.fleet_cohort import FleetCohort
+        from fleet_slip.api.fleet_models import FleetCohort
 
         return FleetCohort(self.warehouse, predicate, include_faulty)
 

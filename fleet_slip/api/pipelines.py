@@ -326,18 +326,13 @@ class NightlyPipeline:
         self.files_before = {file.path for file in self.fleet.warehouse.logs.snapshot().files}
         for name in REQUIRED_STEPS:
             self._execute(name, getattr(self, f"_{name}"))
-        state = self._state()
         report = NightReport(
             model=self.training.name,
             night=self.night,
             root=str(self.fleet.root),
             steps=tuple(self.steps),
             before=self.baseline,
-            drives=state.drives,
-            rows=state.rows,
-            quarantined=state.quarantined,
-            champion=state.champion,
-            candidate=state.candidate,
+            after=self._state(),
             faults=self.faults,
             chart=self.chart,
             seconds=round(time.monotonic() - start, 3),

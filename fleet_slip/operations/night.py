@@ -101,8 +101,8 @@ class NightReport(Answer):
 
     Attributes
     ----------
-    before : Baseline
-        State of the data root when the night first began.
+    before, after : Baseline
+        State of the data root when the night first began, and at its end.
     faults : tuple of SensorFault
         Drives with faulty sensors; `new_faults` are those of this night.
     chart : Chart or None
@@ -110,9 +110,9 @@ class NightReport(Answer):
     """
 
     DOCUMENT = (
-        "model night exit_code verdict drives new_drives rows new_rows new_rows_quarantined "
-        "champion champion_before=before.champion candidate steps faults new_faults=new_faulty "
-        "alarms seconds"
+        "model night exit_code verdict drives=after.drives new_drives rows=after.rows new_rows "
+        "new_rows_quarantined champion=after.champion champion_before=before.champion "
+        "candidate=after.candidate steps faults new_faults=new_faulty alarms seconds"
     )
 
     model: str
@@ -120,11 +120,7 @@ class NightReport(Answer):
     root: str
     steps: tuple[NightStep, ...]
     before: Baseline
-    drives: int
-    rows: int
-    quarantined: int
-    champion: str | None
-    candidate: str | None
+    after: Baseline
     faults: "tuple[SensorFault, ...]"
     chart: "Chart | None"
     seconds: float
@@ -151,17 +147,17 @@ class NightReport(Answer):
     @property
     def new_drives(self) -> int:
         """The drives of the night."""
-        return self.drives - self.before.drives
+        return self.after.drives - self.before.drives
 
     @property
     def new_rows(self) -> int:
         """The log rows of the night."""
-        return self.rows - self.before.rows
+        return self.after.rows - self.before.rows
 
     @property
     def new_rows_quarantined(self) -> int:
         """The rejected rows of the night."""
-        return self.quarantined - self.before.quarantined
+        return self.after.quarantined - self.before.quarantined
 
     @property
     def problem(self) -> FleetSlipError | None:
@@ -202,9 +198,9 @@ class NightReport(Answer):
         return {
             "night": self.night.isoformat(),
             "exit_code": self.exit_code,
-            "drives": self.drives,
-            "rows": self.rows,
-            "champion": self.champion,
+            "drives": self.after.drives,
+            "rows": self.after.rows,
+            "champion": self.after.champion,
             "steps": {step.name: step.state for step in self.steps},
             "faulty": sorted({hash_drive(self.model, f.drive_id) for f in self.faults}),
         }
@@ -215,7 +211,7 @@ class NightReport(Answer):
         mark = {"done": "ok", "attention": "LOOK", "failed": "FAILED", "left out": "-"}
         lines = [
             f"{self.model}, night of {self.night}: {self.verdict} (exit code {self.exit_code})",
-            f"new: {self.gained}; champion: {self.champion or 'none'}"
+            f"new: {self.gained}; champion: {self.after.champion or 'none'}"
             + (f", was {self.before.champion}" if self.moved else ""),
             *(f"  {s.name:<{width}}  {mark[s.state]:<6}  {s.summary}" for s in self.steps),
             *(
@@ -228,7 +224,7 @@ class NightReport(Answer):
     @property
     def moved(self) -> bool:
         """True if the night replaced a champion."""
-        return self.before.champion not in (None, self.champion)
+        return self.before.champion not in (None, self.after.champion)
 
 
 def write_summary(report: NightReport, folder: Path) -> list[Path]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import fleet_slip
 from fleet_slip.api.fleet import Fleet
-from fleet_slip.api.fleet_cohort import FleetCohort
+from fleet_slip.api.fleet_models import FleetCohort
 from fleet_slip.errors import QuestionError, StorageError
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.summary import Selection

@@ -156,7 +156,7 @@ def test_a_fleet_that_counts_on_board_alone_has_nights(place: Path, tmp_path: Pa
             rows.append(row_of(gram, f"VIN{car}", START_S + 86_400 * night))
         fleet.import_onboard_grams(write_counted(tmp_path / f"{night}", rows))
         report = give(place, night)
-        assert (report.exit_code, report.drives, report.champion) == (
+        assert (report.exit_code, report.after.drives, report.after.champion) == (
             0,
             12 + 12 * night,
             f"smoke@{night + 1}",
@@ -196,7 +196,7 @@ def test_a_file_that_cannot_be_used_does_not_hold_up_the_others(
     land(landing, 2)
     (place / "landing/torn.parquet").write_bytes(b"PAR1 half a file")
     report = give(place, 2)
-    assert (report.exit_code, report.champion, report.drives) == (4, "smoke@3", 8)
+    assert (report.exit_code, report.after.champion, report.after.drives) == (4, "smoke@3", 8)
     assert "ingest failed" in str(report.problem)
     assert "torn.parquet" in str(report.problem)
 
@@ -208,7 +208,7 @@ def test_no_night_erases_drives_whose_date_has_rolled_over(place: Path, landing:
     for night in (2, 3):  # the second knows these drives
         report = give(place, night)
         (retain,) = (step for step in report.steps if step.name == "retain")
-        assert (retain.state, report.drives, report.exit_code) == ("attention", 8, 10)
+        assert (retain.state, report.after.drives, report.exit_code) == ("attention", 8, 10)
         assert str(rolled_over) in retain.summary
 
 
@@ -224,7 +224,7 @@ def test_with_a_wrong_mapping_what_is_there_is_looked_after(place: Path, landing
     assert states["ingest"] == "failed"
     assert states["verify"] == states["quality"] == "done"
     mended = give(place, 2)
-    assert (mended.exit_code, mended.drives - mended.before.drives) == (0, 2)
+    assert (mended.exit_code, mended.after.drives - mended.before.drives) == (0, 2)
 
 
 def test_a_broken_sensor_is_told_once_and_trains_no_model(place: Path, landing: Landing) -> None:
@@ -234,7 +234,7 @@ def test_a_broken_sensor_is_told_once_and_trains_no_model(place: Path, landing: 
     assert len(first.new_faults) == 2
     assert {fault.fault.signals for fault in first.new_faults} == {("yaw_rate",)}
     assert all(fault.drive_id in str(first) for fault in first.new_faults)
-    assert first.champion == "smoke@2"
+    assert first.after.champion == "smoke@2"
     second = give(place, 3)
     assert second.exit_code == 0
     assert (len(second.faults), second.new_faults) == (2, ())
@@ -252,10 +252,10 @@ def test_a_worse_winner_becomes_a_candidate_and_calls_for_attention(
     with champions_by(place / "configs", "min_correlation = 0.5", "min_correlation = 0.999999"):
         report, again, next_night = (give(place, night) for night in (2, 2, 3))
     assert report.exit_code == 10
-    assert (report.champion, report.candidate) == ("smoke@2", "smoke@3")
+    assert (report.after.champion, report.after.candidate) == ("smoke@2", "smoke@3")
     assert "publish: smoke@3" in str(report.problem)
-    assert (again.exit_code, again.candidate) == (10, "smoke@3")
-    assert (next_night.exit_code, next_night.candidate) == (0, "smoke@3"), str(next_night)
+    assert (again.exit_code, again.after.candidate) == (10, "smoke@3")
+    assert (next_night.exit_code, next_night.after.candidate) == (0, "smoke@3"), str(next_night)
 
 
 def refused(place: Path, night: int, **options: Any) -> tuple[int, str]:
@@ -361,5 +361,5 @@ def test_a_process_that_is_killed_leaves_a_night_that_can_be_given_again(
     process.communicate()
     assert process.returncode < 0
     again = give(place, 2)
-    assert (again.exit_code, again.drives, again.champion) == (0, 8, "smoke@3")
-    assert again.drives - again.before.drives == 2
+    assert (again.exit_code, again.after.drives, again.after.champion) == (0, 8, "smoke@3")
+    assert again.after.drives - again.before.drives == 2

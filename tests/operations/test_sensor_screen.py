@@ -121,7 +121,7 @@ def test_a_first_champion_of_a_label_that_is_wrong_in_all_drives_is_refused(
         fleet.models.publish("m", chosen)
     night = fleet.nightly(landing.folder, str(landing.mapping), "m", models="table1")
     assert night.exit_code != 0
-    assert night.champion is None
+    assert night.after.champion is None
     assert fleet.models.publish("m", chosen, candidate=True).candidate
     assert fleet.models.publish("m", chosen, force=True).new
 
