@@ -24,15 +24,16 @@ from fleet_slip.cli.output import (
     say,
     write_text,
 )
+from fleet_slip.config import read_named_file
 from fleet_slip.errors import AlarmError, UsageError
 from fleet_slip.rendering import TextTable
+from fleet_slip.resources import folder
 
 if TYPE_CHECKING:
     from fleet_slip.catalog.signals import SignalCatalog
     from fleet_slip.grams.update import GramReport
     from fleet_slip.ingest.draft import Draft
-    from fleet_slip.ingest.logs import IngestReport, Preview
-    from fleet_slip.resources import Configs
+    from fleet_slip.ingest.logs import IngestReport
 
 ALL_SETS = "all"
 """Name that stands for every feature set."""
@@ -104,7 +105,12 @@ def ingest(
         print_answer([fleet.import_onboard_grams(file) for file in files], json)
         return
     if dry_run:
-        _print_previews(fleet.preview(files, mapping), json)
+        previews = fleet.preview(files, mapping)
+        print_answer(previews, json)
+        if suspicions := sum(len(preview.alarms) for preview in previews):
+            raise AlarmError(
+                f"{pluralize(suspicions, 'suspicion')}, see above. Nothing was stored."
+            )
         return
 
     from fleet_slip.ingest.log_files import names_several
@@ -135,7 +141,12 @@ def ingest(
     elif folders:
         new = sum(report.new for report in reports)
         say(_ingested(pluralize(new, "new file"), reports) if new else "nothing new")
-    _require_no_alarm(reports)
+    for log in reports:
+        for alarm in log.alarms:
+            raise AlarmError(
+                f"{log.file}: {alarm} Its rows are stored. Correct the mapping and repeat the "
+                "command with --replace."
+            )
 
 
 def warn_of_passed_over(files: Sequence[str]) -> None:
@@ -144,16 +155,6 @@ def warn_of_passed_over(files: Sequence[str]) -> None:
 
     if passed_over := find_logs(files).describe_passed_over():
         say(passed_over, logging.WARNING)
-
-
-def _require_no_alarm(reports: "list[IngestReport]") -> None:
-    """Raise `AlarmError` for the first alarm of a file."""
-    for report in reports:
-        for alarm in report.alarms:
-            raise AlarmError(
-                f"{report.file}: {alarm} Its rows are stored. Correct the mapping and repeat the "
-                "command with --replace."
-            )
 
 
 def _ingested(subject: str, reports: "Sequence[IngestReport]") -> str:
@@ -177,13 +178,6 @@ def _ingested(subject: str, reports: "Sequence[IngestReport]") -> str:
     if replaced := sum(report.drives_replaced for report in new):
         text += f"; {pluralize(replaced, 'drive')} replaced"
     return text + skipped_drives(sum(report.drives_forgotten for report in new))
-
-
-def _print_previews(previews: "list[Preview]", json: bool) -> None:
-    """Print previews. Raises `AlarmError` if anything looks wrong."""
-    print_answer(previews, json)
-    if suspicions := sum(len(preview.alarms) for preview in previews):
-        raise AlarmError(f"{pluralize(suspicions, 'suspicion')}, see above. Nothing was stored.")
 
 
 # Mappings.
@@ -371,7 +365,19 @@ def features(
 
     catalog = fleet_of(context).warehouse.catalog
     if files:
-        _print_files(catalog.configs, json)
+        configs = catalog.configs
+        own, in_use = configs.folder, configs.files()
+        places = {
+            name: {
+                "from": "own" if own and str(file).startswith(str(own)) else "shipped",
+                "path": str(file),
+            }
+            for name, file in in_use.items()
+            if read_named_file(file)
+        }
+        heading = f"own configs: {own or 'none'}\nshipped ones: {folder('configs')}"
+        table = TextTable(heading, "file|from", places.items(), "{0}|{1[from]}", text_columns=2)
+        print_table(places, json, table)
         return
     feature_sets = {name: catalog.feature_set(name) for name in (PLAIN, *catalog.sets)}
     if sql is not None:
@@ -412,21 +418,3 @@ def features(
         print_parts([TextTable("", header, columns.items(), row, text_columns=4)])
         if not everything:
             say(f"and {pluralize(len(catalog.time_columns), 'column')} over time: --all")
-
-
-def _print_files(configs: "Configs", json: bool) -> None:
-    from fleet_slip.config import read_named_file
-    from fleet_slip.resources import folder
-
-    overlay = configs.folder
-    files = {
-        name: {
-            "from": "own" if overlay and str(file).startswith(str(overlay)) else "shipped",
-            "path": str(file),
-        }
-        for name, file in configs.files().items()
-        if read_named_file(file)
-    }
-    heading = f"own configs: {overlay or 'none'}\nshipped ones: {folder('configs')}"
-    table = TextTable(heading, "file|from", files.items(), "{0}|{1[from]}", text_columns=2)
-    print_table(files, json, table)
