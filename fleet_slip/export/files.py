@@ -81,7 +81,11 @@ def document_of(subject: Subject) -> dict[str, Any]:
         "program": program_content(subject.program),
         "costs": count_costs(subject.program).as_dict(),
         "checks": [
-            {name: value for name, value in vars(check).items() if name in check.written}
+            {
+                name: value
+                for name, value in vars(check).items()
+                if name != "car" and (name != "states" or value)
+            }
             for check in subject.checks
         ],
     }
@@ -203,8 +207,7 @@ def with_states(version: ModelVersion, program: Program, check: TestVector) -> T
     estimator = Estimator(version.catalog, version.manifest, {**facts, **car})
     states = []
     for sample in check.samples:
-        pairs = zip(program.signals, sample, strict=True)
-        estimator.step({s.column: None if n is None else float(n * s.scale) for s, n in pairs})
+        estimator.advance(sample)
         states.append(estimator.states)
     return replace(check, states=tuple(states))
 

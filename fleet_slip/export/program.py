@@ -219,7 +219,7 @@ class Steps:
         """Steps with a history, and its number of ticks; 0: all ticks since the start."""
         return rings_of(self.steps)
 
-    @property
+    @cached_property
     def states(self) -> dict[int, int]:
         """Steps that hold a number of the tick before, with the step of their next value."""
         return {plain_of(s)[1]: plain_of(s)[0] for s in self.steps if s[0] == "next"}

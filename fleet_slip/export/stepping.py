@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
-from functools import partial
 from io import StringIO
 from typing import Any
 
@@ -18,7 +17,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import round_number
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
-from fleet_slip.columns.lowering import power
+from fleet_slip.columns.lowering import operands_of, operation_of, plain_of, power
 from fleet_slip.errors import InputError
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
@@ -27,21 +26,21 @@ from fleet_slip.models.predict import Predictor
 
 _OPERATIONS: Mapping[str, Callable[..., int | None]] = {
     **COMPUTED,
+    "constant": lambda value: value,
     "nearest": lambda a, b: nearest(a, b) if b > 0 else None,
+    "shift": lambda a, bits: nearest(a, 1 << bits),
     "min": min,
     "max": max,
     "power": power,
     "clip": lambda a, limit: max(-limit, min(a, limit)),
     "at_least": lambda a, bound: a if a >= bound else None,
     "where": lambda a, _: a,
+    "next": lambda a, _: a,
 }
-"""Operations on values of one tick, none of which is missing."""
+"""Operations on values of one tick, none of which is missing, and on plain numbers."""
 
-
-def _shifted(value: int, bits: int) -> int:
-    """Return a value over 2^bits, to the nearest."""
-    return nearest(value, 1 << bits)
-
+Sample = tuple[int | None, ...]
+"""The counts of a tick in the order of the program's signals; None where missing."""
 
 RETAINED_PARTS = 256
 """Parts of the sums of a drive that can be retained for the next drive."""
@@ -73,27 +72,18 @@ class Estimator:
     def __init__(
         self, catalog: Catalog, manifest: Manifest, car: Mapping[str, Any] | None = None
     ) -> None:
-        manifest = manifest.estimate
+        self._manifest = manifest = manifest.estimate
         self._program = program = compile_program(catalog, manifest)
         properties = _parse_car(manifest, program, car or {})
-        self.columns = tuple(signal.column for signal in program.signals)
-        self._manifest = manifest
-        steps = [program.operation(step) for step in range(len(program.steps))]
-        car_counts = {
+        self._car = {
             "fact": properties.fact_counts(program),
             "number": properties.number_counts(program),
         }
-        self._initial: list[int | None] = [None] * len(steps)
-        self._steps: list[tuple[int, str, Callable[..., int | None] | None, tuple[int, ...]]] = []
-        for place, (name, plain) in enumerate(steps):
-            if name == "constant":
-                self._initial[place] = plain[0]
-            elif name == "shift":
-                self._steps.append((place, name, partial(_shifted, bits=plain[1]), plain[:1]))
-            elif name in car_counts:
-                self._initial[place] = car_counts[name][plain[0]]
-            else:
-                self._steps.append((place, name, _OPERATIONS.get(name), plain))
+        self.columns = tuple(signal.column for signal in program.signals)
+        self._steps: list[tuple[str, tuple[int, ...], tuple[int, ...]]] = []
+        for step in program.steps:
+            operands = operands_of(step)
+            self._steps.append((operation_of(step), operands, plain_of(step)[len(operands) :]))
         scale_of = {signal.name: float(signal.scale) for signal in program.signals}
         self._terms = [
             (place, scale_of[t.signal] if t.logged else float(t.scale), t.coefficient)
@@ -123,30 +113,7 @@ class Estimator:
         InputError
             If the sample lacks a column.
         """
-        counts, now = self._counts(sample), self._initial.copy()
-        following: dict[int, int] = {}
-        for place, name, compute, plain in self._steps:
-            if compute is not None:
-                values = [now[operand] for operand in plain]
-                now[place] = None if None in values else compute(*values)
-            elif name == "signal":
-                now[place] = counts[plain[0]]
-            elif name == "else":
-                now[place] = now[plain[1]] if now[plain[0]] is None else now[plain[0]]
-            elif name == "ago":
-                now[place] = self._ago(*plain)
-            elif name == "state":
-                now[place] = self._states[place]
-            elif name == "next":
-                following[plain[1]] = now[plain[0]] or 0
-            elif name == "sum":
-                now[place] = self._slide(now[plain[0]], *plain)
-            else:
-                now[place] = self._windows[plain][1]
-        for source, ring in self._rings.items():
-            ring[self._tick % len(ring)] = now[source]
-        self._states |= following
-        self._tick += 1
+        now = self.advance(self._counts(sample))
         estimate = self._manifest.intercept
         for place, scale, coefficient in self._terms:
             count = now[place]
@@ -154,6 +121,31 @@ class Estimator:
                 return None
             estimate += coefficient * (count * scale)
         return estimate
+
+    def advance(self, counts: Sample) -> list[int | None]:
+        """Advance by a tick with these counts of the signals; return the value of each step."""
+        inputs = {**self._car, "signal": _valid(counts, self._program.signals)}
+        now: list[int | None] = []
+        for name, operands, plain in self._steps:
+            values = [now[operand] for operand in operands]
+            if name in _OPERATIONS:
+                now.append(None if None in values else _OPERATIONS[name](*values, *plain))
+            elif name in inputs:
+                now.append(inputs[name][plain[0]])
+            elif name == "else":
+                now.append(values[1] if values[0] is None else values[0])
+            elif name == "state":
+                now.append(self._states[len(now)])
+            elif name == "ago":
+                now.append(self._ago(*operands, *plain))
+            else:
+                now.append(self._slide(name, values[0], *operands, *plain))
+        for source, ring in self._rings.items():
+            ring[self._tick % len(ring)] = now[source]
+        for state, following in self._program.states.items():
+            self._states[state] = now[following] or 0
+        self._tick += 1
+        return now
 
     @property
     def states(self) -> tuple[int, ...]:
@@ -191,33 +183,31 @@ class Estimator:
             values = [value * retained // RETAINED_PARTS for value in previous[window]]
             self._windows[window] = values
 
-    def _counts(self, sample: Mapping[str, float | None]) -> list[int | None]:
-        """Convert a sample to counts; None: missing or out of range."""
-        counts: list[int | None] = []
-        name = self._manifest.name
+    def _counts(self, sample: Mapping[str, float | None]) -> Sample:
+        """Round a sample to counts; None: missing."""
+        name, counts = self._manifest.name, list[int | None]()
+        if missing := [column for column in self.columns if column not in sample]:
+            raise InputError(f"{name} needs {', '.join(missing)} in every sample.")
         for signal in self._program.signals:
+            value = sample[signal.column]
             try:
-                value = sample[signal.column]
                 ratio = float("nan") if value is None else float(value) / float(signal.scale)
-            except KeyError:
-                missing = ", ".join(column for column in self.columns if column not in sample)
-                raise InputError(f"{name} needs {missing} in every sample.") from None
             except (TypeError, ValueError):
                 raise InputError(
                     f"{name}: {signal.column} of a sample is not a number. Give a number or None."
                 ) from None
-            count = round(ratio) if abs(ratio) < 2**31 else None
-            inside = count is not None and signal.min_count <= count <= signal.max_count
-            counts.append(count if inside else None)
-        return counts
+            counts.append(round(ratio) if abs(ratio) < 2**31 else None)
+        return tuple(counts)
 
     def _ago(self, source: int, ticks: int) -> int | None:
         ring = self._rings[source]
         return ring[(self._tick - ticks) % len(ring)]
 
-    def _slide(self, newest: int | None, source: int, ticks: int, limit: int) -> int:
-        """Update a window's sum and number of values to this tick; return the sum."""
+    def _slide(self, name: str, newest: int | None, source: int, ticks: int, limit: int) -> int:
+        """Return the sum of a window or its number of values; the sum updates both."""
         window = self._windows[source, ticks, limit]
+        if name == "values":
+            return window[1]
         oldest = self._ago(source, ticks) if ticks else None
         if oldest is not None:
             window[0] -= oldest
@@ -237,21 +227,17 @@ def _parse_car(manifest: Manifest, program: Program, values: Mapping[str, Any]) 
             f"{manifest.name} does not use {', '.join(unused)} of a car. It uses: "
             f"{', '.join(sorted(names)) or 'no properties'}."
         )
-    counts = {
-        name: count
-        for name, number in numbers.items()
-        if values.get(name) is not None
-        and (count := round_number(_fraction(values[name]), _fraction(str(number.grain))))
-        is not None
-    }
+    counts = {}
+    for name, number in numbers.items():
+        if values.get(name) is None:
+            continue
+        try:
+            value = Fraction(values[name])
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"{values[name]!r} is not a number. Give a number.") from None
+        if (count := round_number(value, Fraction(number.grain))) is not None:
+            counts[name] = count
     return Car({name: value for name, value in values.items() if name not in numbers}, counts)
-
-
-def _fraction(value: Any) -> Fraction:
-    try:
-        return Fraction(value)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{value!r} is not a number. Give a number.") from None
 
 
 def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
@@ -271,9 +257,6 @@ def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
 SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200
 
-Sample = tuple[int | None, ...]
-"""The counts of a tick in the order of the program's signals; None where missing."""
-
 
 @dataclass(frozen=True)
 class TestVector:
@@ -292,11 +275,6 @@ class TestVector:
     """Counts of the program's angle at each tick; None: no angle."""
     states: tuple[tuple[int, ...], ...] = ()
     """Values of the steps `state` after each tick, if there are any."""
-
-    @property
-    def written(self) -> set[str]:
-        """Names of the attributes that the JSON document contains."""
-        return {name for name in vars(self) if name != "car" and (name != "states" or self.states)}
 
 
 def make_checks(
