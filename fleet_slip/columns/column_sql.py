@@ -13,15 +13,11 @@ from fleet_slip.catalog.definitions import MAX_ATTRIBUTE, Definition, rows_behin
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.lowering import (
     GIVEN,
-    OPERATIONS,
     POWERS,
     Lowering,
     Range,
     Step,
     VehicleAttribute,
-    operands_of,
-    operation_of,
-    plain_of,
     size_of,
 )
 from fleet_slip.errors import DataError, QuestionError
@@ -81,20 +77,10 @@ def attribute_sql(attribute: VehicleAttribute) -> str:
     return f"CASE WHEN {is_it} THEN 1 WHEN {attribute.name} IS NOT NULL THEN 0 END"
 
 
-def sql_of(
-    operation: str, operands: list[str], *plain: int, divides_by: int, table: Mapping[str, str]
-) -> str:
-    """Return an operation in SQL; `divides_by` is the smallest possible divisor."""
-    frame = f"RANGE BETWEEN {plain[0] - 1} PRECEDING AND CURRENT ROW" if plain and plain[0] else ""
-    text = table[operation].format(
-        *operands,
-        *plain,
-        drive="PARTITION BY drive_id ORDER BY tick",
-        frame=frame or "RANGE BETWEEN UNBOUNDED PRECEDING AND CURRENT ROW",
-    )
-    if operation in DIVIDES and divides_by <= 0:
-        return f"(CASE WHEN {operands[1]} > 0 THEN {text} END)"
-    return text
+def _frame(ticks: int = 0) -> str:
+    """Return the frame of a window of so many ticks; of 0 ticks, of all since the start."""
+    begin = f"{ticks - 1}" if ticks else "UNBOUNDED"
+    return f"RANGE BETWEEN {begin} PRECEDING AND CURRENT ROW"
 
 
 INLINE = ("+", "-", "*", "negative")
@@ -116,7 +102,7 @@ class SqlLayers:
     ) -> None:
         self._steps, self._ranges, self._table, self._input_sql = steps, ranges, table, input_sql
         self.layers: defaultdict[int, list[str]] = defaultdict(list)
-        self._uses = Counter(operand for step in steps for operand in operands_of(step))
+        self._uses = Counter(operand for step in steps for operand in step.operands)
         self._texts: dict[int, tuple[str, int]] = {}
 
     def text(self, number: int) -> tuple[str, int]:
@@ -134,22 +120,20 @@ class SqlLayers:
 
     def _written(self, number: int) -> tuple[str, int]:
         step = self._steps[number]
-        name, plain = operation_of(step), plain_of(step)
-        if name == "constant":
-            return sql_constant(plain[0]), 0
-        if name in GIVEN:
-            return self._input_sql(name, plain[0]), 0
-        operation = OPERATIONS[name]
-        operands = plain[: operation.steps]
-        inline = name in INLINE
-        parts = [self.text(i) if inline else self.column(i) for i in operands]
-        text = sql_of(
-            name,
-            [part for part, _ in parts],
-            *plain[operation.steps :],
-            divides_by=self._ranges[operands[-1]][0],
-            table=self._table,
+        if step.name == "constant":
+            return sql_constant(step.plain[0]), 0
+        if step.name in GIVEN:
+            return self._input_sql(step.name, step.plain[0]), 0
+        inline = step.name in INLINE
+        parts = [self.text(i) if inline else self.column(i) for i in step.operands]
+        text = self._table[step.name].format(
+            *(part for part, _ in parts),
+            *step.plain,
+            drive="PARTITION BY drive_id ORDER BY tick",
+            frame=_frame(*step.plain[:1]),
         )
+        if step.name in DIVIDES and self._ranges[step.operands[1]][0] <= 0:
+            text = f"(CASE WHEN {parts[1][0]} > 0 THEN {text} END)"
         layer = max(layer for _, layer in parts)
         if inline and self._uses[number] == 1:
             return text, layer
@@ -255,10 +239,10 @@ def _clips(steps: tuple[Step, ...], end: int, ends: Iterable[int]) -> set[int]:
     """Return the clipping steps between `ends` and a step."""
     clips, waiting = set[int](), [end]
     while waiting:
-        step = waiting.pop()
-        if step not in ends:
-            clips |= {step} if steps[step][0] == "clip" else set()
-            waiting += operands_of(steps[step])
+        number = waiting.pop()
+        if number not in ends:
+            clips |= {number} if steps[number].name == "clip" else set()
+            waiting += steps[number].operands
     return clips
 
 
@@ -303,8 +287,8 @@ def with_columns(
             kind = "SMALLINT" if size <= COUNT_MAX else "INTEGER"
             columns.append(f"{layers.column(place)[0]}::{kind} AS {name}")
     for place, times in counted.times.items():
-        value, limit = plain_of(counted.steps[place])
-        largest = plain_of(counted.steps[limit])[0]
+        value, limit = counted.steps[place].operands
+        largest = counted.steps[limit].plain[0]
         if size_of(counted.ranges[value]) > largest:
             outside = f"coalesce(abs({layers.column(value)[0]}) > {largest}, false)::INTEGER"
             clips.append(f"{times} * {outside}" if times > 1 else outside)

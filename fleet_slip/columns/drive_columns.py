@@ -25,9 +25,6 @@ from fleet_slip.columns.lowering import (
     POWERS,
     largest_in,
     most_products,
-    operands_of,
-    operation_of,
-    plain_of,
     size_of,
 )
 from fleet_slip.columns.recursion import Recursion, run_recursion
@@ -258,12 +255,12 @@ class ColumnProgram:
         steps, ranges = counted.steps, counted.ranges
         wide, of_sums = set[int](), set[int]()
         for number, step in enumerate(steps):
-            operands = operands_of(step)
-            if step[0] in _DIVISIONS and ranges[operands[1]][1] <= 0:
+            operands = step.operands
+            if step.name in _DIVISIONS and ranges[operands[1]][1] <= 0:
                 raise QuestionError("a feature divides by a number that is not positive.")
-            if OPERATIONS[operation_of(step)].over_time:
+            if OPERATIONS[step.name].over_time:
                 of_sums.add(number)  # a drive with so many rows is refused
-            elif step[0] in _ARITHMETIC:
+            elif step.name in _ARITHMETIC:
                 if not of_sums.isdisjoint(operands):
                     of_sums.add(number)
                 elif largest_in(step, number, ranges) >= _EXACT:
@@ -272,9 +269,7 @@ class ColumnProgram:
         outside = [number for number in range(len(steps)) if number not in recursion.members]
         before = tuple(number for number in outside if number not in recursion.dependent)
         after = tuple(number for number in outside if number in recursion.dependent)
-        last_reader = {
-            i: number for number in (*before, *after) for i in operands_of(steps[number])
-        }
+        last_reader = {i: number for number in (*before, *after) for i in steps[number].operands}
         unused_after: dict[int, list[int]] = {}
         for number in last_reader.keys() - {*counted.places.values(), *recursion.inputs}:
             unused_after.setdefault(last_reader[number], []).append(number)
@@ -424,20 +419,19 @@ class _Evaluation:
 
     def _value(self, number: int) -> Vector:
         step = self._counted.steps[number]
-        name, plain = operation_of(step), plain_of(step)
+        name = step.name
         if name in _READERS:
-            return _READERS[name](self, *plain)
+            return _READERS[name](self, *step.operands, *step.plain)
         if name == "clip":
-            return self._clip(number, *plain)
-        count = OPERATIONS[name].steps
-        operands = [self._values[i] for i in plain[:count]]
+            return self._clip(number, *step.operands)
+        operands = [self._values[i] for i in step.operands]
         is_wide = any(isinstance(operand, Wide) for operand in operands)
         if number in self._program.wide or (is_wide and name in (*_INTEGERS, "at_least", "where")):
             return self._wide(number, name, [_widen(operand) for operand in operands])
         operands = [_narrow(operand) for operand in operands]
-        if name in _DIVISIONS and self._counted.ranges[plain[1]][0] <= 0:
+        if name in _DIVISIONS and self._counted.ranges[step.operands[1]][0] <= 0:
             operands[1] = np.where(operands[1] > 0, operands[1], nan)
-        return _VECTORS[name](*operands, *plain[count:])
+        return _VECTORS[name](*operands, *step.plain)
 
     def _wide(self, number: int, name: str, operands: list[Wide]) -> Vector:
         values = [operand.values for operand in operands]

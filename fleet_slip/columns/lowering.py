@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import reduce
 from itertools import combinations_with_replacement
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 from fleet_slip.catalog.arithmetic import nearest, parse, truncated
 from fleet_slip.catalog.definitions import (
@@ -34,8 +34,16 @@ from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.columns.observer import ObserverLowering, lower_blend
 from fleet_slip.errors import QuestionError
 
-Step = tuple[str | int, ...]
 Range = tuple[int, int]
+
+
+class Step(NamedTuple):
+    """The name of an operation, the numbers of the steps that are its operands, plain numbers."""
+
+    name: str
+    operands: tuple[int, ...] = ()
+    plain: tuple[int, ...] = ()
+
 
 Missing = Literal["never", "given", "operands", "divisor", "less", "both"]
 """When a step is missing: never; with its input or past value; with an operand; also for a divisor
@@ -128,33 +136,16 @@ OPERATIONS: Mapping[str, Operation] = {
 GIVEN = ("signal", "fact", "number")
 
 
-def operation_of(step: Step) -> str:
-    """Return the name of a step's operation."""
-    return str(step[0])
-
-
-def plain_of(step: Step) -> tuple[int, ...]:
-    """Return the operands of a step: numbers of steps, then plain numbers."""
-    return tuple(int(operand) for operand in step[1:])
-
-
-def operands_of(step: Step) -> tuple[int, ...]:
-    """Return the numbers of the steps that are operands of a step."""
-    return plain_of(step)[: OPERATIONS[operation_of(step)].steps]
-
-
 def ranges_of(steps: Sequence[Step], inputs: Mapping[str, Sequence[Range]]) -> list[Range]:
     """Return the range of each step, zero included in what is `inputs`, as for missing values."""
     ranges: list[Range] = []
     for step in steps:
-        name, plain = operation_of(step), plain_of(step)
-        operation = OPERATIONS[name]
-        if name in GIVEN:
-            least, largest = inputs[name][plain[0]]
+        if step.name in GIVEN:
+            least, largest = inputs[step.name][step.plain[0]]
             ranges.append((min(least, 0), max(largest, 0)))
         else:
-            operands = [ranges[i] for i in plain[: operation.steps]]
-            ranges.append(operation.range_of(*operands, *plain[operation.steps :]))
+            operands = [ranges[i] for i in step.operands]
+            ranges.append(OPERATIONS[step.name].range_of(*operands, *step.plain))
     return ranges
 
 
@@ -162,9 +153,9 @@ def roots_of(steps: Sequence[Step], ranges: Sequence[Range]) -> list[tuple[int, 
     """Return, for each step, the steps whose presence determines its presence."""
     result: list[tuple[int, ...]] = []
     for number, step in enumerate(steps):
-        missing, operands = OPERATIONS[operation_of(step)].missing, operands_of(step)
+        missing, operands = OPERATIONS[step.name].missing, step.operands
         roots = [root for i in operands for root in result[i]]
-        if step[0] == "where":  # a value of now is one of its window's, so that it has values
+        if step.name == "where":  # a value of now is one of its window's, so that it has values
             roots = [
                 root for root in roots if root not in _mean_of(steps, operands[0], operands[1])
             ]
@@ -184,12 +175,12 @@ def _mean_of(steps: Sequence[Step], mean: int, now: int) -> set[int]:
     while inner:
         number = inner.pop()
         step = steps[number]
-        if step[0] in ("clip", "where"):
-            inner.append(operands_of(step)[0])
-        elif step[0] == "nearest":
-            divisor = steps[operands_of(step)[1]]
-            counts = [divisor, *(steps[i] for i in operands_of(divisor) if divisor[0] == "*")]
-            if any(count[:2] == ("values", now) for count in counts):
+        if step.name in ("clip", "where"):
+            inner.append(step.operands[0])
+        elif step.name == "nearest":
+            divisor = steps[step.operands[1]]
+            counts = [divisor, *(steps[i] for i in divisor.operands if divisor.name == "*")]
+            if any(count[:2] == ("values", (now,)) for count in counts):
                 quotients.add(number)
     return quotients
 
@@ -198,8 +189,8 @@ def rings_of(steps: Sequence[Step]) -> dict[int, int]:
     """Return the steps whose past values are used, with the number of ticks; 0 for all."""
     rings: dict[int, int] = {}
     for step in steps:
-        if OPERATIONS[operation_of(step)].over_time:
-            source, ticks, *_ = plain_of(step)
+        if OPERATIONS[step.name].over_time:
+            (source,), ticks = step.operands, step.plain[0]
             rings[source] = max(rings.get(source, 0), ticks)
     return rings
 
@@ -211,11 +202,11 @@ def size_of(interval: Range) -> int:
 
 def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
     """Return the largest absolute value of a step, including intermediate values of rounding."""
-    if step[0] == "nearest":
-        a, b = (size_of(ranges[i]) for i in operands_of(step))
-        return 2 * a + b
-    if step[0] == "shift":
-        return size_of(ranges[plain_of(step)[0]]) + (1 << (plain_of(step)[1] - 1))
+    sizes = [size_of(ranges[i]) for i in step.operands]
+    if step.name == "nearest":
+        return 2 * sizes[0] + sizes[1]
+    if step.name == "shift":
+        return sizes[0] + (1 << (step.plain[0] - 1))
     return size_of(ranges[number])
 
 
@@ -300,7 +291,9 @@ class Lowering:
 
     def do(self, operation: str, *operands: int) -> int:
         """Add a step; return its number."""
-        return self.steps.setdefault((operation, *operands), len(self.steps))
+        count = OPERATIONS[operation].steps
+        step = Step(operation, operands[:count], operands[count:])
+        return self.steps.setdefault(step, len(self.steps))
 
     def constant(self, value: int) -> int:
         """Return the number of a constant step."""

@@ -238,7 +238,7 @@ class ObserverLowering:
 
     def _state(self, limit: float, bits: int = STATE) -> Number:
         """Return a number of the tick before, within ±limit; 0 at the start of a drive."""
-        slot = sum(1 for step in self.low.steps if step[0] == "state")
+        slot = sum(1 for step in self.low.steps if step.name == "state")
         bound = round(limit * 2**bits)
         return Number(self.low, self.low.do("state", slot, bound), bits)
 

@@ -1,6 +1,6 @@
 """Steps that depend on the tick before, run row by row in int64: an interpreter for the kernel."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_slip.columns.lowering import Step, operands_of, operation_of, plain_of
+from fleet_slip.columns.lowering import Step
 from fleet_slip.compiling import kernel
 
 NAMES = (
@@ -46,33 +46,34 @@ class Recursion:
         """Find the steps that depend on a state, and that a next state depends on."""
         after, before = set[int](), set[int]()
         for number, step in enumerate(steps):
-            if step[0] == "state" or any(operand in after for operand in operands_of(step)):
+            if step.name == "state" or not after.isdisjoint(step.operands):
                 after.add(number)
         for number in range(len(steps) - 1, -1, -1):
-            if number in before or steps[number][0] == "next":
-                before |= {number, *operands_of(steps[number])}
+            if number in before or steps[number].name == "next":
+                before |= {number, *steps[number].operands}
         return cls(steps, tuple(sorted(after & before)), frozenset(after))
 
     @cached_property
     def inputs(self) -> tuple[int, ...]:
         """Numbers of the steps that members read, constants excepted."""
-        operands = [i for number in self.members for i in operands_of(self.steps[number])]
+        read = self._read_by(self.members)
         inner = set(self.members)
-        read = dict.fromkeys(i for i in operands if i not in inner)
-        return tuple(i for i in read if self.steps[i][0] != "constant")
+        return tuple(i for i in read if i not in inner and self.steps[i].name != "constant")
+
+    def _read_by(self, numbers: Iterable[int]) -> dict[int, None]:
+        """Return the operands of some steps, each once."""
+        return dict.fromkeys(i for number in numbers for i in self.steps[number].operands)
 
     @cached_property
     def outputs(self) -> tuple[int, ...]:
         """Numbers of the members that other steps read."""
-        readers = self.dependent.difference(self.members)
-        read = dict.fromkeys(i for number in readers for i in operands_of(self.steps[number]))
+        read = self._read_by(self.dependent.difference(self.members))
         return tuple(i for i in self.members if i in read)
 
     @cached_property
     def places(self) -> dict[int, int]:
         """Place of each step in the memory of the interpreter: inputs, constants, members."""
-        operands = [i for number in self.members for i in operands_of(self.steps[number])]
-        constants = [i for i in operands if self.steps[i][0] == "constant"]
+        constants = [i for i in self._read_by(self.members) if self.steps[i].name == "constant"]
         order = dict.fromkeys((*self.inputs, *constants, *self.members))
         return {number: place for place, number in enumerate(order)}
 
@@ -81,21 +82,20 @@ class Recursion:
         """Operation, place of the result, and places of the operands or a number, by member."""
         rows = []
         for number in self.members:
-            name, plain = operation_of(self.steps[number]), plain_of(self.steps[number])
-            operands = [self.places[i] for i in operands_of(self.steps[number])]
-            plain_numbers = plain[len(operands) :] if name != "state" else (0, 0)
-            # An operation on one operand reads it twice.
-            reads = [*operands, *plain_numbers, *operands][:2]
-            rows.append([NAMES.index(name), self.places[number], *reads])
+            step = self.steps[number]
+            operands = [self.places[i] for i in step.operands]
+            # An operation on one operand reads it twice; a state reads nothing.
+            reads = [*operands, *step.plain, *operands][:2] if operands else [0, 0]
+            rows.append([NAMES.index(step.name), self.places[number], *reads])
         return np.array(rows, dtype=np.int64).reshape(-1, 4)
 
     def memory(self) -> NDArray[np.int64]:
         """Return values and presence of all places at the start of a drive, shape (2, places)."""
         memory = np.zeros((2, len(self.places)), dtype=np.int64)
         for number, place in self.places.items():
-            if self.steps[number][0] == "constant":
-                memory[:, place] = plain_of(self.steps[number])[0], 1
-            elif self.steps[number][0] == "state":
+            if self.steps[number].name == "constant":
+                memory[:, place] = self.steps[number].plain[0], 1
+            elif self.steps[number].name == "state":
                 memory[1, place] = 1
         return memory
 

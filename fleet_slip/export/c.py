@@ -66,8 +66,9 @@ class StepWriter:
     def value(self, step: int) -> str:
         """Return the value of a step in C; its statements are written first."""
         if step not in self._values:
-            name, plain = self.program.operation(step)
-            self._values[step] = _WRITERS.get(name, StepWriter._arithmetic)(self, step, *plain)
+            name, operands, plain = self.program.steps[step]
+            write = _WRITERS.get(name, StepWriter._arithmetic)
+            self._values[step] = write(self, step, *operands, *plain)
         return self._values[step]
 
     def is_present(self, *steps: int) -> str:
@@ -77,7 +78,7 @@ class StepWriter:
 
     def word(self, step: int) -> str:
         """Return a step as a state word: `MISSING` if it is missing."""
-        if self.program.operation(step)[0] in _INPUTS:
+        if self.program.steps[step].name in _INPUTS:
             return self._input_word(step)
         value = self.value(step)
         return f"(({self.is_present(step)}) ? {value} : MISSING)"
@@ -89,16 +90,20 @@ class StepWriter:
     def _is_root_present(self, root: int) -> str:
         """Return the bool that is false where a step is missing by itself."""
         if root not in self._presence:
-            name = self.program.operation(root)[0]
-            is_input = name in _INPUTS
-            present = (
-                f"({self._input_word(root)} != MISSING)" if is_input else _PRESENT[name](self, root)
-            )
+            name, operands, _ = self.program.steps[root]
+            if name in _INPUTS:
+                present = f"({self._input_word(root)} != MISSING)"
+            elif name == "else":
+                present = " || ".join(f"({self.is_present(operand)})" for operand in operands)
+            elif name == "at_least":
+                present = f"({self.value(operands[0])} >= {self.value(operands[1])})"
+            else:
+                present = f"({self.value(operands[1])} > 0)"
             self._presence[root] = self._declare("bool", "has", root, present)
         return self._presence[root]
 
     def _arithmetic(self, step: int, *operands: int) -> str:
-        name = self.program.operation(step)[0]
+        name = self.program.steps[step].name
         values = [self.value(operand) for operand in operands]
         if name == "*" and "1" in values:
             return values[values[0] == "1"]
@@ -109,16 +114,11 @@ class StepWriter:
         if name in "+-*" and self.size(step) > MAX_32 >= max(map(self.size, operands)):
             values[0] = f"(int64_t){values[0]}"
         text = _OPERATIONS[name].format(*values)
-        narrows = name in ("min_64", "max_64") and self.size(step) <= MAX_32
-        return self._set(step, f"(int32_t){text}" if narrows else text)
+        return self._set(step, text, wide=name in ("min_64", "max_64"))
 
     def _shift(self, step: int, source: int, bits: int) -> str:
         self.counts["shift"] += 1
-        call = f"shifted({self.value(source)}, {bits}U)"
-        return self._set(step, f"(int32_t){call}" if self._narrows(step, wide=True) else call)
-
-    def _state(self, step: int, *_: int) -> str:
-        return self._set(step, f"state->state_{step}")
+        return self._set(step, f"shifted({self.value(source)}, {bits}U)", wide=True)
 
     def _clip(self, step: int, source: int, bound: int) -> str:
         value, limit = self.value(source), self.size(bound)
@@ -136,7 +136,9 @@ class StepWriter:
         wide = max(self.size(a), self.size(b)) > MAX_32
         quotient = f"{self.value(a)} / {self._divisor(step, b)}"
         self.counts["//64" if wide else "//"] += 1
-        return self._set(step, f"(int32_t)({quotient})" if self._narrows(step, wide) else quotient)
+        if wide and self.size(step) <= MAX_32:
+            quotient = f"({quotient})"
+        return self._set(step, quotient, wide=wide)
 
     def _nearest(self, step: int, a: int, b: int) -> str:
         value = self.value(a)
@@ -146,8 +148,7 @@ class StepWriter:
         self.counts["nearest_64" if wide else "nearest_32"] += 1
         if not wide:
             divisor = f"{divisor}U" if divisor.isdigit() else f"(uint32_t){divisor}"
-        call = f"nearest_{64 if wide else 32}({value}, {divisor})"
-        return self._set(step, f"(int32_t){call}" if self._narrows(step, wide) else call)
+        return self._set(step, f"nearest_{64 if wide else 32}({value}, {divisor})", wide=wide)
 
     def _divisor(self, step: int, source: int) -> str:
         """Return a divisor; 1 where the quotient is missing."""
@@ -159,15 +160,13 @@ class StepWriter:
     def _input(self, step: int, *_: int) -> str:
         return self._set(step, f"{self._is_root_present(step)} ? {self._input_word(step)} : 0")
 
-    def _narrows(self, step: int, wide: bool) -> bool:
-        return wide and self.size(step) <= MAX_32
-
     def _input_word(self, step: int) -> str:
         """Return an input, or a value of an earlier tick, as a word that can be `MISSING`."""
         if step not in self._words:
-            name, plain = self.program.operation(step)
+            name, operands, plain = self.program.steps[step]
             self.counts["within"] += name == "signal"
-            word = self._ago(*plain) if name == "ago" else self._inputs[name][plain[0]]
+            is_past = name == "ago"
+            word = self._ago(*operands, *plain) if is_past else self._inputs[name][plain[0]]
             self._words[step] = self._declare("int32_t", "in", step, word)
         return self._words[step]
 
@@ -190,10 +189,13 @@ class StepWriter:
             else:
                 self.counts["gather"] += 1
                 self.lines.append(f"gather({both}, {limit}U, {newest});")
-        counts = self.program.operation(step)[0] == "values"
+        counts = self.program.steps[step].name == "values"
         return f"(int32_t)state->values_{key}" if counts else f"state->sum_{key}"
 
-    def _set(self, step: int, value: str) -> str:
+    def _set(self, step: int, value: str, *, wide: bool = False) -> str:
+        """Declare the value of a step, narrowed from a `wide` one of 64 bits if possible."""
+        if wide and self.size(step) <= MAX_32:
+            value = f"(int32_t){value}"
         return self._declare(integer_type(self.size(step)), "s", step, value)
 
     def _declare(self, kind: str, name: str, step: int, value: str) -> str:
@@ -215,7 +217,7 @@ _WRITERS: Mapping[str, Callable[..., str]] = {
     "sum": StepWriter._sum,
     "values": StepWriter._sum,
     "shift": StepWriter._shift,
-    "state": StepWriter._state,
+    "state": lambda writer, step, *_: writer._set(step, f"state->state_{step}"),
 }
 """Writers of the operations that are not in `_OPERATIONS`."""
 
@@ -233,30 +235,6 @@ _OPERATIONS = {
     "sign": "sign({0})",
 }
 """Operations of C, as texts of their operands."""
-
-
-def _positive(writer: StepWriter, step: int) -> str:
-    _, divisor = writer.program.operation(step)[1]
-    return f"({writer.value(divisor)} > 0)"
-
-
-def _enough(writer: StepWriter, step: int) -> str:
-    a, b = writer.program.operation(step)[1]
-    return f"({writer.value(a)} >= {writer.value(b)})"
-
-
-def _either(writer: StepWriter, step: int) -> str:
-    a, b = writer.program.operation(step)[1]
-    return f"({writer.is_present(a)}) || ({writer.is_present(b)})"
-
-
-_PRESENT: Mapping[str, Callable[[StepWriter, int], str]] = {
-    "//": _positive,
-    "nearest": _positive,
-    "at_least": _enough,
-    "else": _either,
-}
-"""Conditions that a step is not missing by itself, by operation."""
 
 
 def sum_key(source: int, ticks: int, limit: int) -> str:
@@ -334,39 +312,29 @@ _HELPER = re.compile(r"^//: (\w+)\n", re.MULTILINE)
 
 def c_header(version: ModelVersion, program: Program) -> str:
     """Return the header: inputs, state, and functions."""
-    return fill_in_version(
-        "templates/estimator.h",
-        version,
-        program,
-        scale_names=_scale_names(c_prefix(version).upper(), program),
-        state=state_fields(program),
-        outside=_outside(program),
-    )
-
-
-def _scale_names(upper: str, program: Program) -> Sequence[str]:
-    """Return the macros of the signals' scales, which the source does not use.
-
-    Their first 31 characters differ (MISRA C:2012, rule 5.4).
-    """
-    names = [f"{upper}_{signal.name.upper()}_SCALE" for signal in program.signals]
-    is_cut = len({name[:MAX_NAME_CHARACTERS] for name in names}) < len(names)
-    return distinct(names, MAX_NAME_CHARACTERS) if is_cut else names
-
-
-def _outside(program: Program) -> Mapping[str, str]:
-    """Return the conditions that fields of a sample are outside their ranges, if possible.
-
-    Comparisons that are always true for 16 bits are left out: compilers warn of them.
-    """
-    conditions = {}
+    upper = c_prefix(version).upper()
+    # The source does not use these macros. Their first 31 characters differ (MISRA C:2012, 5.4).
+    scale_names: Sequence[str] = [
+        f"{upper}_{signal.name.upper()}_SCALE" for signal in program.signals
+    ]
+    if len({name[:MAX_NAME_CHARACTERS] for name in scale_names}) < len(scale_names):
+        scale_names = distinct(scale_names, MAX_NAME_CHARACTERS)
+    outside = {}
     for field, signal in zip(field_names(program)["signals"], program.signals, strict=True):
+        # Compilers warn of comparisons that are always true for 16 bits.
         low, high = signal.min_count, signal.max_count
         tests = [f"(sample->{field} < {low})"] if low > -(2**15) + 1 else []
         tests += [f"(sample->{field} > {high})"] if high < 2**15 - 1 else []
         if tests:
-            conditions[field] = " || ".join(tests)
-    return conditions
+            outside[field] = " || ".join(tests)
+    return fill_in_version(
+        "templates/estimator.h",
+        version,
+        program,
+        scale_names=scale_names,
+        state=state_fields(program),
+        outside=outside,
+    )
 
 
 def c_source(version: ModelVersion, program: Program) -> str:

@@ -118,7 +118,7 @@ def program_content(program: Program) -> dict[str, Any]:
             {"name": number.name, "unit": number.unit, "grain": f"{number.grain:f}"}
             for number in program.numbers
         ],
-        "steps": [list(step) for step in program.steps],
+        "steps": [[step.name, *step.operands, *step.plain] for step in program.steps],
         "angle": {
             "name": angle.name,
             "column": angle.column,

@@ -22,7 +22,6 @@ from onnx import TensorProto, helper, numpy_helper
 from fleet_slip.columns.lowering import (
     GIVEN,
     POWERS,
-    operands_of,
     size_of,
 )
 from fleet_slip.export.program import Program
@@ -186,16 +185,15 @@ class _Writer(Nodes):
 
     def _is_constant(self, step: int) -> bool:
         """Return True if a step has the same value at all ticks at which it is not missing."""
-        name = self.program.operation(step)[0]
-        operands = operands_of(self.program.steps[step])
+        name, operands, _ = self.program.steps[step]
         values = operands[:1] if name in ("where", "at_least") else operands
         return name == "constant" or (bool(operands) and all(map(self._is_constant, values)))
 
     def _value(self, step: int) -> str:
         """Return the value of a step; any value of its range where it is missing."""
         if step not in self._values:
-            name, plain = self.program.operation(step)
-            self._values[step] = self._computed(step, name, plain)
+            name, operands, plain = self.program.steps[step]
+            self._values[step] = self._computed(step, name, (*operands, *plain))
         return self._values[step]
 
     def _is_present(self, *steps: int) -> str:
@@ -210,15 +208,13 @@ class _Writer(Nodes):
     def _is_root_present(self, step: int) -> str:
         """Return the node that is false where a step is missing by itself."""
         if step not in self._present:
-            name, plain = self.program.operation(step)
+            name, operands, _ = self.program.steps[step]
             if name in ("//", "nearest"):
-                self._present[step] = self.do("Greater", self._value(plain[1]), 0)
+                self._present[step] = self.do("Greater", self._value(operands[1]), 0)
             elif name == "at_least":
-                values = [self._value(operand) for operand in plain]
-                self._present[step] = self.do("GreaterOrEqual", *values)
+                self._present[step] = self.do("GreaterOrEqual", *map(self._value, operands))
             elif name == "else":
-                conditions = [self._is_present(operand) for operand in plain]
-                self._present[step] = self.do("Or", *conditions)
+                self._present[step] = self.do("Or", *map(self._is_present, operands))
             else:
                 self._value(step)
         return self._present[step]
@@ -228,9 +224,9 @@ class _Writer(Nodes):
     ) -> str:
         if name in ("constant", "where", "at_least"):
             return self.constant(plain[0]) if name == "constant" else self._value(plain[0])
-        if name in ("state", "shift"):
-            if name == "state":
-                return self.declare(f"state_{step}", 1)
+        if name == "state":
+            return self.declare(f"state_{step}", 1)
+        if name == "shift":
             return self.nearest(self._value(plain[0]), self.constant(1 << plain[1]))
         if name in GIVEN:
             return self._input(step, name, plain[0])
@@ -317,10 +313,6 @@ class _Writer(Nodes):
         self.outputs.insert(0, helper.make_tensor_value_info("angle", self.kind, ["cars", 1]))
 
 
-def _sign(graph: Nodes, a: str) -> str:
-    return graph.signed(a, graph.do("Min", graph.do("Abs", a), 1))
-
-
 def _power(graph: Nodes, a: str, b: str) -> str:
     """Return 1 plus the sum of all powers of two p with b · p < a: the least p with a ≤ b · p."""
     powers = graph.constant([[1 << bit for bit in range(POWERS)]])
@@ -342,7 +334,7 @@ _OPERATIONS: Mapping[str, Callable[..., str]] = {
     "power": _power,
     "negative": _node("Neg"),
     "abs": _node("Abs"),
-    "sign": _sign,
+    "sign": lambda graph, a: graph.signed(a, graph.do("Min", graph.do("Abs", a), 1)),
     "//": lambda graph, a, b: graph.signed(a, graph.do("Div", graph.do("Abs", a), b)),
     "nearest": lambda graph, a, b: graph.nearest(a, b),
     "clip": lambda graph, a, b: graph.do("Max", graph.do("Min", a, b), graph.do("Neg", b)),

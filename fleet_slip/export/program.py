@@ -24,9 +24,6 @@ from fleet_slip.columns.lowering import (
     Step,
     VehicleAttribute,
     given_ranges,
-    operands_of,
-    operation_of,
-    plain_of,
     ranges_of,
     rings_of,
     roots_of,
@@ -194,10 +191,6 @@ class Steps:
     numbers: tuple[ParameterCount, ...]
     steps: tuple[Step, ...]
 
-    def operation(self, step: int) -> tuple[str, tuple[int, ...]]:
-        """Return the operation of a step and its arguments."""
-        return operation_of(self.steps[step]), plain_of(self.steps[step])
-
     @cached_property
     def input_ranges(self) -> dict[str, list[Range]]:
         """Valid ranges of signals, facts and numbers: values outside are missing."""
@@ -222,21 +215,22 @@ class Steps:
     @cached_property
     def states(self) -> dict[int, int]:
         """Steps that hold a number of the tick before, with the step of their next value."""
-        return {plain_of(s)[1]: plain_of(s)[0] for s in self.steps if s[0] == "next"}
+        return {s.operands[1]: s.operands[0] for s in self.steps if s.name == "next"}
 
     @property
     def sums(self) -> list[tuple[int, ...]]:
         """Sums over time: the step, its ticks, and the maximum number of values."""
-        return list(dict.fromkeys(plain_of(s) for s in self.steps if s[0] in ("sum", "values")))
+        windows = [s for s in self.steps if s.name in ("sum", "values")]
+        return list(dict.fromkeys((*s.operands, *s.plain) for s in windows))
 
     @cached_property
     def learned(self) -> list[tuple[int, ...]]:
         """Sums that slopes are computed from, which can be retained for the next drive."""
-        solved = [step for step in self.steps if step[0] == "nearest"]
-        totals = [a for _, a, b in solved if self.steps[int(b)][0] == "power"]
-        places = [place for a in totals for place in (a, *operands_of(self.steps[int(a)]))]
-        operands = [self.steps[int(place)] for place in places]
-        return list(dict.fromkeys(plain_of(step) for step in operands if step[0] == "sum"))
+        solved = [step.operands for step in self.steps if step.name == "nearest"]
+        totals = [a for a, b in solved if self.steps[b].name == "power"]
+        places = [place for a in totals for place in (a, *self.steps[a].operands)]
+        sums = [self.steps[place] for place in places if self.steps[place].name == "sum"]
+        return list(dict.fromkeys((*step.operands, *step.plain) for step in sums))
 
     @property
     def longest_ticks(self) -> int:

@@ -17,7 +17,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import round_number
 from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
 from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
-from fleet_slip.columns.lowering import operands_of, operation_of, plain_of, power
+from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
 from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
 from fleet_slip.grams.compute import counts_of
@@ -80,10 +80,6 @@ class Estimator:
             "number": properties.number_counts(program),
         }
         self.columns = tuple(signal.column for signal in program.signals)
-        self._steps: list[tuple[str, tuple[int, ...], tuple[int, ...]]] = []
-        for step in program.steps:
-            operands = operands_of(step)
-            self._steps.append((operation_of(step), operands, plain_of(step)[len(operands) :]))
         scale_of = {signal.name: float(signal.scale) for signal in program.signals}
         self._terms = [
             (place, scale_of[t.signal] if t.logged else float(t.scale), t.coefficient)
@@ -126,7 +122,7 @@ class Estimator:
         """Advance by a tick with these counts of the signals; return the value of each step."""
         inputs = {**self._car, "signal": _valid(counts, self._program.signals)}
         now: list[int | None] = []
-        for name, operands, plain in self._steps:
+        for name, operands, plain in self._program.steps:
             values = [now[operand] for operand in operands]
             if name in _OPERATIONS:
                 now.append(None if None in values else _OPERATIONS[name](*values, *plain))

@@ -10,7 +10,7 @@ import pytest
 from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Observer
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, as_counts, compute_columns
-from fleet_slip.columns.lowering import Lowering, largest_in, plain_of, ranges_of
+from fleet_slip.columns.lowering import Lowering, largest_in, ranges_of
 from fleet_slip.columns.observer import ANGLE_RAD
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation import ekf
@@ -153,11 +153,11 @@ def test_no_number_overflows_in_any_car() -> None:
         ranges = ranges_of(steps, {"signal": limits})
         for number, step in enumerate(steps):
             assert largest_in(step, number, ranges) < 2**63
-            if step[0] == "nearest":
-                assert ranges[plain_of(step)[1]][0] > 0
-            if step[0] == "next":
-                value, state = plain_of(step)
-                limit = plain_of(steps[state])[1]
+            if step.name == "nearest":
+                assert ranges[step.operands[1]][0] > 0
+            if step.name == "next":
+                value, state = step.operands
+                limit = steps[state].plain[1]
                 assert -limit <= ranges[value][0] <= ranges[value][1] <= limit
 
 
