@@ -13,20 +13,11 @@ from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QueryGoesOnError, QuestionError
 from fleet_slip.storage.folder import Folder
 from fleet_slip.storage.runs import add_runs
+from fleet_slip.warehouse import table_views
 from fleet_slip.warehouse.database import database_errors, interruptible, one_query, reading_files
-from fleet_slip.warehouse.table_views import (
-    TABLE_VIEWS,
-    add_table,
-    describe_columns,
-    lock,
-    open_tables,
-    paths_of,
-    table_snapshots,
-    views_in,
-)
 from fleet_slip.warehouse.warehouse import Warehouse, open_warehouse
 
-VIEWS = frozenset({*TABLE_VIEWS, "runs", "models", "dictionary"})
+VIEWS = frozenset({*table_views.TABLE_VIEWS, "runs", "models", "dictionary"})
 
 _ABOUT_ALL_VIEWS = re.compile(
     r"duckdb_|information_schema|pragma_|pg_|sqlite_|\b(?:show|tables|databases|dictionary)\b", re.I
@@ -63,19 +54,23 @@ def open_views(
     """Return a connection as `connect` does; `unlocked`, it opens any file and takes settings."""
     warehouse.require()
     views = VIEWS if query is None else needed_views(query)
-    snapshots = table_snapshots(warehouse, views)
+    snapshots = table_views.table_snapshots(warehouse, views)
     drives = ALL_DRIVES if _SOURCE.search(query or "") else TRAINING_DRIVES
-    database = open_tables(warehouse, views, snapshots, threads=threads, drives=drives)
+    database = table_views.open_tables(warehouse, views, snapshots, threads=threads, drives=drives)
     if "runs" in views:
         add_runs(database, warehouse.root)
     if "models" in views:
         from fleet_slip.models.registry import Registry
 
-        add_table(database, "models", Registry.open(warehouse).as_table())
+        table_views.add_table(database, "models", Registry.open(warehouse).as_table())
     if "dictionary" in views:
-        add_table(database, "dictionary", describe_columns(database, warehouse.catalog.signals))
+        table_views.add_table(
+            database,
+            "dictionary",
+            table_views.describe_columns(database, warehouse.catalog.signals),
+        )
     if not unlocked:
-        lock(database, paths_of(snapshots, views))
+        table_views.lock(database, table_views.paths_of(snapshots, views))
     return database
 
 
@@ -86,7 +81,7 @@ def needed_views(query: str) -> frozenset[str]:
     """
     if _ABOUT_ALL_VIEWS.search(query):
         return VIEWS
-    views = views_in(query, VIEWS)
+    views = table_views.views_in(query, VIEWS)
     return VIEWS if not views and _READS_TABLE.search(query) else views
 
 

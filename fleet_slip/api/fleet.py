@@ -9,17 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from fleet_slip.api.calls import (
-    ShowProgress,
-    ShowStep,
-    Workers,
-    for_workers,
-    open_workers,
-    record_call,
-    remote_executor,
-    step_progress,
-    total_progress,
-)
+from fleet_slip.api import calls
 from fleet_slip.base import date_of, last_day
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.catalog.signals import TRAINING_DRIVES
@@ -177,7 +167,7 @@ class Fleet:
 
     # Logs and Gram rows. Completed work is never repeated.
 
-    @record_call
+    @calls.record_call
     def simulate(
         self,
         campaign: "str | Campaign",
@@ -185,8 +175,8 @@ class Fleet:
         days: int | None = None,
         through: date | str | None = None,
         engine: "Engine" = "kernel",
-        workers: Workers = None,
-        progress: ShowProgress | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "SimulationReport":
         """Simulate the drives of a campaign that are missing in the logs.
 
@@ -223,28 +213,28 @@ class Fleet:
         if isinstance(campaign, str):
             campaign = load_campaign(campaign, self.warehouse.configs)
         chosen_days = campaign.chosen_days(days, last_day(through, "through"))
-        with open_workers(self.root, workers) as executor, step("simulate") as figures:
+        with calls.open_workers(self.root, workers) as executor, step("simulate") as figures:
             report = simulate_campaign(
-                for_workers(self.warehouse, executor),
+                calls.for_workers(self.warehouse, executor),
                 campaign,
                 chosen_days,
                 executor,
-                total_progress(progress),
+                calls.total_progress(progress),
                 engine,
             )
             figures.rows, figures.size_bytes = report.rows, report.size_bytes
         return report
 
-    @record_call
+    @calls.record_call
     def ingest(
         self,
         files: Iterable[Path | str] | Path | str,
         mapping: "str | Mapping",
         *,
         replace: "Replace" = "no",
-        workers: Workers = None,
+        workers: calls.Workers = None,
         on_report: "Callable[[IngestReport], None] | None" = None,
-        progress: ShowProgress | None = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "list[IngestReport]":
         """Bring measured logs into the data root.
 
@@ -291,14 +281,14 @@ class Fleet:
         from fleet_slip.operations.rewriting import build_removal
 
         mapping, logs, from_folders = self._find_logs(files, mapping)
-        count = total_progress(progress)
+        count = calls.total_progress(progress)
         reports: list[IngestReport] = []
-        with open_workers(self.root, workers) as executor, step("ingest") as figures:
-            remote = remote_executor(executor)
+        with calls.open_workers(self.root, workers) as executor, step("ingest") as figures:
+            remote = calls.remote_executor(executor)
             if remote:  # workers have their own working directory
                 logs = [log.absolute() for log in logs]
             figures.rows = 0
-            warehouse = for_workers(self.warehouse, executor)
+            warehouse = calls.for_workers(self.warehouse, executor)
             uses_cache = from_folders or replace == "corrected"
             cache = IngestCache.load(self.warehouse, mapping) if uses_cache else None
             new_logs = logs if cache is None else cache.without_landed(logs, warehouse)
@@ -327,7 +317,7 @@ class Fleet:
         order = {str(log): number for number, log in enumerate(logs)}
         return sorted(reports, key=lambda report: order[report.file])
 
-    @record_call
+    @calls.record_call
     def import_onboard_grams(self, file: Path | str) -> "OnboardImport":
         """Bring in Gram rows that cars computed on board, in one commit.
 
@@ -373,14 +363,14 @@ class Fleet:
         mapping, logs, _ = self._find_logs(files, mapping)
         return preview_logs(logs, mapping)
 
-    @record_call
+    @calls.record_call
     def gram(
         self,
         features: str = PLAIN,
         *,
         cohort: str | None = None,
-        workers: Workers = None,
-        progress: ShowProgress | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "GramReport":
         """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
 
@@ -414,12 +404,12 @@ class Fleet:
         if cohort:
             predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
             files = cohort_files(self.warehouse, predicate)
-        with open_workers(self.root, workers) as executor, step("gram") as figures:
+        with calls.open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
-                for_workers(self.warehouse, executor),
-                total_progress(progress),
+                calls.for_workers(self.warehouse, executor),
+                calls.total_progress(progress),
                 features,
-                remote_executor(executor),
+                calls.remote_executor(executor),
                 files,
             )
             figures.rows = report.rows_read
@@ -427,7 +417,7 @@ class Fleet:
 
     # Pipelines.
 
-    @record_call
+    @calls.record_call
     def run(
         self,
         campaign: "str | Campaign" = "waterford",
@@ -436,8 +426,8 @@ class Fleet:
         through: date | str | None = None,
         name: str | None = None,
         models: str | None = None,
-        workers: Workers = None,
-        progress: ShowStep | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowStep | None = None,
     ) -> "RunReport":
         """Simulate a campaign, update Gram rows, select a model, publish it if it is not worse.
 
@@ -477,13 +467,13 @@ class Fleet:
         model_name = require_model_name(name or campaign.name)
         predicate = f"campaign = '{campaign.name}'"
         with self._exclusive("run", campaign.name):
-            with open_workers(self.root, workers) as executor:
+            with calls.open_workers(self.root, workers) as executor:
                 simulation = self.simulate(
                     campaign,
                     days=days,
                     through=through,
                     workers=executor,
-                    progress=step_progress(progress, f"simulate {campaign.name}"),
+                    progress=calls.step_progress(progress, f"simulate {campaign.name}"),
                 )
                 training = Training(model_name, predicate, models or DEFAULT_MODELS)
                 grams = training.gram(self, executor, progress)
@@ -498,15 +488,15 @@ class Fleet:
             seconds=round(time.monotonic() - start, 3),
         )
 
-    @record_call
+    @calls.record_call
     def learn(
         self,
         name: str,
         logs: Iterable[Path | str] | Path | str,
         mapping: "str | Mapping",
         *,
-        workers: Workers = None,
-        progress: ShowStep | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowStep | None = None,
     ) -> "LearnReport":
         """Train a model on measured logs: ingest, update Gram rows, select and publish.
 
@@ -544,7 +534,7 @@ class Fleet:
         training = Training.on_mapping(require_model_name(name), mapping)
         reports: list[IngestReport] = []
         failure = None
-        with self._exclusive("learn", name), open_workers(self.root, workers) as executor:
+        with self._exclusive("learn", name), calls.open_workers(self.root, workers) as executor:
             try:
                 self.ingest(
                     logs,
@@ -552,7 +542,7 @@ class Fleet:
                     replace="corrected",
                     workers=executor,
                     on_report=reports.append,
-                    progress=step_progress(progress, "ingest"),
+                    progress=calls.step_progress(progress, "ingest"),
                 )
             except InputError as error:
                 if not reports:
@@ -574,7 +564,7 @@ class Fleet:
             seconds=round(time.monotonic() - start, 3),
         )
 
-    @record_call
+    @calls.record_call
     def nightly(
         self,
         inbox: Path | str,
@@ -586,8 +576,8 @@ class Fleet:
         candidate: bool = False,
         retention: str | None = None,
         night: date | str | None = None,
-        workers: Workers = None,
-        progress: ShowStep | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowStep | None = None,
     ) -> "NightReport":
         """Run the nightly job of a fleet of real cars.
 

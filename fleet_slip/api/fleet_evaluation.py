@@ -5,12 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import (
-    ShowProgress,
-    open_workers,
-    record_call,
-    total_progress,
-)
+from fleet_slip.api import calls
 from fleet_slip.api.fleet_models import FleetModels
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import UsageError
@@ -95,7 +90,7 @@ class FleetEvaluation:
             measured_cohort=trained_cohort if overlap.measured else "",
         )
 
-    @record_call
+    @calls.record_call
     def evaluate(
         self,
         model: str | ModelVersion | None = None,
@@ -103,7 +98,7 @@ class FleetEvaluation:
         *,
         scenarios: Sequence[str] = (),
         threads: int | None = None,
-        progress: ShowProgress | None = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "Evaluation":
         """Evaluate models on simulated test drives: those of the paper, and others.
 
@@ -142,12 +137,12 @@ class FleetEvaluation:
         chosen = tuple(load_scenario(name, configs) for name in scenarios)
         chosen = chosen or load_scenarios(configs)
         first, *rivals = self._versions(model, challengers)
-        with open_workers(self.warehouse.root, threads) as executor:
-            simulate_scenarios(self.warehouse, chosen, executor, total_progress(progress))
+        with calls.open_workers(self.warehouse.root, threads) as executor:
+            simulate_scenarios(self.warehouse, chosen, executor, calls.total_progress(progress))
             content = evaluate_scenarios(self.warehouse, chosen, first, rivals, executor)
         return store_evaluation(evaluations_of(self.warehouse), content)
 
-    @record_call
+    @calls.record_call
     def evaluate_measured(
         self,
         model: str | ModelVersion | None = None,
@@ -194,7 +189,7 @@ class FleetEvaluation:
         screen = SensorScreen(cohort)
         if not include_faulty:
             screen = screen_computed_drives(self.warehouse, cohort)
-        with open_workers(self.warehouse.root, threads) as executor:
+        with calls.open_workers(self.warehouse.root, threads) as executor:
             content = evaluate_measured(self.warehouse, versions, screen.cohort, car, executor)
         content |= {"cohort": cohort, **({"examined": str(screen)} if str(screen) else {})}
         return store_evaluation(evaluations_of(self.warehouse, "measured"), content)
@@ -216,7 +211,7 @@ class FleetEvaluation:
         from fleet_slip.evaluation.scenario_evaluation import evaluate_blind
 
         first, *rivals = self._versions(model, challengers)
-        with open_workers(self.warehouse.root, threads) as executor:
+        with calls.open_workers(self.warehouse.root, threads) as executor:
             return Evaluation(evaluate_blind(self.warehouse, first, rivals, executor))
 
     def identify(
@@ -265,7 +260,7 @@ class FleetEvaluation:
         car = vehicle.model_copy(update={"name": name})
         rows = load_cohort(self.warehouse, cohort, PLAIN)
         chosen = TuningDrives.choose(self.warehouse, rows, with_mass=False)
-        with open_workers(self.warehouse.root, threads) as executor:
+        with calls.open_workers(self.warehouse.root, threads) as executor:
             return identify_held_out(car, chosen.drives, executor)
 
     def report(
@@ -291,7 +286,7 @@ class FleetEvaluation:
         folder = LocalFolder(output) if output else self.warehouse.root / "report"
         return write_report(self.warehouse, self._models.get(model), folder)
 
-    @record_call
+    @calls.record_call
     def watch(
         self,
         drive: str,

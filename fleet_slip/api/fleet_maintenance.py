@@ -5,17 +5,7 @@ from dataclasses import dataclass
 from datetime import date
 from typing import TYPE_CHECKING
 
-from fleet_slip.api.calls import (
-    ShowProgress,
-    ShowStep,
-    Workers,
-    for_workers,
-    open_workers,
-    progress_of_steps,
-    record_call,
-    remote_executor,
-    total_progress,
-)
+from fleet_slip.api import calls
 from fleet_slip.base import date_of, normalize_name, pluralize
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import QuestionError, RefusedError, UsageError
@@ -169,8 +159,8 @@ class FleetMaintenance:
         grams: bool = False,
         repair: bool = False,
         accept_loss: Sequence[str] = (),
-        workers: Workers = None,
-        progress: ShowStep | None = None,
+        workers: calls.Workers = None,
+        progress: calls.ShowStep | None = None,
     ) -> "Verification":
         """Verify every byte against its checksum, and all tables against each other.
 
@@ -208,19 +198,19 @@ class FleetMaintenance:
         from fleet_slip.operations.verify import repair as repair_damage
         from fleet_slip.storage.documents import accept_losses
 
-        steps, root = progress_of_steps(progress), self.warehouse.root
+        steps, root = calls.progress_of_steps(progress), self.warehouse.root
         accepted: Sequence[str] = ()
         if accept_loss:
             with recorded_step(root, "accept_losses", accept_loss):
                 accepted = accept_losses(root, accept_loss)
-        with open_workers(self.warehouse.root, workers) as executor:
+        with calls.open_workers(self.warehouse.root, workers) as executor:
 
             def verify_all() -> "Verification":
                 return verify(
-                    for_workers(self.warehouse, executor),
+                    calls.for_workers(self.warehouse, executor),
                     full=full,
                     steps=steps,
-                    executor=remote_executor(executor),
+                    executor=calls.remote_executor(executor),
                 )
 
             result = verify_all()
@@ -235,7 +225,7 @@ class FleetMaintenance:
         return result
 
     def check_grams(
-        self, files: int = 4, *, begin: int = 0, progress: ShowProgress | None = None
+        self, files: int = 4, *, begin: int = 0, progress: calls.ShowProgress | None = None
     ) -> "CheckReport":
         """Compute the Gram rows of some log files in several ways and compare the bits.
 
@@ -259,16 +249,16 @@ class FleetMaintenance:
         """
         from fleet_slip.operations.verify import check_grams
 
-        return check_grams(self.warehouse, files, total_progress(progress), begin)
+        return check_grams(self.warehouse, files, calls.total_progress(progress), begin)
 
-    @record_call
+    @calls.record_call
     def compact(
         self,
         target_rows: int | None = None,
         *,
         retention_hours: float | None = None,
         dry_run: bool = False,
-        progress: ShowProgress | None = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "Compacted":
         """Merge the small log files of each day, and remove files that are out of use.
 
@@ -294,14 +284,16 @@ class FleetMaintenance:
         if dry_run:
             return Compacted(None, vacuum(self.warehouse, hours, dry_run=True))
         with step("compact") as figures:
-            report = compact(self.warehouse, target_rows or TARGET_ROWS, total_progress(progress))
+            report = compact(
+                self.warehouse, target_rows or TARGET_ROWS, calls.total_progress(progress)
+            )
             figures.rows, figures.size_bytes = report.rows_rewritten, report.size_bytes_after
         with step("vacuum") as figures:
             removed = vacuum(self.warehouse, hours)
             figures.size_bytes = removed.size_bytes
         return Compacted(report, removed)
 
-    @record_call
+    @calls.record_call
     def migrate(self) -> "MigrationReport":
         """Bring the tables to this version of the program and to the signal catalog.
 
@@ -319,14 +311,14 @@ class FleetMaintenance:
 
     # Erasure.
 
-    @record_call
+    @calls.record_call
     def forget(
         self,
         *,
         vehicle: str | None = None,
         drive: str | None = None,
         now: bool = False,
-        progress: ShowProgress | None = None,
+        progress: calls.ShowProgress | None = None,
     ) -> "ForgetReport":
         """Erase a vehicle or a drive from logs, Gram rows and quarantine.
 
@@ -357,11 +349,13 @@ class FleetMaintenance:
 
         subject = _subject(vehicle, drive)
         with step("forget") as figures:
-            report = forget(self.warehouse, subject, now=now, progress=total_progress(progress))
+            report = forget(
+                self.warehouse, subject, now=now, progress=calls.total_progress(progress)
+            )
             figures.rows = report.rows
         return report
 
-    @record_call
+    @calls.record_call
     def allow(self, *, vehicle: str | None = None, drive: str | None = None) -> bool:
         """Accept new rows of an erased vehicle or drive again; return False if it was allowed.
 
@@ -392,9 +386,9 @@ class FleetMaintenance:
             erasure_log.allow(subject)
         return state == "done"
 
-    @record_call
+    @calls.record_call
     def apply_retention(
-        self, config: str | None = None, *, progress: ShowProgress | None = None
+        self, config: str | None = None, *, progress: calls.ShowProgress | None = None
     ) -> "RetentionReport":
         """Erase drives older than the retention period, then vacuum.
 
@@ -416,7 +410,7 @@ class FleetMaintenance:
 
         with step("retain") as figures:
             retention = load_retention(config, self.warehouse.configs)
-            report = retain(self.warehouse, retention, date.today(), total_progress(progress))
+            report = retain(self.warehouse, retention, date.today(), calls.total_progress(progress))
             figures.rows, figures.size_bytes = report.forgotten.rows, report.vacuumed.size_bytes
         return report
 

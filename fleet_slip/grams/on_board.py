@@ -26,20 +26,8 @@ from fleet_slip.base import (
     quote_name,
     sha256_of,
 )
+from fleet_slip.catalog import course
 from fleet_slip.catalog.catalog import Catalog
-from fleet_slip.catalog.course import (
-    AUXILIARY,
-    COURSE,
-    COURSE_LATE,
-    LATE_PARTS,
-    MAX_COURSE_DELAY,
-    MIN_COURSE_DELAY,
-    STRAIGHT,
-    TURNED,
-    TURNED_DIVISOR,
-    YAW_RATE,
-    course_units,
-)
 from fleet_slip.catalog.definitions import limit_of
 from fleet_slip.catalog.features import PLAIN, Feature
 from fleet_slip.catalog.signals import COUNT_MAX, RECEIVED_FILES, SAMPLE_TIME_S, Signal
@@ -134,7 +122,7 @@ def onboard_feature_sets(catalog: Catalog) -> dict[str, OnboardFeatureSet]:
 
 def _onboard_feature_set(catalog: Catalog, name: str, identity: str) -> OnboardFeatureSet:
     signals, resolved = catalog.signals, catalog.feature_set(name)
-    labels = [COURSE, YAW_RATE] if resolved.change_ticks else [signals.label]
+    labels = [course.COURSE, course.YAW_RATE] if resolved.change_ticks else [signals.label]
     names = {*resolved.signals, *labels}
     names |= {signal for f in resolved.features for signal in catalog.features[f].inputs}
     names |= {signal for d in catalog.definitions(name).values() for signal in d.signals}
@@ -160,13 +148,13 @@ def _onboard_feature_set(catalog: Catalog, name: str, identity: str) -> OnboardF
 def _range(catalog: Catalog, column: str, times: Sequence[int]) -> Range:
     """Return the smallest and largest count of a column, or of its changes over `times`."""
     signals, label = catalog.signals, catalog.signals.label
-    if times and column in (*AUXILIARY, label):
-        if column == STRAIGHT:
+    if times and column in (*course.AUXILIARY, label):
+        if column == course.STRAIGHT:
             return 0, 1
-        units = course_units(signals)
+        units = course.course_units(signals)
         limit = units.largest // units.divisor + 1
-        if column == TURNED:
-            limit = 2 * max(times) * COUNT_MAX // TURNED_DIVISOR + 1
+        if column == course.TURNED:
+            limit = 2 * max(times) * COUNT_MAX // course.TURNED_DIVISOR + 1
         return -limit, limit
     source = signals[column] if column == label else catalog.input(column)
     if isinstance(source, Signal):
@@ -261,7 +249,7 @@ COLUMNS = pa.schema(
         ("day", pa.date32()),
         ("feature_set", pa.string()),
         ("part", pa.string()),
-        (COURSE_LATE, pa.int64()),
+        (course.COURSE_LATE, pa.int64()),
         ("signals", pa.string()),
         ("n", pa.int64()),
         ("sums", pa.list_(pa.int64())),
@@ -270,7 +258,7 @@ COLUMNS = pa.schema(
 )
 """Schema of the Parquet file; `part` and `course_late` are optional (`docs/export.md`)."""
 
-OPTIONAL = ("part", COURSE_LATE)
+OPTIONAL = ("part", course.COURSE_LATE)
 NAMES = ("vehicle_id", "drive_id")
 TEXTS = tuple(field.name for field in COLUMNS if field.type == pa.string())
 MAX_FILE_BYTES = 2**28
@@ -627,7 +615,10 @@ def _require_possible(sets: Mapping[str, OnboardFeatureSet], file: Path, table: 
         | {"key": key, "in_time": feature_set.in_time}
         for key, feature_set in by_key.items()
     ]
-    delays = {"earliest": LATE_PARTS * MIN_COURSE_DELAY, "latest": LATE_PARTS * MAX_COURSE_DELAY}
+    delays = {
+        "earliest": course.LATE_PARTS * course.MIN_COURSE_DELAY,
+        "latest": course.LATE_PARTS * course.MAX_COURSE_DELAY,
+    }
     with open_database() as database, database_errors("checking Gram rows"):
         database.register("counted", _numbered(table))
         database.register("known", pa.Table.from_pylist(described))
