@@ -181,7 +181,7 @@ class ChallengerEvaluation:
                 drives.tables, FoldAssignment(fold, names), drives.drive_numbers
             )
         folds = replace(folds, has_intercept=self.selection.compared.intercept)
-        return folds.complete_cases(self.signals, cohort.catalog.signals.label, sparse=True)
+        return folds.complete_cases(self.signals, cohort.catalog.signals.label)
 
     def as_published(self, tested: Folds) -> CrossValidation:
         """Return the figures of the champion without refitting it."""

@@ -19,12 +19,7 @@ from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier
 from fleet_slip.config import Config, parse_document
 from fleet_slip.errors import QuestionError, RefusedError, StorageError
-from fleet_slip.models.manifest import (
-    Manifest,
-    TrainedDrives,
-    checksum_of_drives,
-    require_model_name,
-)
+from fleet_slip.models.manifest import Manifest, TrainedDrives, checksum_of_drives
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import MAX_DIGITS, DocumentFolder
 from fleet_slip.storage.folder import Folder
@@ -381,7 +376,6 @@ class Registry:
         Where it points there already nothing is added, unless a hold ends: one `rollback` undoes a
         repeated command.
         """
-        require_model_name(alias)
         self.load(name, version)
 
         def target(history: AliasHistory) -> int | None:

@@ -419,7 +419,7 @@ def _cross_validate(
 ) -> CrossValidation:
     """Cross-validate least squares on the rows that have the signals. Raises `DataError`."""
     label = catalog.signals.label
-    complete = folds.complete_cases(signals, label, sparse=True)
+    complete = folds.complete_cases(signals, label)
     procedure = least_squares(signals, label)
     return cross_validate(name, complete, procedure, catalog.input_scales)
 
@@ -432,7 +432,7 @@ def search_models(
     Folds without such a row are left out: a car that stands or creeps has no curvature.
     """
     label = catalog.signals.label
-    folds = cohort.complete_cases(inputs, label, sparse=True)
+    folds = cohort.complete_cases(inputs, label)
 
     def fits(gram: Gram) -> list[Fit]:
         sets = stepwise_order(gram, inputs, label, search.method, search.max_features)
@@ -531,7 +531,7 @@ def _select_order(cohort: Cohort, plan: SelectionPlan) -> Selection:
     rule = Rule(request.ranking or "declared", request.criterion or "cv", tolerance)
     folds = replace(
         cohort.folds(plan.folds.by, plan.folds.count), has_intercept=request.intercept
-    ).complete_cases(inputs, label, sparse=True)
+    ).complete_cases(inputs, label)
     drives = clustered_moments(cohort.complete_cases(inputs), intercept=request.intercept)
     choice = choose_nested(folds, drives, inputs, label, catalog.input_scales, rule)
     name, signals = choice.winner.model.name, choice.winner.model.signals

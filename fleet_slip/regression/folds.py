@@ -197,10 +197,10 @@ class CohortFolds:
             count_drives=lambda tables: self.count_drives([positions[i] for i in tables]),
         )
 
-    def complete_cases(self, inputs: Sequence[str], label: str, *, sparse: bool = False) -> Folds:
-        """Return the folds of drives that have the label and all the inputs; `sparse` skips others.
+    def complete_cases(self, inputs: Sequence[str], label: str) -> Folds:
+        """Return the folds of drives that have the label and all the inputs; skip empty folds.
 
-        Raises `DataError` if a fold, or all but one, has no such row.
+        Raises `DataError` if fewer than two folds have such rows.
         """
         signals = (*inputs, label)
         complete = self.tables_with(signals)
@@ -208,26 +208,22 @@ class CohortFolds:
             available = sorted({name for grams in self.tables for name in grams[0].signals})
             require_signals(available, signals)
             raise missing_signals_error(signals)
-        folds = tuple(
+        sums = (
             sum((self.tables[i][f].restrict(signals) for i in complete), Gram.zero(signals))
             for f in range(len(self.names))
         )
-        empty = [name for name, gram in zip(self.names, folds, strict=True) if gram.n == 0]
-        names = self.names
-        if sparse:
-            names = tuple(name for name in names if name not in empty)
-            folds = tuple(gram for gram in folds if gram.n)
-        if len(folds) < 2 or (empty and not sparse):
+        folds = {name: gram for name, gram in zip(self.names, sums, strict=True) if gram.n}
+        if len(folds) < 2:
             raise DataError(
-                f"fold {', '.join(empty)} has no rows with all of {', '.join(signals)}. Choose "
-                "fewer folds, another key to fold by, or fewer signals."
+                f"only fold {', '.join(folds) or 'none'} has rows with all of "
+                f"{', '.join(signals)}. Choose another key to fold by, or fewer signals."
             )
         matching = [
             gram.restrict(signals) for gram in self.auxiliary if set(signals) <= set(gram.signals)
         ]
         auxiliary = sum(matching[1:], matching[0]) if matching else None
-        drives = self.count_drives(complete)
-        return Folds(folds, names, drives, auxiliary, self.weight, self.has_intercept)
+        grams, names, drives = tuple(folds.values()), tuple(folds), self.count_drives(complete)
+        return Folds(grams, names, drives, auxiliary, self.weight, self.has_intercept)
 
 
 # Accuracy of predictions from exact sums of predictions and labels.

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+import fleet_slip
 from fleet_slip.config import load_toml
 from fleet_slip.errors import ConfigError, FleetSlipError, StorageError
 from fleet_slip.models.registry import Registry
@@ -138,7 +139,7 @@ def test_folders_that_are_no_models_are_passed_over(registry: Registry, name: st
 @pytest.mark.parametrize("alias", ["", "a b", "x\n", "../x", "1", "x" * 100])
 def test_an_alias_is_a_plain_name(registry: Registry, alias: str) -> None:
     with pytest.raises(FleetSlipError):
-        registry.promote(NAME, 1, alias)
+        fleet_slip.open(str(registry.root)).models.promote(f"{NAME}@1", alias)
     assert registry.history(NAME).aliases() == {"champion": 1}
 
 

@@ -171,9 +171,7 @@ def test_a_search_is_made_again_without_the_cars_that_are_held_out(champion: War
     winner = next(model for model in answer.models if len(model.signals) == 4)
     answer = replace(answer, winner=replace(answer.winner, model=winner))
     found = compare(answer, version).challenger
-    groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).complete_cases(
-        CHOICE, LABEL, sparse=True
-    )
+    groups = answer.cohort.folds("vehicle", champion_rules.MAX_GROUPS).complete_cases(CHOICE, LABEL)
     assert found.fold_names == groups.names
     for figures, (training, test) in zip(found.folds, groups.splits(), strict=True):
         sets = stepwise_order(training, CHOICE, LABEL, "forward", len(winner.signals))
