@@ -107,6 +107,7 @@ class Comparison:
 
     def __str__(self) -> str:
         challenger, champion = self.challenger.pooled, self.champion.pooled
+        gap_deg, error_deg = math.degrees(self.gap.rmse), math.degrees(self.gap.standard_error)
         return (
             f"on the same {pluralize(challenger.rows, 'row')} of "
             f"{pluralize(self.challenger.drives, 'drive')}"
@@ -114,7 +115,7 @@ class Comparison:
             f"{len(self.challenger.folds)} groups by {self.by}, it has RMSE "
             f"{challenger.rmse_deg:.4f} deg and correlation {challenger.correlation:.4f}; "
             f"{self.champion.name} as published has {champion.rmse_deg:.4f} deg and "
-            f"{champion.correlation:.4f}, difference {self.gap}"
+            f"{champion.correlation:.4f}, difference {gap_deg:.4f} +- {error_deg:.2g} deg"
         )
 
 

@@ -579,7 +579,6 @@ def require_model_name(name: str) -> str:
 # whether it is in the set.
 
 _SALT = b"fleet-slip trained drives\n"
-_BATCH_DRIVES = 2**20
 
 
 @dataclass(frozen=True)
@@ -592,9 +591,9 @@ class TrainedDrives:
     @classmethod
     def from_hashes(cls, name: str, drives: "Hashes") -> "TrainedDrives":
         """Build a set from the hashes of the names of drives."""
-        import numpy as np  # noqa: PLC0415 - not for show
-
-        return cls(name, np.sort(_salt(name, drives)))
+        salted = _salt(name, drives)
+        salted.sort()
+        return cls(name, salted)
 
     @classmethod
     def unpacked(cls, name: str, content: bytes) -> "TrainedDrives":
@@ -612,8 +611,7 @@ class TrainedDrives:
         """Return the mask of drives, by the hashes of their names, that are in the set."""
         import numpy as np  # noqa: PLC0415 - not for show
 
-        unique, place = np.unique(drives, return_inverse=True)
-        mask: BoolArray = np.isin(_salt(self.name, unique), self.salted)[place]
+        mask: BoolArray = np.isin(_salt(self.name, drives), self.salted)
         return mask
 
 
@@ -626,10 +624,6 @@ def _salt(name: str, drives: "Hashes") -> "Hashes":
     """Return the salted hash of each drive, in the order of the drives."""
     import numpy as np  # noqa: PLC0415 - not for show
 
-    salt, numbers = _SALT + name.encode(), drives.astype("<u8")
-    hashed = np.empty(len(drives), dtype=np.uint64)
-    for first in range(0, len(drives), _BATCH_DRIVES):
-        batch = numbers[first : first + _BATCH_DRIVES].tobytes()
-        digests = [sha256(salt + batch[i : i + 8]).digest()[:8] for i in range(0, len(batch), 8)]
-        hashed[first : first + _BATCH_DRIVES] = np.frombuffer(b"".join(digests), dtype=">u8")
-    return hashed
+    salt, numbers = _SALT + name.encode(), drives.astype("<u8").tobytes()
+    parts = (sha256(salt + numbers[i : i + 8]).digest()[:8] for i in range(0, len(numbers), 8))
+    return np.frombuffer(b"".join(parts), dtype=">u8").astype(np.uint64)

@@ -109,9 +109,8 @@ class Frame:
                 f"has {available}{f' and {more} more' if more > 0 else ''}."
             )
         columns = {name: self._numbers(name) for name in names}
-        rows = {name: len(values) for name, values in columns.items()}
-        if len(set(rows.values())) > 1:
-            lengths = ", ".join(f"{name} {n:,}" for name, n in rows.items())
+        if len({len(values) for values in columns.values()}) > 1:
+            lengths = ", ".join(f"{name} {len(values):,}" for name, values in columns.items())
             raise InputError(f"the columns differ in length: {lengths}.")
         return columns
 
@@ -120,11 +119,9 @@ class Frame:
             raise InputError(f"the frame has several columns {name}.")
         try:
             column = self.column(name)
-            if not _is_number(column.type):
+            if not any(is_number(column.type) for is_number in _NUMBERS):
                 raise InputError(f"the column {name} is {column.type}, not numeric.")
-            if column.type != pa.float64():
-                column = column.cast(pa.float64())
-            values = column.to_numpy(zero_copy_only=False)
+            values = column.cast(pa.float64()).to_numpy(zero_copy_only=False)
         except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"the column {name} is not numeric: {error}") from None
         if infinite := int(np.isinf(values).sum()):
@@ -132,9 +129,7 @@ class Frame:
         return np.asarray(values, dtype=np.float64)
 
 
-def _is_number(kind: pa.DataType) -> bool:
-    tests = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
-    return any(test(kind) for test in tests)
+_NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
 
 
 def open_frame(frame: Any) -> Frame:
@@ -166,7 +161,9 @@ def open_frame(frame: Any) -> Frame:
         with contextlib.suppress(pa.ArrowException):  # of a series, not of a frame
             table = pa.table(frame)
             return Frame(
-                table.column_names, table.column, lambda values, _: pa.chunked_array([values])
+                table.column_names,
+                lambda name: table.column(name).combine_chunks(),
+                lambda values, _: pa.chunked_array([values]),
             )
     raise InputError(
         f"{type(frame).__name__} is no data frame. Give one of Polars (collected), pandas or "
@@ -189,21 +186,31 @@ def predict(
         )
         for name in plan.signals
     }
-    if missing := [name for name in plan.facts if name not in opened.names]:
-        raise InputError(f"{manifest.name} needs properties of the car: {', '.join(missing)}.")
-    facts = {name: _column(opened, name) for name in plan.facts}
-    numbers = _numbers(manifest, opened)
+    calibrated: dict[str, Fraction] = {
+        definition.number.name: Fraction(definition.number.grain)
+        for definition in manifest.estimate.definitions.values()
+        if definition.number
+    }
+    if missing := [name for name in (*plan.facts, *calibrated) if name not in opened.names]:
+        raise InputError(
+            f"{manifest.name} needs properties of the car: {', '.join(missing)}. Calibrated ones: "
+            "fleet-slip calibrate --car NAME. A car that has driven too little has nulls there."
+        )
+    facts = {name: opened.column(name) for name in plan.facts}
+    numbers = opened.numbers([*calibrated], manifest.name)
     rows = len(next(iter(counts.values())))
-    ticks = _ticks(opened, rows) if plan.windows else np.arange(rows)
-    drives = _rows_of_each_drive(opened, rows) if plan.windows else [np.arange(rows)]
+    ticks, drives = np.arange(rows), [np.arange(rows)]
+    if plan.windows:
+        ticks = _ticks(opened, rows)
+        drives = _rows_of_each_drive(opened, rows)
     drive = counts_of(pa.table({"tick": ticks, **counts}), plan, {})
     angle = np.empty(rows)
     for at in drives if rows else ():
         parameters = {
             name: count
-            for name, (values, grain) in numbers.items()
-            if np.isfinite(values[at[0]])
-            and (count := round_number(Fraction(float(values[at[0]])), grain)) is not None
+            for name, grain in calibrated.items()
+            if np.isfinite(value := numbers[name][at[0]])
+            and (count := round_number(Fraction(float(value)), grain)) is not None
         }
         attributes = {name: values[at[0]].as_py() for name, values in facts.items()}
         angle[at] = predictor(drive.segment(at, attributes, parameters))
@@ -214,32 +221,9 @@ def _rows_of_each_drive(frame: Frame, rows: int) -> list[IntArray]:
     """Return the numbers of the rows of each drive."""
     if "drive_id" not in frame.names:
         return [np.arange(rows)]
-    indices = pc.fill_null(_column(frame, "drive_id").dictionary_encode().indices, -1)
+    indices = pc.fill_null(frame.column("drive_id").dictionary_encode().indices, -1)
     _, drives, sizes = np.unique(indices, return_inverse=True, return_counts=True)
     return np.split(np.argsort(drives, kind="stable"), np.cumsum(sizes)[:-1])
-
-
-def _numbers(manifest: Manifest, frame: Frame) -> dict[str, tuple[FloatArray, Fraction]]:
-    """Return what a car's drives tell of it, in SI units by row with NaN, and grains."""
-    used = {
-        definition.number.name: definition.number
-        for definition in manifest.estimate.definitions.values()
-        if definition.number
-    }
-    if missing := [name for name in used if name not in frame.names]:
-        raise InputError(
-            f"{manifest.name} needs calibrated parameters of the car: {', '.join(missing)}. Run: "
-            "fleet-slip calibrate --car NAME. A car that has driven too little has nulls there."
-        )
-    return {
-        name: (frame.numbers([name], manifest.name)[name], Fraction(number.grain))
-        for name, number in used.items()
-    }
-
-
-def _column(frame: Frame, name: str) -> pa.Array:
-    column = frame.column(name)
-    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
 
 
 def _ticks(frame: Frame, rows: int) -> IntArray:

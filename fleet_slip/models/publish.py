@@ -530,12 +530,8 @@ def would_publish(
 ) -> DryRun:
     """Return what `publish_challenger` would do, and raise as it does; write nothing."""
     name, decision = manifest.name, decide(registry, manifest, selection, **options)
-    if decision.champion or not decision.waits:
-        return DryRun(name, decision.champion is None, decision.reason)
-    waiting = registry.history(name).pointed_at(CANDIDATE)
-    is_there = (
-        waiting is not None
-        and waiting == registry.versions(name)[-1]
-        and registry.load(name, waiting).manifest.same_estimator(manifest)
-    )
-    return DryRun(name, not is_there, decision.reason, candidate=True)
+    publishes = decision.champion is None
+    waiting = registry.history(name).pointed_at(CANDIDATE) if decision.waits else None
+    if waiting is not None and waiting == registry.versions(name)[-1]:
+        publishes = not registry.load(name, waiting).manifest.same_estimator(manifest)
+    return DryRun(name, publishes, decision.reason, candidate=decision.waits)

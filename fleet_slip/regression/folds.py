@@ -112,37 +112,28 @@ class Folds:
     weight: Fraction = Fraction(1)
     has_intercept: bool = True
 
-    @cached_property
+    @property
     def total(self) -> Gram:
         """The Gram of all training rows, with integer weights."""
-        return self._about(self._sum)
+        return self._about(self._weighted[1])
 
     def _about(self, training: Gram) -> Gram:
         return training if self.has_intercept else training.about_origin()
 
     @cached_property
-    def _sum(self) -> Gram:
-        scaled_total = sum(self.grams[1:], self.grams[0]).scaled(self._row_factor)
+    def _weighted(self) -> tuple[int, Gram]:
+        """The weight of each row of the folds that makes all weights integers, and the sum."""
+        total = sum(self.grams[1:], self.grams[0])
         if self.auxiliary is None or not self.weight:
-            return scaled_total
-        centered = self.auxiliary.centered()
-        return scaled_total + centered.scaled(
-            self.weight.numerator * self._row_factor // self._divisor
-        )
-
-    @property
-    def _divisor(self) -> int:
-        return self.weight.denominator * (self.auxiliary.n if self.auxiliary else 1)
-
-    @cached_property
-    def _row_factor(self) -> int:
-        """The weight of each row of the folds that makes all weights integers."""
-        return self._divisor // math.gcd(self.weight.numerator, self._divisor)
+            return 1, total
+        factor, divisor = (self.weight / self.auxiliary.n).as_integer_ratio()
+        return divisor, total.scaled(divisor) + self.auxiliary.centered().scaled(factor)
 
     def splits(self) -> Iterator[tuple[Gram, Gram]]:
         """Yield the training Gram and the test Gram of each fold."""
+        row_weight, total = self._weighted
         for fold in self.grams:
-            yield self._about(self._sum - fold.scaled(self._row_factor)), fold
+            yield self._about(total - fold.scaled(row_weight)), fold
 
 
 @dataclass(frozen=True)
