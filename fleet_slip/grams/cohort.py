@@ -358,11 +358,9 @@ def _expand_rows(opened: OpenedGrams, rows: pa.Table) -> dict[str, Any]:
     groups = list(expansion.tables(rows))
     metadata = rows.drop_columns(["sums", "products", "signals"])
     # Rows with different calibrated columns are in different tables; the metadata follow them.
-    sorted_metadata = [
-        _with_signals(metadata.filter(pa.array(mask)), signals) for signals, _, mask in groups
-    ]
-    drives = pa.concat_tables(sorted_metadata) if groups else metadata
-    return {"tables": tuple(table for _, table, _ in groups), "drives": drives}
+    drives = [_with_signals(metadata.filter(pa.array(mask)), names) for names, _, mask in groups]
+    tables = tuple(table for _, table, _ in groups)
+    return {"tables": tables, "drives": pa.concat_tables(drives) if drives else metadata}
 
 
 def with_gram_rows(cohort: Cohort, rows: pa.Table) -> Cohort:
@@ -406,16 +404,9 @@ def empty_cohort_error(opened: OpenedGrams, predicate: Predicate) -> DataError:
             f"{feature_set.change_text} apart, so there is no course to learn from. Choose another "
             "cohort, or map the course and ingest again: docs/course.md."
         )
-    examples = opened.database.execute(
-        "SELECT string_agg(DISTINCT source, ', ' ORDER BY source), "
-        "string_agg(DISTINCT campaign, ', ' ORDER BY campaign) FROM grams "
-        f"WHERE {TRAINING_DRIVES}"
-    ).fetchone()
-    sources, campaigns = examples or ("", "")
     return DataError(
-        f"no drive matches the cohort predicate {predicate.quoted}. The warehouse has sources "
-        f'{sources} and campaigns {campaigns}. See the columns with: fleet-slip sql "DESCRIBE '
-        'drives"; drives with faulty sensors with: fleet-slip quality'
+        f"no drive matches the cohort predicate {predicate.quoted}. See the drives with: "
+        'fleet-slip sql "FROM drives"; those with faulty sensors with: fleet-slip quality'
     )
 
 
@@ -466,8 +457,7 @@ def _find_folds(
 
 def _index_in(values: pa.Array, column: pa.Array) -> IntArray:
     """Return the position of each value of a column in `values`."""
-    positions: IntArray = pc.index_in(column.cast(values.type), value_set=values).to_numpy()
-    return positions
+    return np.asarray(pc.index_in(column.cast(values.type), value_set=values))
 
 
 def _used_folds(

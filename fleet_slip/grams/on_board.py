@@ -300,9 +300,9 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
     table = _read(file, content)
     digest = hashlib.sha256(content).hexdigest()
     transaction = AppTransaction(f"receive/{digest}", 1)
-    drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py()
+    drives, rows = pc.count_distinct(table["drive_id"]).as_py(), pc.sum(table["n"]).as_py() or 0
     new = warehouse.grams.snapshot().transaction_version(transaction.name) is None
-    report = OnboardImport(str(file), new, len(table), drives, rows or 0)
+    report = OnboardImport(str(file), new, len(table), drives, rows)
     if not new:
         return report
     sets = onboard_feature_sets(warehouse.catalog)
@@ -320,18 +320,14 @@ def import_onboard_grams(warehouse: Warehouse, file: Path) -> OnboardImport:
         _require_new(file, grams, numbered)
         replaced = files_to_rewrite(grams, frozenset())
         merged = list(rows_to_keep(grams, replaced, frozenset()))
-        single = AppTransaction(ONE_AT_A_TIME, (grams.version or 0) + 1)
-        grams.commit_or_discard(
-            Change(
-                write_rows(warehouse, [*merged, new_rows]), replaced, [transaction, single], _NOTE
-            )
-        )
+        transactions = [transaction, AppTransaction(ONE_AT_A_TIME, (grams.version or 0) + 1)]
+        added = write_rows(warehouse, [*merged, new_rows])
+        grams.commit_or_discard(Change(added, replaced, transactions, {"job": "receive"}))
 
     retry_conflicts(attempt)
     return report
 
 
-_NOTE = {"job": "receive"}
 _SEE = "If it is a log, give its --mapping, as drafted by: fleet-slip mapping suggest LOG"
 VALUE_BYTES = 8
 
@@ -655,16 +651,13 @@ def _require_new(file: Path, grams: Snapshot, rows: pa.Table) -> None:
         database.register("counted", rows)
         database.execute("SET VARIABLE gram_files = $files", {"files": grams.paths})
         with reading_files(database, "finding repeated drives"):
-            statement = read_sql("jobs", "counted_again.sql").format(received=RECEIVED_FILES)
-            repeated = database.execute(statement).fetchone()
-            statement = read_sql("jobs", "counted_time.sql")
-            excess = None
-            if not repeated:
-                excess = database.execute(statement, [MAX_ROWS_OF_A_DAY]).fetchone()
+            repetitions = read_sql("jobs", "counted_again.sql").format(received=RECEIVED_FILES)
+            repeated = database.execute(repetitions).fetchone()
+            excesses = read_sql("jobs", "counted_time.sql")
+            excess = database.execute(excesses, [MAX_ROWS_OF_A_DAY]).fetchone()
     if repeated:
         row, drive, stored = repeated
         _refuse(file, row, drive, f"is stored already, as {quote_name(stored)}", RepeatedError)
     if excess:
-        row, drive = excess
         reason = "exceeds 24 hours of driving of its car on a day, with the stored rows"
-        _refuse(file, row, drive, reason)
+        _refuse(file, excess[0], excess[1], reason)

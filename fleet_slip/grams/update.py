@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake.transaction import AddAction
 
-from fleet_slip.arrays import BoolArray, IntArray
+from fleet_slip.arrays import BoolArray
 from fleet_slip.base import Progress, no_progress, pluralize
 from fleet_slip.calibration.receiver_delay import course_delays
 from fleet_slip.catalog.course import COURSE_LATE
@@ -216,7 +216,7 @@ def _update_set(
             "a backup."
         )
     grams, superseded = work.grams, 0
-    if work:
+    if work.files or work.stale:
         rows = compute_grams(warehouse, work.files, progress, feature_set, executor, work.delays)
         added, replaced, superseded = _write_files(warehouse, work, rows)
         _commit(work.grams, work.logs, work.identity, added, replaced)
@@ -264,9 +264,6 @@ class _Work:
     stale: frozenset[str]
     delays: Mapping[str, int] | None
 
-    def __bool__(self) -> bool:
-        return bool(self.files or self.stale)
-
 
 def _find_work(
     warehouse: Warehouse, feature_set: str, paths: Collection[str] | None = None
@@ -279,18 +276,13 @@ def _find_work(
     identity = warehouse.catalog.identity(feature_set)
     backlog = find_backlog(logs, grams, identity)
     delays = _delays(warehouse, feature_set, grams, logs)
-    outdated = set[str]()
-    if delays is not None:
-        outdated = {
-            path
-            for path, car, delay in recorded_delays(grams, identity)
-            if delay != delays.get(car, 0)
-        }
+    recorded = recorded_delays(grams, identity) if delays is not None else set()
+    changed = {path for path, car, delay in recorded if delay != (delays or {}).get(car, 0)}
     requested = [file for file in logs.files if paths is None or file.path in paths]
     missing = {file.path for file in backlog.missing}
-    old = [file for file in requested if file.path in outdated]
-    files = (*(file for file in requested if file.path in missing), *old)
-    outdated_paths = frozenset(file.path for file in old)
+    outdated = [file for file in requested if file.path in changed]
+    files = (*(file for file in requested if file.path in missing), *outdated)
+    outdated_paths = frozenset(file.path for file in outdated)
     return _Work(grams, logs, identity, files, outdated_paths, backlog.stale, delays)
 
 
@@ -411,22 +403,15 @@ def gram_digests(rows: pa.Table) -> tuple[list[str], BoolArray]:
             table = gram_table(signals, alike)
             numbers = np.column_stack([table.n, table.sums, table.products])
             eventful[mask] = is_eventful = find_eventful(table)
-        columns = ("feature_set", "part", "vehicle_id", "day")
-        names = zip(*(alike[name].to_pylist() for name in columns), strict=True)
-        digests[mask] = [
-            _digest(feature_set, block, signals, "" if alone else f"{vehicle}\n{day}", row)
-            for (feature_set, block, vehicle, day), alone, row in zip(
-                names, is_eventful, numbers, strict=True
-            )
-        ]
+        names = alike.select(["feature_set", "part", "vehicle_id", "day"]).to_pylist()
+        of_rows = []
+        for name, alone, row in zip(names, is_eventful, numbers, strict=True):
+            owner = "" if alone else f"{name['vehicle_id']}\n{name['day']}"
+            text = f"{name['feature_set']}\n{name['part'] or ''}\n{signals}\n{owner}\n"
+            content = text.encode() + row.tobytes()
+            of_rows.append(blake2b(content, digest_size=8).hexdigest())
+        digests[mask] = of_rows
     return digests.tolist(), eventful
-
-
-def _digest(
-    feature_set: str, block: str | None, signals: str, owner: str, numbers: IntArray
-) -> str:
-    text = f"{feature_set}\n{block or ''}\n{signals}\n{owner}\n"
-    return blake2b(text.encode() + numbers.tobytes(), digest_size=8).hexdigest()
 
 
 # Writing and rewriting of files.

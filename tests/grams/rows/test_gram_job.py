@@ -47,9 +47,9 @@ def test_gram_rows_equal_sums_of_python_integers_at_the_ends_of_int16(warehouse:
     land(warehouse, "one", *(log_rows(drive, c) for drive, c in counts.items()))
     update_grams(warehouse)
     for drive, gram in ((key[0], gram) for key, gram in stored(warehouse).items()):
-        columns = [counts[drive][name].tolist() for name in NAMES]
+        columns = [counts[drive][name].tolist() for name in gram.signals]
         assert (list(gram.sums), list(gram.products)) == integer_gram(columns)
-        assert (gram.n, gram.signals) == (3000, NAMES)
+        assert (gram.n, {*gram.signals}) == (3000, {*NAMES})
 
 
 def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse) -> None:
@@ -63,10 +63,10 @@ def test_rows_that_lack_signals_have_gram_rows_of_their_own(warehouse: Warehouse
     assert {(drive, gram.n) for (drive, _), gram in grams.items()} == {
         ("holes", 34), ("holes", 66), ("absent", 100),
     }  # fmt: skip
-    without_ay = tuple(name for name in NAMES if name != "ay")
+    without_ay = tuple(sorted({*NAMES} - {"ay"}))
     with_hole = [whole[name][::3] for name in without_ay]
     assert list(grams["holes", without_ay].products) == integer_gram(with_hole)[1]
-    few = tuple(name for name in NAMES if not name.startswith("wheel"))
+    few = tuple(sorted(name for name in NAMES if not name.startswith("wheel")))
     assert list(grams["absent", few].products) == integer_gram([whole[name] for name in few])[1]
     assert check_grams(warehouse, 1).drives == 2
 
@@ -159,8 +159,11 @@ def test_a_drive_that_one_side_lacks_differs() -> None:
     assert differing_drives({("a", KEY): A}, {("a", KEY): B}) == ["a"]
     assert differing_drives({("b", KEY): A, ("a", KEY): A}, {}) == ["a", "b"]
     assert differing_drives({}, {("a", KEY): A}) == ["a"]
-    turned = A.restrict(("ay", "ax"))
-    assert differing_drives({("a", KEY): A}, {("a", ("ay", "ax")): turned}) == []
+    turned = pa.table(
+        {"drive_id": ["a"], "part": pa.nulls(1, pa.string()), "signals": ["ay,ax"], "n": [A.n]}
+        | {"sums": [A.restrict(KEY[::-1]).sums], "products": [A.restrict(KEY[::-1]).products]}
+    )
+    assert differing_drives({("a", KEY): A}, grams_of(turned)) == []
     assert differing_drives({("a", KEY): A}, {("a", ("ax",)): A.restrict(("ax",))}) == ["a"]
 
 
