@@ -40,7 +40,7 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
         metered = Budget.for_file(log).metered
         if len(columns_by_time) == 1 and not source.has_clock:
             plain = source.batches(next(iter(columns_by_time.values())))
-            yield from metered(_with_later_hours(plain, mapping))
+            yield from metered(_with_later_hours(plain, log, mapping))
             return
         if source.has_clock:
             bases = [base for columns in columns_by_time.values() for base in source.bases(columns)]
@@ -51,9 +51,8 @@ def read_batches(log: Path, mapping: Mapping) -> Iterator[pl.DataFrame]:
             ]
         held, split_gap_s = mapping.common_columns(), mapping.time.split_gap_s
         signals = {signal.column for signal in mapping.signals.values()}
-        for rows in merge_bases(
-            [*map(metered, bases)], OWN_TIME, held, split_gap_s, signals, log=log
-        ):
+        metered_bases = [metered(base) for base in bases]
+        for rows in merge_bases(metered_bases, OWN_TIME, held, split_gap_s, signals, log):
             yield from rows.iter_slices(BATCH_ROWS)
 
 
@@ -71,12 +70,8 @@ def _with_times(
     A text that is no time is NaN. Rows without a time are those of other, longer columns.
     """
     for batch in batches:
-        try:
-            times_s = seconds_of(batch[column], mapping.time, mapping.formats).alias(OWN_TIME)
-        except ValueError as error:
-            raise InputError(f"{quote_name(log)}: {error}") from None
-        rows = batch.with_columns(times_s)
-        yield rows.filter(pl.col(OWN_TIME).is_not_null())
+        times_s = seconds_of(batch[column], mapping.time, mapping.formats, log)
+        yield batch.with_columns(times_s.alias(OWN_TIME)).drop_nulls(OWN_TIME)
 
 
 LATER = "\0later"
@@ -85,7 +80,9 @@ _SET_BACK_S = (1200.0, 7500.0)
 """Steps back in time, in s, by which clocks are set."""
 
 
-def _with_later_hours(batches: Iterator[pl.DataFrame], mapping: Mapping) -> Iterator[pl.DataFrame]:
+def _with_later_hours(
+    batches: Iterator[pl.DataFrame], log: Path, mapping: Mapping
+) -> Iterator[pl.DataFrame]:
     """Yield rows with `LATER`, where the mapping names the zone of its timestamps."""
     time, column = mapping.time, mapping.time.column
     if time.zone is None or column is None or time.date is not None:
@@ -93,7 +90,7 @@ def _with_later_hours(batches: Iterator[pl.DataFrame], mapping: Mapping) -> Iter
         return
     local, before_s, is_later = time.model_copy(update={"zone": None}), np.nan, False
     for batch in batches:
-        local_s = seconds_of(batch[column], local, mapping.formats).to_numpy()
+        local_s = seconds_of(batch[column], local, mapping.formats, log).to_numpy()
         steps_s = np.diff(local_s, prepend=before_s)
         back = (steps_s <= -_SET_BACK_S[0]) & (steps_s >= -_SET_BACK_S[1])
         turns = np.where(back, 1, np.where(np.abs(steps_s) >= _SET_BACK_S[0], -1, 0))
@@ -135,34 +132,50 @@ def merge_bases(
     without columns of `signals` has no rows of its own. The rows of a single base are yielded
     unchanged. With `log`, bases without a common time raise `InputError`.
     """
-    opened = [_PendingBase(base, time, split_gap_s) for base in bases]
+    opened = [_TimeBase(base, time, split_gap_s) for base in bases]
     columns = {name: kind for base in opened for name, kind in base.columns.items()}
     filled = [base for base in opened if base.has_rows]
+    no_rows = pl.DataFrame(schema=columns)
     if len(filled) == 1:
-        yield from (_completed(batch, columns) for batch in filled[0].batches)
+        yield from (pl.concat([no_rows, rows], how="diagonal") for rows in filled[0].batches)
         return
-    pending = filled
     starts_s = [base.start_s for base in filled]
     if log is not None and starts_s and min(starts_s) < EARLIEST_S <= max(starts_s):
         raise _no_common_time(filled, log)
-    for number, base in enumerate(filled):
-        base.begin(number, max(WINDOW_ROWS // len(filled), 1))
-    columns |= {BASE: pl.Int32(), DISORDER: pl.String(), ROW: pl.Int64(), _RIGHT: pl.Float64()}
-    base_of_column = {
-        name: number for number, base in reversed([*enumerate(filled)]) for name in base.columns
-    }
-    held_columns = [
-        _HeldColumn(name, base_of_column.get(name, -1), time, split_gap_s) for name in held
-    ]
-    with_signals = [
-        n for n, base in enumerate(filled) if not base.columns.keys().isdisjoint(signals)
-    ]
-    while pending := [base for base in pending if base.fill()]:
-        until = min(base.reached for base in pending)
-        rows = pl.concat([_completed(base.take(until), columns) for base in pending])
-        rows = rows.sort(_RIGHT, maintain_order=True)
-        rows = rows.with_columns(column.hold(rows) for column in held_columns).drop(_RIGHT)
-        yield rows.filter(pl.col(BASE).is_in(with_signals))
+    base_of = {name: n for n, base in reversed([*enumerate(filled)]) for name in base.columns}
+    with_signals = [n for n, base in enumerate(filled) if base.columns.keys() & set(signals)]
+    number_of_rows = max(WINDOW_ROWS // max(len(filled), 1), 1)
+    streams = [base.judged(number, number_of_rows) for number, base in enumerate(filled)]
+    waiting = [no_rows] * len(streams)
+    last: dict[str, pl.DataFrame] = {}
+    while True:
+        waiting = [
+            rows if rows.height else next(stream, no_rows)
+            for rows, stream in zip(waiting, streams, strict=True)
+        ]
+        if not any(rows.height for rows in waiting):
+            break
+        until_s = min(rows[_RIGHT][-1] for rows in waiting if rows.height)
+        counts = [
+            rows[_RIGHT].search_sorted(until_s, side="right") if rows.height else 0
+            for rows in waiting
+        ]
+        pairs = list(zip(waiting, counts, strict=True))
+        window = pl.concat([no_rows, *(rows.head(n) for rows, n in pairs)], how="diagonal")
+        waiting = [rows.slice(n) for rows, n in pairs]
+        window = window.sort(_RIGHT, maintain_order=True)
+        for name in held:
+            is_stated = (
+                pl.col(name).is_not_null()
+                & (pl.col(BASE) == base_of.get(name, -1))
+                & pl.col(DISORDER).is_null()
+                & pl.col(time).is_finite()
+            )
+            stated = window.filter(is_stated).select(_RIGHT, pl.col(name).alias(HELD + name))
+            values = pl.concat([last.get(name, stated.clear()), stated]).set_sorted(_RIGHT)
+            last[name] = values.tail(1)
+            window = window.join_asof(values, on=_RIGHT, tolerance=split_gap_s)
+        yield window.drop(_RIGHT).filter(pl.col(BASE).is_in(with_signals))
     if log is not None:
         _require_common_time([filled[number] for number in with_signals], log)
 
@@ -171,7 +184,7 @@ _MAX_APART_S = 60.0
 """Longest time in s between the end of a time base and the start of another in one recording."""
 
 
-def _require_common_time(bases: Sequence["_PendingBase"], log: Path) -> None:
+def _require_common_time(bases: Sequence["_TimeBase"], log: Path) -> None:
     """Raise `InputError` if a base shares no time with another one: it has another clock."""
     for base in bases:
         distances_s = [
@@ -183,7 +196,7 @@ def _require_common_time(bases: Sequence["_PendingBase"], log: Path) -> None:
             raise _no_common_time(bases, log)
 
 
-def _no_common_time(bases: Sequence["_PendingBase"], log: Path) -> InputError:
+def _no_common_time(bases: Sequence["_TimeBase"], log: Path) -> InputError:
     """Return the error of time bases of different clocks."""
     starts = ", ".join(f"{base.example!r} begins at {base.start_s:,.2f} s" for base in bases[:4])
     return InputError(
@@ -192,14 +205,8 @@ def _no_common_time(bases: Sequence["_PendingBase"], log: Path) -> InputError:
     )
 
 
-def _completed(rows: pl.DataFrame, columns: dict[str, pl.DataType]) -> pl.DataFrame:
-    """Return rows with all columns, null where they have none."""
-    absent = [pl.lit(None, kind).alias(name) for name, kind in columns.items() if name not in rows]
-    return rows.with_columns(absent).select(*columns)
-
-
-class _PendingBase:
-    """The rows of a base that are in no window yet. Its first batch gives the columns."""
+class _TimeBase:
+    """The rows of a time base. Its first batch gives the columns."""
 
     def __init__(self, batches: Iterator[pl.DataFrame], time: str, split_gap_s: float) -> None:
         self._time, self._gap_s = time, split_gap_s
@@ -209,105 +216,44 @@ class _PendingBase:
         self.columns, self.has_rows = dict(first.schema), first.height > 0
         times_s = first[time].to_numpy() if self.has_rows else np.zeros(0)
         self.start_s = float(next(iter(times_s[np.isfinite(times_s)]), np.nan))
+        self.end_s = -np.inf
+        """The last right time so far."""
         self.example = next((name for name in first.columns if name != time), "")
         self.batches = chain([first], batches)
-        self._before_s, self._right_s, self._judged_rows = np.nan, -np.inf, 0
-        self._rows = pl.DataFrame()
 
-    def begin(self, number: int, count: int) -> None:
-        """Set the base's number, and how many rows to read at once."""
-        self._number = pl.lit(number, pl.Int32).alias(BASE)
-        self._slices = _resized(self._judged(), count)
+    def judged(self, number: int, count: int) -> Iterator[pl.DataFrame]:
+        """Yield at most `count` rows at once, with `BASE`, `ROW`, `DISORDER` and `_RIGHT`.
 
-    def _judged(self) -> Iterator[pl.DataFrame]:
-        """Yield rows with `DISORDER`, `ROW` and `_RIGHT`. The last one waits for the next batch."""
-        waiting: pl.DataFrame | None = None
-        for batch in self.batches:
-            rows = batch if waiting is None else pl.concat([waiting, batch])
-            if rows.height > 1:
-                yield self._judge(rows.head(rows.height - 1), rows[self._time][-1])
-            waiting = rows.tail(1)
-        if waiting is not None and waiting.height:
-            yield self._judge(waiting, None)
-
-    def _judge(self, rows: pl.DataFrame, after_s: float | None) -> pl.DataFrame:
-        """Check times. A row far ahead is `isolated`, or all rows after it would be late."""
-        time_s = rows[self._time].to_numpy()
-        before_s = np.concatenate([[self._before_s], time_s[:-1]])
-        next_s = np.append(time_s[1:], np.nan if after_s is None else after_s)
-        with np.errstate(invalid="ignore"):
-            ahead = (time_s - before_s > self._gap_s) & (next_s < time_s)
-        usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
-        right_s = np.maximum.accumulate(np.concatenate([[self._right_s], usable]))
-        late, twice = time_s < right_s[:-1], time_s == right_s[:-1]
-        reasons: pl.Series | pl.Expr = pl.lit(None, pl.String)
-        if (late | twice | ahead).any():
-            names = np.select(
-                [ahead, late, twice], ["isolated", "time_backwards", "time_duplicate"], ""
+        A row far ahead of both neighbours is `isolated`, or all rows after it would be late. So the
+        last row of a batch waits for the next one.
+        """
+        row, before_s = 0, np.nan
+        waiting = pl.DataFrame(schema=self.columns)
+        slices = (piece for batch in self.batches for piece in batch.iter_slices(count))
+        for piece in chain(slices, [None]):
+            rows = waiting if piece is None else pl.concat([waiting, piece])
+            ready, waiting = (rows, rows) if piece is None else (rows.head(-1), rows.tail(1))
+            if not ready.height:
+                continue
+            next_s = np.append(rows[self._time].to_numpy(), np.nan)[1 : ready.height + 1]
+            time_s = ready[self._time].to_numpy()
+            with np.errstate(invalid="ignore"):
+                step_s = np.diff(time_s, prepend=before_s)
+            ahead = (step_s > self._gap_s) & (next_s < time_s)
+            usable = np.where(ahead | ~np.isfinite(time_s), -np.inf, time_s)
+            right_s = np.maximum.accumulate(np.append(self.end_s, usable))
+            disorder = (
+                pl.when(pl.Series(ahead))
+                .then(pl.lit("isolated"))
+                .when(pl.Series(time_s < right_s[:-1]))
+                .then(pl.lit("time_backwards"))
+                .when(pl.Series(time_s == right_s[:-1]))
+                .then(pl.lit("time_duplicate"))
             )
-            reasons = pl.Series(names.tolist()).replace("", None)
-        self._before_s, self._right_s = time_s[-1], right_s[-1]
-        first, self._judged_rows = self._judged_rows + 1, self._judged_rows + rows.height
-        return rows.with_columns(
-            reasons.alias(DISORDER),
-            pl.int_range(first, self._judged_rows + 1, dtype=pl.Int64).alias(ROW),
-            pl.Series(_RIGHT, right_s[1:]),
-        )
-
-    def fill(self) -> bool:
-        """Read the next rows if none wait. Returns True if some wait now."""
-        if not self._rows.height:
-            self._rows = next(self._slices, self._rows)
-        return self._rows.height > 0
-
-    @property
-    def end_s(self) -> float:
-        """The last right time so far."""
-        return float(self._right_s)
-
-    @property
-    def reached(self) -> float:
-        """The time of the last row that waits."""
-        return float(self._rows[_RIGHT][-1])
-
-    def take(self, until: float) -> pl.DataFrame:
-        """Return the waiting rows up to a time."""
-        number = int(self._rows[_RIGHT].search_sorted(until, side="right"))
-        taken, self._rows = self._rows.head(number), self._rows.slice(number)
-        return taken.with_columns(self._number)
-
-
-def _resized(batches: Iterator[pl.DataFrame], count: int) -> Iterator[pl.DataFrame]:
-    """Yield the rows of batches in frames of `count` rows; joins small batches, splits large."""
-    small: list[pl.DataFrame] = []
-    for batch in batches:
-        small.append(batch)
-        if sum(batch.height for batch in small) >= count:
-            yield from pl.concat(small).iter_slices(count)
-            small = []
-    if small:
-        yield from pl.concat(small).iter_slices(count)
-
-
-class _HeldColumn:
-    """A column of one base whose last value applies to the rows of all bases."""
-
-    def __init__(self, name: str, base: int, time: str, longest_s: float) -> None:
-        self._name, self._longest_s = name, longest_s
-        self._is_stated = (
-            pl.col(name).is_not_null()
-            & (pl.col(BASE) == base)
-            & pl.col(DISORDER).is_null()
-            & pl.col(time).is_finite()
-        )
-        self._last: list[pl.DataFrame] = []
-
-    def hold(self, rows: pl.DataFrame) -> pl.Series:
-        """Return the last value at the time of each row, null if it is too old."""
-        stated = rows.filter(self._is_stated).select(
-            _RIGHT, pl.col(self._name).alias(HELD + self._name)
-        )
-        values = pl.concat([*self._last, stated]).set_sorted(_RIGHT)
-        self._last = [values.tail(1)]
-        held = rows.select(_RIGHT).join_asof(values, on=_RIGHT, tolerance=self._longest_s)
-        return held[HELD + self._name]
+            yield ready.with_columns(
+                disorder.alias(DISORDER),
+                pl.lit(number, pl.Int32).alias(BASE),
+                pl.int_range(row + 1, row + ready.height + 1, dtype=pl.Int64).alias(ROW),
+                pl.Series(_RIGHT, right_s[1:]),
+            )
+            row, before_s, self.end_s = row + ready.height, time_s[-1], right_s[-1]

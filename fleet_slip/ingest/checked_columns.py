@@ -4,6 +4,7 @@ A batch's columns carry the prefix `RAW`, so that no name in a file can meet one
 for a pattern, or be anything but a name.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,8 +21,6 @@ from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.batches import DISORDER, HELD, LATER, ROW, read_batches, read_columns
 from fleet_slip.ingest.columns import (
-    DateColumn,
-    SignalColumn,
     as_number,
     count_range,
     describe,
@@ -53,9 +52,35 @@ class RowField:
     faults: Faults
 
 
-def find_held(column: str, schema: pl.Schema) -> str:
-    """Return the column with another column's last value, for rows of several time bases."""
-    return HELD + column if RAW + HELD + column in schema else column
+@dataclass(frozen=True)
+class RawColumns:
+    """The raw columns of batches with one schema, read as a mapping states."""
+
+    schema: pl.Schema
+    mapping: Mapping
+
+    def held(self, column: str) -> str:
+        """Return the column with a column's last value, for rows of several time bases."""
+        return HELD + column if RAW + HELD + column in self.schema else column
+
+    def kind(self, column: str) -> pl.DataType:
+        """Return the type of a column."""
+        return self.schema[RAW + column]
+
+    def text(self, column: str) -> pl.Expr:
+        """Return a column as text, whole numbers without a point, null for missing."""
+        raw = pl.col(RAW + column)
+        text = raw.cast(pl.String)
+        if self.kind(column) == pl.Float64:
+            integer = raw.cast(pl.Int64, strict=False)
+            text = pl.when(integer == raw).then(integer.cast(pl.String)).otherwise(text)
+        return without_missing(text, self.mapping.missing)
+
+    def number(self, column: str) -> pl.Expr:
+        """Return a column as float64, null for missing, NaN for other texts."""
+        raw, missing = pl.col(RAW + column), self.mapping.missing
+        comma = self.mapping.csv.decimal_comma
+        return as_number(column, raw, self.kind(column), missing, decimal_comma=comma)
 
 
 def _number_faults(name: str, reason: str, is_faulty: pl.Expr) -> Faults:
@@ -68,32 +93,16 @@ MAX_WHOLE = 2.0**53
 """From this number on, neighbouring whole numbers are the same float."""
 
 
-def as_text(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
-    """Return a column as text, whole numbers without a point, null for missing."""
-    raw = pl.col(RAW + column)
-    text = raw.cast(pl.String)
-    if schema[RAW + column] == pl.Float64:
-        integer = raw.cast(pl.Int64, strict=False)
-        text = pl.when(integer == raw).then(integer.cast(pl.String)).otherwise(text)
-    return without_missing(text, mapping.missing)
-
-
-def _number(column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
-    """Return a column as float64, null for missing, NaN for other texts."""
-    kind, comma = schema[RAW + column], mapping.csv.decimal_comma
-    return as_number(column, pl.col(RAW + column), kind, mapping.missing, decimal_comma=comma)
-
-
 _FIRST_DAY, _END_DAY = date(1970, 1, 1), date(2200, 1, 1)
 
 
-def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
+def day_field(name: str, column: str, columns: RawColumns) -> RowField:
     """Return the field of a day. Raises `ValueError` for a column that is none."""
     raw, value = pl.col(RAW + column), pl.col(name)
     text = raw
-    match schema[RAW + column]:
+    match columns.kind(column):
         case pl.String:
-            text = without_missing(raw, mapping.missing)
+            text = without_missing(raw, columns.mapping.missing)
             days = [text.str.to_date(f, strict=False) for f in ("%Y-%m-%d", "%d.%m.%Y")]
             day = pl.coalesce(days)
         case pl.Date | pl.Datetime:
@@ -105,10 +114,10 @@ def day_field(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> Ro
     return RowField(name, "key", raw, day, faults)
 
 
-def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
+def time_field(column: str, columns: RawColumns) -> RowField:
     """Return the field of the time in s, since 1970 for timestamps. Raises `ValueError`."""
-    raw, value, time = pl.col(RAW + column), pl.col("time"), mapping.time
-    faults = {"missing": value.is_null()}
+    raw, value, mapping = pl.col(RAW + column), pl.col("time"), columns.mapping
+    time, faults = mapping.time, {"missing": value.is_null()}
     if column == OWN_TIME or time.unit is not None:
         faults |= {"not_a_number": value.is_nan(), "not_finite": value.is_infinite()}
     else:
@@ -118,22 +127,20 @@ def time_field(column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
             faults["out_of_range"] = (value < 0) | (value >= days * 86_400)
     if column == OWN_TIME:
         return RowField("time", "time", raw, raw, faults)
+    dates = None
+    if time.date is not None:  # dates of digits alone get the zeros that a number lacks
+        digits = _FIRST_DAY.strftime(time.date.format)
+        dates = columns.text(columns.held(time.date.column))
+        dates = dates.str.zfill(len(digits)) if digits.isdigit() else dates
     time_s = time.in_s(
         raw,
-        schema[RAW + column],
+        columns.kind(column),
         missing=mapping.missing,
         decimal_comma=mapping.csv.decimal_comma,
-        dates=_dates(time.date, schema, mapping) if time.date else None,
-        later=pl.col(RAW + LATER) if RAW + LATER in schema else None,
+        dates=dates,
+        later=pl.col(RAW + LATER) if RAW + LATER in columns.schema else None,
     )
     return RowField("time", "time", raw, time_s, faults)
-
-
-def _dates(date: DateColumn, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
-    """Return dates as text; dates of digits alone get the leading zeros that a number lacks."""
-    text = as_text(find_held(date.column, schema), schema, mapping)
-    digits = _FIRST_DAY.strftime(date.format)
-    return text.str.zfill(len(digits)) if digits.isdigit() else text
 
 
 # The fields of a mapping: values in SI units and their problems.
@@ -142,25 +149,26 @@ MAX_VALUE_CHARACTERS = 200
 """Characters of offending values that are kept."""
 
 
-def fields_of(mapping: Mapping, schema: pl.Schema) -> list[RowField]:
-    """Return the fields of a batch with this schema: drive metadata, time, signals, conditions.
+def fields_of(columns: RawColumns) -> list[RowField]:
+    """Return the fields of a batch: drive metadata, time, signals, conditions.
 
     Raises `ValueError` if a column's type does not fit the mapping.
     """
+    mapping, schema = columns.mapping, columns.schema
     fields = [
-        _METADATA[name](name, find_held(column, schema), schema, mapping)
+        _METADATA[name](name, columns.held(column), columns)
         for name, column in _key_columns(mapping).items()
     ]
     time = OWN_TIME if RAW + OWN_TIME in schema else mapping.time.key
     if time is not None:
-        fields.append(time_field(time, schema, mapping))
+        fields.append(time_field(time, columns))
         if RAW + DISORDER in schema:
             # The faults of times within their base, found by `merge_bases`.
             reasons = ("time_backwards", "time_duplicate", "isolated")
             faults = {reason: pl.col(RAW + DISORDER) == reason for reason in reasons}
             fields.append(_condition(faults, raw=pl.col(RAW + time), name="time"))
     names = [name for name in mapping.signal_catalog.signals if name in mapping.signals]
-    signals = [_signal(name, schema, mapping) for name in names]
+    signals = [_signal(name, columns) for name in names]
     nothing = pl.all_horizontal([pl.col(name).is_null() for name in names])
     fields += [*signals, _condition({"no_value": nothing}, raw=pl.lit(None, pl.String))]
     if RAW + EXTRA_FIELDS in schema:
@@ -178,28 +186,25 @@ def _key_columns(mapping: Mapping) -> dict[str, str]:
     return columns if mapping.drive.column is None else {"drive": mapping.drive.column, **columns}
 
 
-def meets_conditions(mapping: Mapping, schema: pl.Schema) -> pl.Expr:
-    """Return whether a row meets all of the mapping's conditions. Raises `ValueError`."""
-    predicates = []
-    for condition in mapping.where:
-        column = find_held(condition.column, schema)
-        read = as_text if condition.one_of else _number
-        predicates.append(condition.is_met(read(column, schema, mapping)))
-    return pl.all_horizontal(predicates)
-
-
 def _condition(faults: Faults, raw: pl.Expr, name: str = "") -> RowField:
     return RowField(name, "condition", raw, raw, faults)
 
 
-def _signal(name: str, schema: pl.Schema, mapping: Mapping) -> RowField:
+def _signal(name: str, columns: RawColumns) -> RowField:
     """Return a signal in SI units; its range is checked on the count that it becomes."""
+    mapping = columns.mapping
     source = mapping.signals[name]
-    raw = pl.col(RAW + source.column)
-    number = _signed(source, source.column, schema, mapping)
+    value = columns.number(source.column)
+    if source.sign is not None:
+        sign = columns.text(columns.held(source.sign.column))
+        is_negative = sign == str(source.sign.negative)
+        value = pl.when(is_negative).then(-value).when(sign.is_not_null()).then(value)
+    gain, bias = source.linear(mapping.signal_catalog[name].unit)
+    if (gain, bias) != (1.0, 0.0):  # otherwise it would change nothing but the sign of zero
+        value = value * gain + bias
     least, largest = _value_range(*count_range(mapping.signal_catalog, name, source))
     faults = _number_faults(name, "out_of_range", ~pl.col(name).is_between(least, largest))
-    return RowField(name, "signal", raw, _si_value(mapping, name, source, number), faults)
+    return RowField(name, "signal", pl.col(RAW + source.column), value, faults)
 
 
 def _value_range(signal: Signal, low: int, high: int) -> tuple[float, float]:
@@ -213,33 +218,16 @@ def _value_range(signal: Signal, low: int, high: int) -> tuple[float, float]:
     return float(least), float(largest)
 
 
-def _signed(source: SignalColumn, column: str, schema: pl.Schema, mapping: Mapping) -> pl.Expr:
-    """Return a column as a number, with the sign of another column."""
-    number = _number(column, schema, mapping)
-    if source.sign is None:
-        return number
-    sign = as_text(find_held(source.sign.column, schema), schema, mapping)
-    is_negative = sign == str(source.sign.negative)
-    return pl.when(is_negative).then(-number).when(sign.is_not_null()).then(number)
-
-
-def _si_value(mapping: Mapping, name: str, source: SignalColumn, number: pl.Expr) -> pl.Expr:
-    gain, bias = source.linear(mapping.signal_catalog[name].unit)
-    # Otherwise it would change nothing but the sign of zero.
-    return number if (gain, bias) == (1.0, 0.0) else number * gain + bias
-
-
-def _positive(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    number = _number(column, schema, mapping)
+def _positive(name: str, column: str, columns: RawColumns) -> RowField:
     faults = _number_faults(name, "out_of_range", pl.col(name) <= 0)
-    return RowField(name, "key", pl.col(RAW + column), number, faults)
+    return RowField(name, "key", pl.col(RAW + column), columns.number(column), faults)
 
 
-def _text(name: str, column: str, schema: pl.Schema, mapping: Mapping) -> RowField:
-    text = as_text(column, schema, mapping)
+def _text(name: str, column: str, columns: RawColumns) -> RowField:
+    text = columns.text(column)
     value = text.map_batches(partial(_map_texts, normalize_name, pl.String), pl.String)
     faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
-    if schema[RAW + column] == pl.Float64:  # which has lost digits of longer numbers
+    if columns.kind(column) == pl.Float64:  # which has lost digits of longer numbers
         faulty |= pl.col(RAW + column).abs() >= MAX_WHOLE
     faults = {"missing": pl.col(name).is_null(), "out_of_range": faulty}
     return RowField(name, "key", pl.col(RAW + column), value, faults)
@@ -258,7 +246,7 @@ def _map_texts(
     return texts.replace_strict(different, values, default=None, return_dtype=kind)
 
 
-_METADATA: dict[str, Callable[[str, str, pl.Schema, Mapping], RowField]] = {
+_METADATA: dict[str, Callable[[str, str, RawColumns], RowField]] = {
     "drive": _text,
     "vehicle_id": _text,
     "vehicle_model": _text,
@@ -277,65 +265,68 @@ MAX_KEYS = 100_000
 """Combinations of drive metadata in one file, of whatever rows."""
 
 
-CheckedRows: TypeAlias = tuple[pl.DataFrame, pl.DataFrame]
-"""The good rows of a batch, and the refused ones."""
-
-
-class RowChecker:
-    """Checks the rows of a file and counts them.
+@dataclass
+class IngestCounts:
+    """Counts of a file's rows: each row read is left out, kept or quarantined.
 
     Attributes
     ----------
-    rows
-        Read so far.
-    left_out
-        Of these, those that do not meet the mapping's conditions.
-    keys
-        The metadata of each number in the column `group`.
+    rows_left_out
+        Rows that do not meet the mapping's conditions.
+    quarantined
+        Refused rows by reason.
+    ticks
+        Rows of the result; equal to `rows_kept` where nothing was resampled.
     """
 
-    def __init__(self, file: Path, mapping: Mapping) -> None:
-        """Take a file that is not open yet."""
-        self._file, self._mapping = file, mapping
-        self.rows = self.left_out = 0
-        self.keys = DriveKeys()
+    rows_read: int = 0
+    rows_left_out: int = 0
+    rows_kept: int = 0
+    quarantined: dict[str, int] = dataclasses.field(default_factory=dict)
+    drives: int = 0
+    drives_resampled: int = 0
+    ticks: int = 0
 
-    def blocks(self) -> Iterator[CheckedRows]:
-        """Yield the rows of each batch. Raises `InputError`."""
-        for batch in read_batches(self._file, self._mapping):
-            yield self._check(batch)
-        if not self.rows:
-            raise InputError(f"{quote_name(self._file)}: a header without rows. Export it again.")
-        if self.left_out == self.rows:
-            raise InputError(
-                f"{quote_name(self._file)}: none of {self.rows:,} rows meets the condition of "
-                f"mapping {self._mapping.name!r}: {describe(self._mapping.where)}."
-            )
 
-    def _check(self, batch: pl.DataFrame) -> CheckedRows:
+def check_rows(
+    file: Path, mapping: Mapping, keys: "DriveKeys", counts: IngestCounts
+) -> Iterator[tuple[pl.DataFrame, pl.DataFrame]]:
+    """Yield the good rows of each batch, and the refused ones; count the rows that were read.
+
+    Raises `InputError`.
+    """
+    for batch in read_batches(file, mapping):
         raw = _without_nan(batch.rename({name: RAW + name for name in batch.columns}))
         try:
-            fields, meeting = _understand(self._mapping, tuple(raw.schema.items()))
+            fields, meeting = _understand(mapping, tuple(raw.schema.items()))
         except ValueError as error:
-            raise InputError(f"{quote_name(self._file)}: {error}") from None
+            raise InputError(f"{quote_name(file)}: {error}") from None
         if RAW + ROW in raw.columns:
             raw = raw.rename({RAW + ROW: "row", RAW + BASE: "base"})
         else:
-            row = pl.int_range(self.rows + 1, self.rows + batch.height + 1, dtype=pl.Int64)
-            raw = raw.with_columns(row.alias("row"))
+            first, end = counts.rows_read + 1, counts.rows_read + raw.height + 1
+            raw = raw.with_columns(pl.int_range(first, end, dtype=pl.Int64).alias("row"))
+        counts.rows_read += raw.height
         if meeting is not None:
-            raw = raw.filter(meeting)
-        self.rows += batch.height
-        self.left_out += batch.height - raw.height
-        rows, refused = _split(raw, self.keys.number(raw, fields), fields)
-        if len(self.keys.metadata) > MAX_KEYS:
+            selected = raw.filter(meeting)
+            counts.rows_left_out += raw.height - selected.height
+            raw = selected
+        rows, refused = _split(raw, keys.number(raw, fields), fields)
+        if len(keys.metadata) > MAX_KEYS:
             raise InputError(
-                f"{quote_name(self._file)}: more than {MAX_KEYS:,} combinations of drive metadata. "
-                f"Check the columns under [drive] in the mapping {self._mapping.name!r}."
+                f"{quote_name(file)}: more than {MAX_KEYS:,} combinations of drive metadata. Check "
+                f"the columns under [drive] in the mapping {mapping.name!r}."
             )
-        if self._mapping.time.rate_hz is not None:
-            rows = rows.with_columns((pl.col("row") / self._mapping.time.rate_hz).alias("time"))
-        return rows, refused
+        if mapping.time.rate_hz is not None:
+            rows = rows.with_columns((pl.col("row") / mapping.time.rate_hz).alias("time"))
+        yield rows, refused
+    if not counts.rows_read:
+        raise InputError(f"{quote_name(file)}: a header without rows. Export it again.")
+    if counts.rows_left_out == counts.rows_read:
+        raise InputError(
+            f"{quote_name(file)}: none of {counts.rows_read:,} rows meets the condition of mapping "
+            f"{mapping.name!r}: {describe(mapping.where)}."
+        )
 
 
 def _without_nan(batch: pl.DataFrame) -> pl.DataFrame:
@@ -354,9 +345,12 @@ def _understand(
     mapping: Mapping, columns: tuple[tuple[str, pl.DataType], ...]
 ) -> tuple[list[RowField], pl.Expr | None]:
     """Return the fields of batches with these columns: the same for all files of a folder."""
-    schema = pl.Schema(columns)
-    fields = fields_of(mapping, schema)
-    return fields, meets_conditions(mapping, schema) if mapping.where else None
+    raw = RawColumns(pl.Schema(columns), mapping)
+    predicates = []
+    for condition in mapping.where:
+        read = raw.text if condition.one_of else raw.number
+        predicates.append(condition.is_met(read(raw.held(condition.column))))
+    return fields_of(raw), pl.all_horizontal(predicates) if predicates else None
 
 
 class DriveKeys:
@@ -383,22 +377,20 @@ class DriveKeys:
         is_head = pl.any_horizontal(*changes, pl.int_range(pl.len()) == 0)
         run = batch.select(is_head.alias("head"))["head"]
         heads = batch.select(sources).filter(run).with_columns(_values(keys))
-        numbers = self._number_keys(heads, keys)
-        return numbers.gather(run.cum_sum() - 1)
-
-    def _number_keys(self, rows: pl.DataFrame, keys: list[RowField]) -> pl.Series:
-        """Return the number of each row's key, null where it is faulty."""
         names = [field.name for field in keys]
-        faulty = pl.any_horizontal(fault for field in keys for fault in field.faults.values())
-        sound = rows.with_columns(faulty.fill_null(value=False).alias("\0faulty"))
-        combinations = sound.filter(~pl.col("\0faulty")).select(names).unique(maintain_order=True)
-        fresh = [key for key in combinations.rows() if key not in self._numbers]
-        self._numbers |= {key: number for number, key in enumerate(fresh, len(self._numbers))}
-        self.metadata += [dict(zip(names, key, strict=True)) for key in fresh]
-        numbers = [self._numbers[key] for key in combinations.rows()]
+        faults = [fault for field in keys for fault in field.faults.values()]
+        is_sound = heads.select(~pl.any_horizontal(faults).fill_null(value=False)).to_series()
+        combinations = heads.filter(is_sound).select(names).unique(maintain_order=True)
+        for key in combinations.iter_rows():
+            if key not in self._numbers:
+                self._numbers[key] = len(self._numbers)
+                self.metadata.append(dict(zip(names, key, strict=True)))
+        numbers = [self._numbers[key] for key in combinations.iter_rows()]
         numbered = combinations.with_columns(pl.Series("group", numbers, pl.Int32))
-        joined = sound.join(numbered, on=names, how="left", nulls_equal=True, maintain_order="left")
-        return joined.select(pl.when(~pl.col("\0faulty")).then("group"))["group"]
+        groups = heads.join(
+            numbered, on=names, how="left", nulls_equal=True, maintain_order="left"
+        ).select(pl.when(is_sound).then("group"))
+        return groups["group"].gather(run.cum_sum() - 1)
 
 
 LARGE_FILE_BYTES = 2**22
@@ -408,7 +400,7 @@ LARGE_FILE_BYTES = 2**22
 def is_grouped(file: Path, mapping: Mapping) -> bool:
     """Return True if the rows of each drive are together. Reads these columns only.
 
-    False for small files, several time bases, and a file whose faults `RowChecker` reports.
+    False for small files, several time bases, and a file whose faults `check_rows` reports.
     """
     columns = _key_columns(mapping)
     if not columns:
@@ -420,10 +412,8 @@ def is_grouped(file: Path, mapping: Mapping) -> bool:
     with suppress(InputError, ValueError):
         for batch in read_columns(file, mapping, [*dict.fromkeys(columns.values())]):
             raw = batch.rename({name: RAW + name for name in batch.columns})
-            fields = [
-                _METADATA[name](name, column, raw.schema, mapping)
-                for name, column in columns.items()
-            ]
+            of_batch = RawColumns(raw.schema, mapping)
+            fields = [_METADATA[name](name, column, of_batch) for name, column in columns.items()]
             groups = raw.select(keys.number(raw, fields))["group"].drop_nulls()
             if not groups.is_sorted() or (len(groups) and groups[0] < latest):
                 return False
@@ -465,10 +455,10 @@ def _split(
         fault.fill_null(value=False).alias(str(i)) for i, (_, _, fault) in enumerate(faults)
     )
     is_refused, pieces = pl.repeat(value=False, n=valued.height, eager=True), [no_rows()]
-    for (field, reason, _), mask in zip(faults, masks, strict=True):
+    for (source, reason, _), mask in zip(faults, masks, strict=True):
         if mask.any():
             bad = valued.filter(mask & ~is_refused)
-            pieces.append(_refused(bad, reason, field.name or None, field.raw))
+            pieces.append(_refused(bad, reason, source.name or None, source.raw))
             is_refused |= mask
     return valued.filter(~is_refused).select(columns), pl.concat(pieces)
 

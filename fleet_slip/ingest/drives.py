@@ -48,21 +48,20 @@ class DriveSamples:
     @cached_property
     def intervals_s(self) -> dict[int, float]:
         """The median time between two rows of each base; that of a tick for a single row."""
-        steps_s = {
-            base: pl.Series(np.diff(rows["time"].to_numpy())).median()
-            for base, rows in self.bases.items()
+        steps_s = {base: np.diff(rows["time"].to_numpy()) for base, rows in self.bases.items()}
+        return {
+            b: float(np.median(steps)) if steps.size else STEP_S for b, steps in steps_s.items()
         }
-        return {b: step if isinstance(step, float) else STEP_S for b, step in steps_s.items()}
+
+    @property
+    def frame(self) -> pl.DataFrame:
+        """All rows in one frame."""
+        return pl.concat(self.bases.values(), how="diagonal")
 
     def interval_of(self, signal: str) -> float:
         """Return the usual time between the samples of a signal's time base."""
         bases = (base for base, rows in self.bases.items() if signal in rows.columns)
         return self.intervals_s.get(next(bases, -1), STEP_S)
-
-    @cached_property
-    def frame(self) -> pl.DataFrame:
-        """All rows in one frame."""
-        return pl.concat(self.bases.values(), how="diagonal")
 
     def column(self, name: str) -> pl.Series:
         """Return a column of the only base."""
@@ -72,9 +71,8 @@ class DriveSamples:
     def samples(self, name: str) -> pl.DataFrame:
         """Return `time` and a signal where it has a value, by time."""
         frames = [rows.select("time", name) for rows in self.bases.values() if name in rows.columns]
-        if not frames:
-            return pl.DataFrame(schema={"time": pl.Float64, name: pl.Float64})
-        samples = pl.concat(frames).drop_nulls(name)
+        empty = pl.DataFrame(schema={"time": pl.Float64, name: pl.Float64})
+        samples = pl.concat([empty, *frames]).drop_nulls(name)
         return samples if samples["time"].is_sorted() else samples.sort("time", maintain_order=True)
 
 

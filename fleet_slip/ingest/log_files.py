@@ -287,11 +287,14 @@ def group_lake(files: Iterable[Path]) -> list[Path]:
     return [*files_alone, *sorted(groups)]
 
 
-def seconds_of(column: pl.Series, time: TimeBase, formats: FileFormats) -> pl.Series:
-    """Return times in s, NaN for other texts. Raises `ValueError` for another type."""
-    return column.to_frame().select(
-        time.in_s(pl.col(column.name), column.dtype, decimal_comma=formats.csv.decimal_comma)
-    )[column.name]
+def seconds_of(column: pl.Series, time: TimeBase, formats: FileFormats, log: Path) -> pl.Series:
+    """Return times in s, NaN for other texts. Raises `InputError` for another type."""
+    comma = formats.csv.decimal_comma
+    try:
+        seconds = time.in_s(pl.col(column.name), column.dtype, decimal_comma=comma)
+    except ValueError as error:
+        raise InputError(f"{quote_name(log)}: {error}") from None
+    return column.to_frame().select(seconds)[column.name]
 
 
 class GroupSource(Source):
@@ -355,15 +358,9 @@ class GroupSource(Source):
                     )
                 base = self._times.get(member) or TimeBase(column=time)
                 for rows in source.batches(list(dict.fromkeys([time, *names]))):
-                    times_s = self._seconds(rows[time], base, file).alias(OWN_TIME)
+                    times_s = seconds_of(rows[time], base, self._formats, file).alias(OWN_TIME)
                     rows_with_times = rows.select(*names).rename(named).with_columns(times_s)
-                    yield rows_with_times.filter(pl.col(OWN_TIME).is_not_null())
-
-    def _seconds(self, column: pl.Series, time: TimeBase, file: Path) -> pl.Series:
-        try:
-            return seconds_of(column, time, self._formats)
-        except ValueError as error:
-            raise InputError(f"{quote_name(file)}: {error}") from None
+                    yield rows_with_times.drop_nulls(OWN_TIME)
 
 
 def open_log(

@@ -25,9 +25,10 @@ from fleet_slip.catalog.counts import as_arrow, as_floats
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.compute.tasks import run_tasks
 from fleet_slip.errors import ConfigError, ConflictError, InputError, RepeatedError
+from fleet_slip.ingest.checked_columns import IngestCounts
 from fleet_slip.ingest.log_files import size_of
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured_log import IngestCounts, MeasuredLog, open_measured
+from fleet_slip.ingest.measured_log import MeasuredLog, open_measured
 from fleet_slip.ingest.recordings import (
     FILES,
     Duplicates,

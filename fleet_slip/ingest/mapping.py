@@ -357,6 +357,11 @@ class Mapping(Config):
             for time, names in bases.items()
         }
 
+    @property
+    def columns(self) -> set[str]:
+        """All columns that the mapping uses."""
+        return {name for names in self.time_bases().values() for name in names}
+
     def common_columns(self) -> list[str]:
         """Return the columns that apply to all signals: metadata of drives, and conditions."""
         metadata = (getattr(self.drive, name) for name in DriveMetadata.model_fields)

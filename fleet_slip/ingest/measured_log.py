@@ -7,7 +7,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Named
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from datetime import date
 from io import BytesIO
 from itertools import accumulate
@@ -21,7 +20,13 @@ from fleet_slip.base import canonical_ascii, pluralize, quote_name
 from fleet_slip.catalog.signals import LONGEST_PAUSE_S
 from fleet_slip.compute.tasks import read_ahead
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.checked_columns import RowChecker, describe_refused, is_grouped
+from fleet_slip.ingest.checked_columns import (
+    DriveKeys,
+    IngestCounts,
+    check_rows,
+    describe_refused,
+    is_grouped,
+)
 from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S
 from fleet_slip.ingest.drives import DriveCutter, DriveSamples, sort_by_group
 from fleet_slip.ingest.formats.reading import file_errors, require_unchanged_log
@@ -40,29 +45,6 @@ SHORT_ROWS = 1000
 MAX_TICKS = 40_000_000
 """Maximum ticks of all drives of a file that has few rows for them."""
 MAX_TICKS_PER_ROW = 1000
-
-
-@dataclass
-class IngestCounts:
-    """Counts of a file's rows: each row read is left out, kept or quarantined.
-
-    Attributes
-    ----------
-    rows_left_out
-        Rows that do not meet the mapping's conditions.
-    quarantined
-        Refused rows by reason.
-    ticks
-        Rows of the result; equal to `rows_kept` where nothing was resampled.
-    """
-
-    rows_read: int = 0
-    rows_left_out: int = 0
-    rows_kept: int = 0
-    quarantined: dict[str, int] = field(default_factory=dict)
-    drives: int = 0
-    drives_resampled: int = 0
-    ticks: int = 0
 
 
 REFUSED_ROWS = 2**18
@@ -128,7 +110,7 @@ class MeasuredLog:
         self.file, self.mapping, self.digest = file, mapping, digest
         self.fingerprint = f"{PREFIX}{content[:16]}"
         self.prefix = f"{mapping.name}-{digest[:12]}"
-        self.checker = RowChecker(file, mapping)
+        self._keys = DriveKeys()
         self.counts = IngestCounts()
         self.longest: MeasuredDrive | None = None
         self._rejected = RejectedRows()
@@ -138,7 +120,7 @@ class MeasuredLog:
         self._implausible_days: list[tuple[date, str]] = []
         self._trips: dict[int, tuple[str, float]] = {}
         """The trip of each group's last drive, and when that ended."""
-        self._under_way: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        self._under_way = defaultdict[str, list[tuple[float, float]]](list)
         """The first and the last time of the drives of each car, where they are dated."""
         self.name = os.fsencode(file.name).decode("utf-8", "replace")
         self._stem = self.name.split(".", 1)[0] or self.name
@@ -159,10 +141,9 @@ class MeasuredLog:
 
     def _checked_rows(self) -> Iterator[pl.DataFrame]:
         """Yield the good rows of each batch; keep the others."""
-        for rows, refused in self.checker.blocks():
+        for rows, refused in check_rows(self.file, self.mapping, self._keys, self.counts):
             self._rejected.add(refused)
             yield rows
-        self.counts.rows_read, self.counts.rows_left_out = self.checker.rows, self.checker.left_out
 
     def _drives(self, segments: Iterable[DriveSamples]) -> Iterator[MeasuredDrive]:
         for rows in segments:
@@ -179,7 +160,7 @@ class MeasuredLog:
         if not 0 <= rows.start_s - ended_s <= LONGEST_PAUSE_S:  # or the clock went back
             trip_id = name
         self._trips[group] = trip_id, rows.end_s
-        metadata = dict(self.checker.keys.metadata[group])
+        metadata = dict(self._keys.metadata[group])
         metadata["drive_name"] = metadata.pop("drive", self._stem)
         metadata |= {"source_file": self.name, "trip_id": trip_id}
         try:
@@ -204,6 +185,10 @@ class MeasuredLog:
         self._require_sane_drives()
         return drive
 
+    def _refuse(self, problem: str) -> InputError:
+        name = self.mapping.name
+        return InputError(f"{quote_name(self.file)}: {problem} in the mapping {name!r}.")
+
     def _require_sane_drives(self) -> None:
         """Raise `InputError` where drives are too many or too long for so few rows."""
         counts, problem = self.counts, ""
@@ -213,45 +198,40 @@ class MeasuredLog:
         if counts.ticks > MAX_TICKS and counts.ticks > MAX_TICKS_PER_ROW * counts.rows_kept:
             problem = f"{counts.rows_kept:,} rows span {counts.ticks:,} ticks of 100 Hz"
         if problem:
-            raise InputError(
-                f"{quote_name(self.file)}: {problem}. Check the unit of time, split_gap_s and the "
-                f"drive's column in the mapping {self.mapping.name!r}."
-            )
+            check = "Check the unit of time, split_gap_s and the drive's column"
+            raise self._refuse(f"{problem}. {check}")
 
     def _require_usable(self) -> None:
         """Raise `InputError` where no row, no tick, or no value of a signal came of all rows."""
-        counts, mapping, problem = self.counts, self.mapping, ""
+        counts, mapping = self.counts, self.mapping
         if not counts.rows_kept and (first := self._rejected.first):
             reasons = Counter(counts.quarantined)
             texts = ", ".join(f"{n:,} {reason}" for reason, n in reasons.most_common())
-            example = f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}"
-            problem = (
+            raise self._refuse(
                 f"none of {pluralize(reasons.total(), 'row')} is usable ({texts}; first: "
-                f"{example}). Check columns, units and time"
+                f"{first['signal'] or 'the row'} = {first['value']!r} in row {first['row']}). "
+                "Check columns, units and time"
             )
-        elif not counts.ticks:
-            gap_s = mapping.time.longest_gap_s
-            problem = (
-                f"no row is on a tick of 100 Hz, and longest_gap_s = {gap_s:g} prevents "
-                "interpolation. Raise it, if the signals change slowly enough,"
+        if not counts.ticks:
+            raise self._refuse(
+                "no row is on a tick of 100 Hz, and longest_gap_s = "
+                f"{mapping.time.longest_gap_s:g} prevents interpolation. Raise it, if the signals "
+                "change slowly enough,"
             )
-        else:
-            lost = [name for name in self._samples if not self._values[name]]
-            for signal in lost[:1]:
-                problem = (
-                    f"{signal} has {pluralize(self._samples[signal], 'value')} in "
+        for signal, count in self._samples.items():
+            if not self._values[signal]:
+                raise self._refuse(
+                    f"{signal} has {pluralize(count, 'value')} in "
                     f"{mapping.signals[signal].column!r}, and none is on a tick of 100 Hz: they "
                     "are further apart than longest_gap_s. Give the signal a longest_gap_s of its "
                     "own, or interpolate = false,"
                 )
-        if problem:
-            raise InputError(f"{quote_name(self.file)}: {problem} in the mapping {mapping.name!r}.")
 
     def quarantine(self) -> Iterator[pa.Table]:
         """Yield rejected rows as those of the table `quarantine`, once all drives were taken."""
         stated, stored = self.mapping.drive.vehicle_id, quarantine_schema()
         vehicle = stated if isinstance(stated, str) else None
-        metadata = enumerate(self.checker.keys.metadata)
+        metadata = enumerate(self._keys.metadata)
         groups = [(g, drive_id(self.prefix, g), m.get("vehicle_id", vehicle)) for g, m in metadata]
         schema = {"group": pl.Int32, "drive_id": pl.String, "vehicle_id": pl.String}
         names = pl.DataFrame(groups, schema, orient="row")
@@ -279,12 +259,9 @@ class MeasuredLog:
         if rate_khz > rate.high:
             faults.append(rate.fault("time", rate_khz=rate_khz))
         if days := self._implausible_days:
-            day, why = min(days)
-            faults.append(
-                CHECKS["date of a drive"].fault(
-                    "day", drives=pluralize(len(days), "drive"), day=day, why=why
-                )
-            )
+            drives, (day, why) = pluralize(len(days), "drive"), min(days)
+            check = CHECKS["date of a drive"]
+            faults.append(check.fault("day", drives=drives, day=day, why=why))
         faults += _unmapped_cars(self.file, self.mapping, counts.drives)
         if time.assumed:
             faults.append(CHECKS["assumed rate"].fault("rate_hz", rate_hz=time.rate_hz))
@@ -309,7 +286,7 @@ def _identity(file: Path, mapping: Mapping) -> tuple[str, str]:
     else:
         digest = _file_digest(file)
     content, of_folders = digest.copy(), partition_keys(file)
-    used = {name for names in mapping.time_bases().values() for name in names}
+    used = mapping.columns
     if keys := {key: text for key, text in of_folders.items() if key in used}:
         digest.update(canonical_ascii(keys).encode())
     content.update(canonical_ascii(of_folders).encode())
@@ -398,30 +375,25 @@ def _unmapped_cars(file: Path, mapping: Mapping, drives: int) -> Iterator[Fault]
     }
     if mapping.time.own_clock or not unmapped:
         return
-    used = {name for names in mapping.time_bases().values() for name in names}
     check = CHECKS["unused column of cars or trips"]
     with file_errors(file), open_log(file, mapping.formats) as source:
         names = [channel.name for channel in source.channels()]
-        free = [name for name in names if name not in used and names.count(name) == 1]
+        free = [n for n in names if n not in mapping.columns and names.count(n) == 1]
         for key, words in unmapped.items():
             for name in (name for name in free if is_called(words, name)):
-                count = _count_names(batch[name] for batch in source.batches([name]))
-                if count > check.high and (key == "vehicle_id" or count > drives):
+                values, rows = set[str](), 0
+                for batch in source.batches([name]):
+                    texts = batch[name].cast(pl.String).str.strip_chars().replace("", None)
+                    values.update(texts.drop_nulls().unique())
+                    rows += texts.count()
+                    if len(values) > MAX_NAMES:
+                        break
+                count = len(values)  # a quantity has more
+                is_name = check.high < count <= min(MAX_NAMES, rows // MIN_ROWS_PER_NAME)
+                if is_name and (key == "vehicle_id" or count > drives):
                     where = f"column = {json.dumps(name, ensure_ascii=False)}"
                     where = f"{key} = {{ {where} }}" if key != "column" else where
                     yield check.fault(name, count=count, where=where)
-
-
-def _count_names(pieces: Iterable[pl.Series]) -> int:
-    """Return how many names a column has; 0 if it is a quantity."""
-    values, rows = set[str](), 0
-    for piece in pieces:
-        texts = piece.cast(pl.String).str.strip_chars().replace("", None).drop_nulls()
-        values.update(texts.unique())
-        rows += len(texts)
-        if len(values) > MAX_NAMES:
-            return 0
-    return 0 if len(values) > rows // MIN_ROWS_PER_NAME else len(values)
 
 
 def _overlaps(under_way: list[tuple[float, float]]) -> int:

@@ -22,7 +22,7 @@ from fleet_slip.catalog.counts import as_floats, digest_counts, round_chunks
 from fleet_slip.catalog.course import COURSE, SATELLITE_SPEED
 from fleet_slip.catalog.signals import MEASURED, SignalCatalog
 from fleet_slip.errors import InputError
-from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S, WHEEL_PREFIX, SignalColumn
+from fleet_slip.ingest.columns import STEP_S, TIME_EPSILON_S, WHEEL_PREFIX
 from fleet_slip.ingest.drives import DriveSamples
 from fleet_slip.ingest.formats.source import EARLIEST_S
 from fleet_slip.ingest.mapping import DriveMetadata, FromColumn, LabelSensor, Mapping
@@ -87,7 +87,11 @@ def to_ticks(
     `logs`. Raises `InputError` for missing metadata.
     """
     signals, has_course = mapping.signal_catalog, COURSE in mapping.signals
-    grid = _grid_of(rows, fill_gaps=has_course)
+    if len(rows.bases) > 1:  # ticks of several time bases are interpolated
+        grid = choose_grid(np.array([0.0, rows.end_s - rows.start_s]), np.inf)
+    else:
+        time_s = rows.column("time").to_numpy() - rows.start_s
+        grid = choose_grid(time_s, rows.interval_of("time"), fill_gaps=has_course)
     counts = {}
     for signal, source in mapping.signals.items():
         if has_course and signal in {COURSE, SATELLITE_SPEED}:
@@ -188,14 +192,6 @@ def choose_grid(time_s: FloatArray, interval_s: float, *, fill_gaps: bool = Fals
     number = int(np.floor((span_s + TIME_EPSILON_S) / STEP_S)) + 1
     method: Method = "average" if is_fast else "interpolate"
     return TickGrid(method, np.arange(number, dtype=np.int32), float(time_s[0] + margin_s))
-
-
-def _grid_of(rows: DriveSamples, *, fill_gaps: bool) -> TickGrid:
-    """Return the ticks of a drive; those of several time bases are interpolated."""
-    if len(rows.bases) > 1:
-        return choose_grid(np.array([0.0, rows.end_s - rows.start_s]), np.inf)
-    time_s = rows.column("time").to_numpy() - rows.start_s
-    return choose_grid(time_s, next(iter(rows.intervals_s.values())), fill_gaps=fill_gaps)
 
 
 def _resample(rows: DriveSamples, signal: str, grid: TickGrid, mapping: Mapping) -> FloatArray:
@@ -347,8 +343,15 @@ def on_grid(
     Interpolates the course minus the integral of the yaw rate, which is the slip, between two near
     fixes. All arrays are of the ticks.
     """
-    fixes = ticks[~np.isnan(course)]
-    if fixes.size < 2 or _is_regular(fixes):
+    is_fix = ~np.isnan(course)
+    fixes = ticks[is_fix]
+    if fixes.size < 2:
+        return course, speed
+    later, tolerance = fixes + TICKS_PER_S, TICKS_PER_S // 10
+    following = np.searchsorted(fixes, later - tolerance)
+    has_later = following < np.searchsorted(fixes, later + tolerance, side="right")
+    # Of the fixes with another about a second later, most have one exactly then.
+    if not has_later.any() or np.isin(later, fixes)[has_later].mean() >= REGULAR:
         return course, speed
     heading = np.cumsum(np.nan_to_num(yaw_rate)) * STEP_S
     heading[np.isnan(yaw_rate)] = np.nan
@@ -356,7 +359,7 @@ def on_grid(
     spacing = GRIDS[np.argmin(np.abs(np.log(GRIDS / usual)))]
     chosen = ticks % spacing == 0
     gridded = []
-    for values in (np.unwrap((course - heading)[~np.isnan(course)]), speed[~np.isnan(course)]):
+    for values in (np.unwrap((course - heading)[is_fix]), speed[is_fix]):
         placed = np.full(ticks.size, np.nan)
         placed[chosen] = interpolate(
             fixes.astype(np.float64), values, ticks[chosen], MAX_TICKS_BETWEEN
@@ -365,76 +368,47 @@ def on_grid(
     return gridded[0] + heading, gridded[1]
 
 
-def _is_regular(fixes: NDArray[np.int32]) -> bool:
-    """Return whether most fixes that have one about a second later have one exactly then."""
-    later, tolerance = fixes + TICKS_PER_S, TICKS_PER_S // 10
-    following = np.searchsorted(fixes, later - tolerance)
-    has_later = following < np.searchsorted(fixes, later + tolerance, side="right")
-    return not has_later.any() or bool(np.isin(later, fixes)[has_later].mean() >= REGULAR)
-
-
 def _fixes(
     rows: DriveSamples, grid: TickGrid, mapping: Mapping, counts: dict[str, pa.Array]
 ) -> dict[str, pa.Array]:
-    """Return the counts of course and speed over ground, null between fixes."""
-    signals = mapping.signal_catalog
-    both = rows.samples(COURSE), rows.samples(SATELLITE_SPEED)
-    samples = both[0].join(both[1], on="time", how="inner", maintain_order="left")
-    fixes = fixes_on_ticks(
-        mapping.signals[COURSE],
-        samples["time"].to_numpy() - rows.start_s,
-        (samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()),
-        grid,
-        physical(signals, counts, "yaw_rate"),
-        physical(signals, counts, "ay") if "ay" in counts else None,
-    )
-    columns = zip((COURSE, SATELLITE_SPEED), fixes, strict=True)
-    return {name: round_chunks([values], signals[name]) for name, values in columns}
+    """Return the counts of course and speed at the ticks nearest to the fixes, null elsewhere.
 
-
-def fixes_on_ticks(
-    source: SignalColumn,
-    time_s: FloatArray,
-    fixes: tuple[FloatArray, FloatArray],
-    grid: TickGrid,
-    yaw_rate: FloatArray,
-    ay: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray]:
-    """Return course in rad and speed in m/s at the ticks nearest to the fixes, NaN elsewhere.
-
-    `fixes` are two columns without missing values, at `time_s`: the velocities to the north and to
-    the east, or course and speed, depending on `source`; `yaw_rate` in rad/s and `ay` in m/s² are
-    of the ticks. A sample that repeats the previous one is no fix. The course is NaN without a yaw
-    rate, below `MOVING_MPS`, and where it `is_held` or `is_backwards`.
+    A sample that repeats the previous one is no fix. The course is null without a yaw rate, below
+    `MOVING_MPS`, and where it `is_held` or `is_backwards`.
 
     In the car's axes the antenna moves by (-r y, r x) relative to the centre of gravity, with the
     yaw rate r; a slip β causes an error of r y β / speed. A fix that is measured a fraction of a
     tick before its tick is rotated by r times that time.
     """
-    course, speed = fixes
-    if source.component:
-        course, speed = np.arctan2(*fixes), np.hypot(*fixes)
+    signals, source = mapping.signal_catalog, mapping.signals[COURSE]
+    both = rows.samples(COURSE), rows.samples(SATELLITE_SPEED)
+    samples = both[0].join(both[1], on="time", how="inner", maintain_order="left")
+    course, speed = samples[COURSE].to_numpy(), samples[SATELLITE_SPEED].to_numpy()
+    if source.component:  # the velocities to the north and to the east
+        course, speed = np.arctan2(course, speed), np.hypot(course, speed)
     elif source.clockwise_from_north:
         course = np.pi / 2 - course
     is_new = (np.diff(course, prepend=np.nan) != 0) | (np.diff(speed, prepend=np.nan) != 0)
-    since = time_s[is_new] - source.delay_s - grid.start_s
+    time_s = samples["time"].to_numpy()[is_new] - rows.start_s
+    since = time_s - source.delay_s - grid.start_s
     nearest = np.rint(since / STEP_S)
     place, exists = find_ticks(grid.ticks, nearest)
     place, late_s = place[exists], (nearest * STEP_S - since)[exists]
     courses, speeds = (np.full(grid.ticks.size, np.nan) for _ in range(2))
-    if not place.size:
-        return courses, speeds
-    course, speed, r = course[is_new][exists], speed[is_new][exists], yaw_rate[place]
-    across = r * (source.antenna_x_m or 0.0)
-    along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
-    turned = course - np.arctan2(across, along) + r * late_s
-    speeds[place] = along + r * (source.antenna_y_m or 0.0)
-    sound = (speed >= MOVING_MPS) & ~is_held(course, yaw_rate, place)
-    if ay is not None:
-        sound &= ~is_backwards(yaw_rate, ay, speed, place)
-    courses[place] = np.where(sound, turned, np.nan)
-    courses, speeds = on_grid(grid.ticks, courses, speeds, yaw_rate)
-    return wrap_angle(courses), speeds
+    if place.size:
+        yaw_rate = physical(signals, counts, "yaw_rate")
+        course, speed, r = course[is_new][exists], speed[is_new][exists], yaw_rate[place]
+        across = r * (source.antenna_x_m or 0.0)
+        along = np.sqrt(np.maximum(speed**2 - across**2, 0.0))
+        turned = course - np.arctan2(across, along) + r * late_s
+        speeds[place] = along + r * (source.antenna_y_m or 0.0)
+        sound = (speed >= MOVING_MPS) & ~is_held(course, yaw_rate, place)
+        if "ay" in counts:
+            sound &= ~is_backwards(yaw_rate, physical(signals, counts, "ay"), speed, place)
+        courses[place] = np.where(sound, turned, np.nan)
+        courses, speeds = on_grid(grid.ticks, courses, speeds, yaw_rate)
+    columns = {COURSE: wrap_angle(courses), SATELLITE_SPEED: speeds}
+    return {name: round_chunks([values], signals[name]) for name, values in columns.items()}
 
 
 # The label is brought to the centre of gravity: with the yaw rate r, a sensor x before it and y to

@@ -13,9 +13,10 @@ import polars as pl
 import pytest
 
 from fleet_slip.errors import AlarmError, ConfigError, InputError, UsageError
+from fleet_slip.ingest.checked_columns import IngestCounts
 from fleet_slip.ingest.draft import answer_key, draft_mapping, open_keys, write_draft
 from fleet_slip.ingest.mapping import load_mapping
-from fleet_slip.ingest.measured_log import IngestCounts, open_measured
+from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.ingest.profile import profile_file
 from fleet_slip.ingest.signal_page import in_si, thinned
 from fleet_slip.ingest.ticks import MeasuredDrive

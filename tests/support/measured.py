@@ -14,9 +14,10 @@ import pytest
 from fleet_slip.base import quote_name
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.errors import InputError
+from fleet_slip.ingest.checked_columns import IngestCounts
 from fleet_slip.ingest.logs import IngestReport, ingest_files, log_table
 from fleet_slip.ingest.mapping import Mapping
-from fleet_slip.ingest.measured_log import IngestCounts, open_measured
+from fleet_slip.ingest.measured_log import open_measured
 from fleet_slip.warehouse.warehouse import Warehouse, quarantine_schema
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
