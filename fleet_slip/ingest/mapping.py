@@ -2,12 +2,14 @@
 
 import os
 import re
+from collections import defaultdict
 from collections.abc import Container, Iterable
 from contextlib import suppress
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
+import polars as pl
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -96,25 +98,6 @@ class LabelSensor(Config):
 
 # The metadata of drives, from the mapping, a column or the path.
 
-Fact = TypeVar("Fact")
-
-
-def signals_of(info: ValidationInfo) -> SignalCatalog:
-    """Return the signals that a mapping is validated against: the context of the validation."""
-    if not isinstance(info.context, SignalCatalog):
-        raise TypeError("a mapping is validated with a SignalCatalog as context")
-    return info.context
-
-
-def require_drive_column(fact: Fact, info: ValidationInfo) -> Fact:
-    """Return a fact of a drive. Raises `ValueError` if the catalog has no such column."""
-    if info.field_name not in signals_of(info).drive:
-        raise ValueError(
-            "the catalog has no such drive column. Copy it from the shipped one: "
-            "configs/signals.toml"
-        )
-    return fact
-
 
 class FromColumn(Config):
     """A drive's metadata in a column of the file. A new value begins a new drive."""
@@ -148,44 +131,16 @@ class FromPath(Config):
 
     def match(self, file: Path) -> tuple[Path, str] | None:
         """Return the folder above the pattern, and the text at `{}`; None for another path."""
-        path = os.path.abspath(file)  # noqa: PTH100 - follows no link
-        patterns, names = self.path.split("/"), path.split("/")[1:]
-        if len(names) < len(patterns):
+        depth, names = self.path.count("/") + 1, os.path.abspath(file).split("/")[1:]  # noqa: PTH100
+        if len(names) < depth:
             return None
-        matches = list(map(match_name, patterns, names[-len(patterns) :]))
-        if None in matches:
-            return None
-        return Path("/", *names[: -len(patterns)]), "".join(filter(None, matches))
-
-
-def match_name(pattern: str, name: str) -> str | None:
-    """Return the text that `{}` matches in a file's name, empty without one; None if none matches.
-
-    The time is that of the product of both lengths. A `*` takes as much as it can, the first one
-    first, and `{}` as little as it can, but one character.
-    """
-    elements = [element for element in re.split(r"(\{\}|\*)", pattern) if element]
-    positions = {len(name)}  # where the elements after the present one can begin
-    starts = [positions]
-    for element in reversed(elements):
-        if element in {"*", "{}"}:
-            positions = set(range(max(positions, default=-1) + (element == "*")))
-        else:
-            ends = (end for end in positions if name.endswith(element, 0, end))
-            positions = {end - len(element) for end in ends}
-        starts.insert(0, positions)
-    if 0 not in positions:
-        return None
-    position, value = 0, ""
-    for element, following in zip(elements, starts[1:], strict=True):
-        if element == "*":
-            position = max(following)
-        elif element == "{}":
-            end = min(start for start in following if start > position)
-            position, value = end, name[position:end]
-        else:
-            position += len(element)
-    return value
+        wildcards = {"{}": "([^/]+?)", "*": "[^/]*"}
+        texts = re.split(r"(\{\}|\*)", self.path)
+        pattern = "".join(wildcards.get(text) or pl.escape_regex(text) for text in texts)
+        end = re.sub("[\ud800-\udfff]", "\0", "/".join(names[-depth:]))  # bytes that are no text
+        # Polars, unlike Python, matches in a time that is linear in the length of both.
+        value = pl.Series([end]).str.extract(f"^{pattern}$")[0]
+        return None if value is None else (Path("/", *names[:-depth]), value)
 
 
 Elsewhere = FromColumn | FromPath
@@ -201,11 +156,6 @@ def _valid_name(text: str) -> str:
 DriveText = Annotated[str, AfterValidator(_valid_name)]
 """Name of a car, a track or another fact of a drive."""
 
-OptionalFact = Annotated[
-    Annotated[DriveText | Elsewhere, AfterValidator(require_drive_column)] | None,
-    added(None),
-]
-
 
 class DriveMetadata(Config):
     """Metadata of drives: values, or their column or pattern of the path. Absent means null."""
@@ -218,8 +168,8 @@ class DriveMetadata(Config):
     vehicle_model: DriveText | Elsewhere
     track: DriveText | Elsewhere | None = None
     mass_kg: PositiveFloat | Elsewhere | None = None
-    tyres: OptionalFact = None
-    receiver: OptionalFact = None
+    tyres: DriveText | Elsewhere | None = added(None)
+    receiver: DriveText | Elsewhere | None = added(None)
     adhesion: PositiveFloat | Elsewhere | None = None
 
     @field_validator("day", mode="before")
@@ -298,8 +248,15 @@ class Mapping(Config):
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> "Mapping":
-        self._signal_catalog = signals_of(info)
-        signals = self._signal_catalog.signals
+        if not isinstance(info.context, SignalCatalog):
+            raise TypeError("a mapping is validated with a SignalCatalog as context")
+        self._signal_catalog, signals = info.context, info.context.signals
+        for name in ("tyres", "receiver"):
+            if getattr(self.drive, name) is not None and name not in info.context.drive:
+                raise ValueError(
+                    f"drive.{name}: the catalog has no such drive column. Copy it from the shipped "
+                    "one: configs/signals.toml"
+                )
         for name, column in self.signals.items():
             if name not in signals:
                 raise ValueError(describe_unknown(name, signals))
@@ -402,12 +359,10 @@ class Mapping(Config):
     @property
     def _compared_numbers(self) -> dict[str, frozenset[str]]:
         """Columns that conditions compare with numbers alone, and those of `one_of`."""
-        texts: dict[str, frozenset[str]] = {}
+        texts = defaultdict[str, set[str]](set)
         for condition in self.where:
-            texts[condition.column] = texts.get(condition.column, frozenset()).union(
-                condition.one_of
-            )
-        return {column: names for column, names in texts.items() if all(map(is_number, names))}
+            texts[condition.column].update(condition.one_of)
+        return {column: frozenset(t) for column, t in texts.items() if all(map(is_number, t))}
 
     @property
     def _plain_numbers(self) -> PlainNumbers:
@@ -457,29 +412,21 @@ def assumptions_of(mapping: Mapping) -> tuple[str, ...]:
     label, course = signals.get(mapping.signal_catalog.label), signals.get(COURSE)
     labelled = mapping.signal_catalog.label in mapping.signal_names
     moved = sensor is not None and sensor.is_elsewhere
-    unknown_radius = RADIUS_M in wheels.values() or (moved and None in wheels.values())
     naive = time.format is not None and "%z" not in time.format and time.is_dated
-    return tuple(
-        text
-        for assumed, text in (
-            (unknown_radius, f"wheel radius {RADIUS_M} m, the nominal one (radius_m)"),
-            (time.assumed, f"{time.rate_hz} rows a second (time.rate_hz)"),
-            (naive and time.zone is None, "times are UTC (time.zone)"),
-            (labelled and not moved, "side-slip sensor at the centre of gravity (label)"),
-            (label is not None and not label.delay_s, "sideslip is not delayed (delay_s)"),
-            (
-                course is not None and not (course.antenna_x_m or course.antenna_y_m),
-                "antenna at the centre of gravity (antenna_x_m, antenna_y_m)",
-            ),
-            (mapping.front_wheels, "both front wheels steer alike (steer_fl, steer_fr)"),
-            (not wheels and any(name in signals for name in OWN_SPEEDS), NO_WHEEL_SPEEDS),
-            (
-                len(wheels) > 1 and len({signals[name].column for name in wheels}) == 1,
-                ONE_SPEED,
-            ),
-        )
-        if assumed
-    )
+    texts = {
+        f"wheel radius {RADIUS_M} m, the nominal one (radius_m)": RADIUS_M in wheels.values()
+        or (moved and None in wheels.values()),
+        f"{time.rate_hz} rows a second (time.rate_hz)": time.assumed,
+        "times are UTC (time.zone)": naive and time.zone is None,
+        "side-slip sensor at the centre of gravity (label)": labelled and not moved,
+        "sideslip is not delayed (delay_s)": label is not None and not label.delay_s,
+        "antenna at the centre of gravity (antenna_x_m, antenna_y_m)": course is not None
+        and not (course.antenna_x_m or course.antenna_y_m),
+        "both front wheels steer alike (steer_fl, steer_fr)": mapping.front_wheels,
+        NO_WHEEL_SPEEDS: not wheels and any(name in signals for name in OWN_SPEEDS),
+        ONE_SPEED: len(wheels) > 1 and len({signals[name].column for name in wheels}) == 1,
+    }
+    return tuple(text for text, is_assumed in texts.items() if is_assumed)
 
 
 def keep_assumptions(root: Folder, mapping: Mapping) -> None:
