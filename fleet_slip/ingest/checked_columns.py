@@ -13,11 +13,9 @@ from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-import numpy as np
 import polars as pl
 
 from fleet_slip.base import find_name_fault, normalize_name, quote_name
-from fleet_slip.catalog.signals import Signal
 from fleet_slip.errors import InputError
 from fleet_slip.ingest.batches import DISORDER, HELD, LATER, ROW, read_batches, read_columns
 from fleet_slip.ingest.columns import (
@@ -202,20 +200,12 @@ def _signal(name: str, columns: RawColumns) -> RowField:
     gain, bias = source.linear(mapping.signal_catalog[name].unit)
     if (gain, bias) != (1.0, 0.0):  # otherwise it would change nothing but the sign of zero
         value = value * gain + bias
-    least, largest = _value_range(*count_range(mapping.signal_catalog, name, source))
-    faults = _number_faults(name, "out_of_range", ~pl.col(name).is_between(least, largest))
+    signal, low, high = count_range(mapping.signal_catalog, name, source)
+    scale = float(signal.scale)
+    bounds = (low - 0.5) * scale, (high + 0.5) * scale
+    is_inside = pl.col(name).is_between(*bounds, closed="none")
+    faults = _number_faults(name, "out_of_range", ~is_inside)
     return RowField(name, "signal", pl.col(RAW + source.column), value, faults)
-
-
-def _value_range(signal: Signal, low: int, high: int) -> tuple[float, float]:
-    """Return the least and the largest value in SI units whose count rounds into a range."""
-    scale, margin = float(signal.scale), 4 * np.spacing(max(abs(low), abs(high)) + 0.5)
-    least, largest = (low - 0.5 - margin) * scale, (high + 0.5 + margin) * scale
-    while least / scale <= low - 0.5:
-        least = np.nextafter(least, np.inf)
-    while largest / scale >= high + 0.5:
-        largest = np.nextafter(largest, -np.inf)
-    return float(least), float(largest)
 
 
 def _positive(name: str, column: str, columns: RawColumns) -> RowField:
@@ -225,25 +215,20 @@ def _positive(name: str, column: str, columns: RawColumns) -> RowField:
 
 def _text(name: str, column: str, columns: RawColumns) -> RowField:
     text = columns.text(column)
-    value = text.map_batches(partial(_map_texts, normalize_name, pl.String), pl.String)
-    faulty = pl.col(name).map_batches(partial(_map_texts, _is_faulty, pl.Boolean), pl.Boolean)
+    value = text.map_batches(partial(_map_texts, normalize_name), pl.String)
+    faults_of_names = pl.col(name).map_batches(partial(_map_texts, find_name_fault), pl.String)
+    faulty = faults_of_names.is_not_null()
     if columns.kind(column) == pl.Float64:  # which has lost digits of longer numbers
         faulty |= pl.col(RAW + column).abs() >= MAX_WHOLE
     faults = {"missing": pl.col(name).is_null(), "out_of_range": faulty}
     return RowField(name, "key", pl.col(RAW + column), value, faults)
 
 
-def _is_faulty(name: str) -> bool:
-    return find_name_fault(name) is not None
-
-
-def _map_texts(
-    function: Callable[[str], object], kind: pl.datatypes.DataTypeClass, texts: pl.Series
-) -> pl.Series:
+def _map_texts(function: Callable[[str], str | None], texts: pl.Series) -> pl.Series:
     """Apply a function to texts, once for each different one."""
     different = texts.drop_nulls().unique()
-    values = pl.Series([function(text) for text in different], dtype=kind)
-    return texts.replace_strict(different, values, default=None, return_dtype=kind)
+    values = pl.Series([function(text) for text in different], dtype=pl.String)
+    return texts.replace_strict(different, values, default=None, return_dtype=pl.String)
 
 
 _METADATA: dict[str, Callable[[str, str, RawColumns], RowField]] = {
@@ -458,23 +443,22 @@ def _split(
     for (source, reason, _), mask in zip(faults, masks, strict=True):
         if mask.any():
             bad = valued.filter(mask & ~is_refused)
-            pieces.append(_refused(bad, reason, source.name or None, source.raw))
+            pieces.append(describe_refused(bad, reason, source.name or None, source.raw))
             is_refused |= mask
     return valued.filter(~is_refused).select(columns), pl.concat(pieces)
 
 
-def describe_refused(rows: pl.DataFrame, reason: str) -> pl.DataFrame:
-    """Return rows as bad ones, because of their time."""
-    return _refused(rows, reason, "time", pl.col("time"))
-
-
-def _refused(rows: pl.DataFrame, reason: str, signal: str | None, value: pl.Expr) -> pl.DataFrame:
+def describe_refused(
+    rows: pl.DataFrame, reason: str, signal: str | None = "time", value: pl.Expr | None = None
+) -> pl.DataFrame:
+    """Return rows as bad ones, by default because of their time."""
+    text = (pl.col("time") if value is None else value).cast(pl.String)
     return rows.select(
         "row",
         "group",
         pl.lit(reason).alias("reason"),
         pl.lit(signal, pl.String).alias("signal"),
-        value.cast(pl.String).str.slice(0, MAX_VALUE_CHARACTERS).alias("value"),
+        text.str.slice(0, MAX_VALUE_CHARACTERS).alias("value"),
     )
 
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping as Named
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from datetime import date, datetime
-from functools import cache
 from glob import glob
 from pathlib import Path, PosixPath
 from typing import Any
@@ -110,8 +109,7 @@ def _files_of(path: Path, passed_over: list[Path]) -> list[Path]:
     if any((table / "_delta_log").is_dir() for table in tables):
         raise InputError(
             f"{quote_name(path)}: part of a data root, whose logs are stored already. Name the "
-            "folder "
-            "of your logs."
+            "folder of your logs."
         )
     inside = sorted(_logs_below(path, passed_over))
     if not inside:
@@ -136,9 +134,7 @@ def _matching(pattern: Path) -> list[Path]:
     names = sorted(glob(str(pattern), recursive=True))  # noqa: PTH207 - takes absolute ones
     files = [path for path in map(Path, names) if path.is_file()]
     if not files:
-        raise InputError(
-            f"{quote_name(pattern)}: no file matches this pattern. Look at its folder."
-        )
+        raise InputError(f"{quote_name(pattern)}: no file matches this pattern. See its folder.")
     plain = [part for part in pattern.parents if not WILDCARDS.intersection(str(part))]
     return _without_strays(files, plain[0])
 
@@ -146,26 +142,20 @@ def _matching(pattern: Path) -> list[Path]:
 def _without_strays(files: list[Path], folder: Path) -> list[Path]:
     """Return files that were found below a folder, marked where they are in truth elsewhere."""
     top = os.path.realpath(folder)
-    real = cache(os.path.realpath)
+    return [file if _is_inside(file, top) else StrayLink(file) for file in files]
 
-    def is_inside(file: Path) -> bool:
-        place = os.path.realpath(file) if file.is_symlink() else f"{real(file.parent)}/"
-        return os.path.commonpath([top, place]) == top
 
-    return [
-        file if isinstance(file, StrayLink) or is_inside(file) else StrayLink(file)
-        for file in files
-    ]
+def _is_inside(path: Path, top: str) -> bool:
+    return os.path.commonpath([top, os.path.realpath(path)]) == top
 
 
 def _logs_below(folder: Path, passed_over: list[Path]) -> Iterator[Path]:
+    """Yield the logs below a folder, and the linked folders elsewhere, which are not read."""
     top = os.path.realpath(folder)
     for parent, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
-        for name in folders:
-            linked = Path(parent, name)
-            if linked.is_symlink() and os.path.commonpath([top, os.path.realpath(linked)]) != top:
-                yield StrayLink(linked)
+        links = [path for name in folders if (path := Path(parent, name)).is_symlink()]
+        yield from (link for link in links if not _is_inside(link, top))
         for name in names:
             file = Path(parent, name)
             if name.startswith(".") or name.lower().endswith(_COMPANIONS):
@@ -244,10 +234,9 @@ class FileGroup(PosixPath):
         """Return the size of all files together, and the time of the last change."""
         states = [file.stat(follow_symlinks=follow_symlinks) for file in self.files]
         latest = max(states, key=lambda state: state.st_mtime_ns)
-        fields = list(latest)
-        fields[6] = sum(state.st_size for state in states)
+        size = sum(state.st_size for state in states)
         times = {"st_mtime_ns": latest.st_mtime_ns, "st_blocks": 0}
-        return os.stat_result(fields, times)
+        return os.stat_result([*latest[:6], size, *latest[7:10]], times)
 
 
 def group_lake(files: Iterable[Path]) -> list[Path]:

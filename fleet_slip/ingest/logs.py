@@ -31,20 +31,18 @@ from fleet_slip.ingest.mapping import Mapping
 from fleet_slip.ingest.measured_log import MeasuredLog, open_measured
 from fleet_slip.ingest.recordings import (
     FILES,
-    Duplicates,
     Fingerprints,
     IngestCache,
     Replace,
     SourceRef,
     TableName,
     digest_of,
+    drives_of,
     drop_erased_drives,
     drop_erased_rejects,
-    file_number,
     file_transaction,
     find_duplicates,
     fingerprints_of,
-    is_fully_erased,
     readmit_file,
     tables_of,
 )
@@ -146,14 +144,18 @@ class Preview(IngestReport, Answer):
 
 @dataclass(frozen=True)
 class WrittenFile:
-    """A file of a batch after writing."""
+    """A file of a batch after writing.
+
+    `same` are the stored sources with its fingerprints, `replaced` those that it replaces.
+    """
 
     log: Path
     digest: str
     report: IngestReport
     longest: MeasuredDrive | None = None
     fingerprints: dict[str, int] = field(default_factory=dict)
-    duplicates: Duplicates = field(default_factory=Duplicates)
+    same: frozenset[SourceRef] = frozenset()
+    replaced: frozenset[SourceRef] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -250,7 +252,9 @@ def _batches(files: Iterable[IngestTask]) -> Iterator[Batch]:
 def _not_new(warehouse: Warehouse, written: WrittenFile) -> IngestReport:
     """Return the report of a file that this process did not commit."""
     report = dataclasses.replace(written.report, new=False, suspicions=(), drives_replaced=0)
-    if report.drives_forgotten or not is_fully_erased(warehouse, written.digest):
+    if report.drives_forgotten or not ErasureLog(warehouse.root).entries():
+        return report
+    if drives_of(warehouse, {SourceRef.of_file(written.digest)}):
         return report
     counts = dataclasses.replace(report.counts, drives=0, ticks=0)
     return dataclasses.replace(report, counts=counts, drives_forgotten=report.counts.drives)
@@ -361,7 +365,8 @@ class _BatchWriter:
 
     def _write_new(self, task: IngestTask, log: MeasuredLog, *, with_rejects: bool) -> WrittenFile:
         """Write the drives and the rejected rows of a log."""
-        ticks, erased, fingerprints = 0, set[str](), {log.fingerprint: file_number(log.digest)}
+        ticks, erased = 0, set[str]()
+        fingerprints = {log.fingerprint: SourceRef.of_file(log.digest).number}
         for drives in _groups(log.drives()):
             drives.sort(key=lambda drive: drive.drive_id)
             accepted = drop_erased_drives(drives, self._erasure_log)
@@ -386,20 +391,20 @@ class _BatchWriter:
                 f"{quote_name(task.file)}: same recording as "
                 f"{quote_name(self._fingerprints[repeated])}. Leave one of them out."
             )
-        duplicates = find_duplicates(
+        same, replaced_drives, replaced = find_duplicates(
             self._warehouse, self._stored, self._replace, task.file, log, fingerprints, earlier
         )
-        self._fingerprints |= dict.fromkeys(fingerprints, task.file)
-        for data in self.data.values():
-            data.end_log()
         report = IngestReport(
             str(task.file),
             dataclasses.replace(log.counts, drives=log.counts.drives - len(erased), ticks=ticks),
             suspicions=log.suspicions(),
             drives_forgotten=len(erased),
-            drives_replaced=duplicates.drives,
+            drives_replaced=len(replaced_drives),
         )
-        return WrittenFile(task.file, log.digest, report, log.longest, fingerprints, duplicates)
+        self._fingerprints |= dict.fromkeys(fingerprints, task.file)
+        for data in self.data.values():
+            data.end_log()
+        return WrittenFile(task.file, log.digest, report, log.longest, fingerprints, same, replaced)
 
 
 def _groups(drives: Iterable[MeasuredDrive]) -> Iterator[list[MeasuredDrive]]:
@@ -631,7 +636,7 @@ def commit_batch(
                 table.discard(written.added[other])  # except committed ones
             written = write_again()
             snapshot = tables[name].snapshot()
-        replaced = {source for file in written.files for source in file.duplicates.replaced}
+        replaced = {source for file in written.files for source in file.replaced}
         added, removal = written.added[name], Change()
         if replaced and build_removal and written.added["logs"]:
             removal = build_removal(name, snapshot, replaced)
@@ -665,4 +670,4 @@ def _is_outdated(
         return True
     files = [file for file in written.files if file.fingerprints and name == "logs"]
     stored = Fingerprints(snapshot.transactions if files else {})
-    return any(stored.find(file.fingerprints) - file.duplicates.same for file in files)
+    return any(stored.find(file.fingerprints) - file.same for file in files)

@@ -179,11 +179,6 @@ def fingerprints_of(drives: Iterable[MeasuredDrive]) -> dict[str, int]:
     return {f"{PREFIX}{drive.counts_digest}": source.number for drive, source in sources if source}
 
 
-def file_number(digest: str) -> int:
-    """Return the number of the fingerprint of a file."""
-    return SourceRef.of_file(digest).number
-
-
 def file_transaction(digest: str) -> AppTransaction:
     """Return the transaction that records a file's content."""
     return AppTransaction(f"{FILES}{digest}", 1)
@@ -250,24 +245,6 @@ def _name_of(log: Path) -> str:
 # Files whose recording is stored already.
 
 
-class Duplicates(NamedTuple):
-    """The stored recordings of a file.
-
-    Attributes
-    ----------
-    same
-        Sources with its fingerprints, also those whose rows were removed.
-    replaced
-        The sources that it replaces.
-    drives
-        Number of drives that it replaces.
-    """
-
-    same: frozenset[SourceRef] = frozenset()
-    replaced: frozenset[SourceRef] = frozenset()
-    drives: int = 0
-
-
 def find_duplicates(
     warehouse: Warehouse,
     fingerprints_of_logs: Fingerprints,
@@ -276,9 +253,11 @@ def find_duplicates(
     log: MeasuredLog,
     fingerprints: Named[str, int],
     earlier: str | None,
-) -> Duplicates:
+) -> tuple[frozenset[SourceRef], list[str], frozenset[SourceRef]]:
     """Return the stored recordings of a file that was read.
 
+    These are the sources with its fingerprints, also those whose rows were removed, the drives that
+    it replaces, and their sources: all drives of a file of the same name, else only duplicates.
     `earlier` is the digest of the stored content that its path had before. Raises `RepeatedError`
     for a recording that is not to be replaced.
     """
@@ -286,8 +265,13 @@ def find_duplicates(
     changed = earlier is not None and earlier != log.digest
     if earlier is not None and changed:
         sources |= {SourceRef.of_file(earlier)}
-    stored = _drives_of(warehouse, {source.file for source in sources})
-    replaced = _replaced(stored, sources, log.name)
+    stored = drives_of(warehouse, {source.file for source in sources})
+    same = {drive: SourceRef.of_drive(drive) for drive in stored if is_from(drive, sources)}
+    replaced = frozenset(
+        source.file if source.file in sources or stored[drive] == log.name else source
+        for drive, source in same.items()
+        if source is not None
+    )
     drives = [drive for drive in stored if is_from(drive, replaced)]
     is_replaced = replace == "all" or (
         replace == "corrected"
@@ -305,7 +289,7 @@ def find_duplicates(
             "To replace the old one: --replace. To remove it: fleet-slip forget --drive "
             f"{drives[0]}"
         )
-    return Duplicates(sources, replaced if drives else frozenset(), len(drives))
+    return sources, drives, replaced if drives else frozenset()
 
 
 def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
@@ -322,7 +306,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
 
     def attempt(table: Table) -> None:
         snapshot = table.snapshot()
-        if _drives_of(warehouse, {SourceRef.of_file(digest)}):
+        if drives_of(warehouse, {SourceRef.of_file(digest)}):
             return
         if snapshot.has_committed(f"{FILES}{digest}"):
             transactions = (AppTransaction(f"{FILES}{digest}", WITHDRAWN),)
@@ -333,26 +317,7 @@ def readmit_file(warehouse: Warehouse, digest: str, first_drive: str) -> bool:
     return True
 
 
-def is_fully_erased(warehouse: Warehouse, digest: str) -> bool:
-    """Return True if there are erasures and no drive of an ingested file is stored."""
-    return bool(ErasureLog(warehouse.root).entries()) and not _drives_of(
-        warehouse, {SourceRef.of_file(digest)}
-    )
-
-
-def _replaced(
-    stored: Named[str, str], sources: frozenset[SourceRef], name: str
-) -> frozenset[SourceRef]:
-    """Return what the new file replaces: all drives of a file of the same name, else duplicates."""
-    same = {drive: SourceRef.of_drive(drive) for drive in stored if is_from(drive, sources)}
-    return frozenset(
-        source.file if source.file in sources or stored[drive] == name else source
-        for drive, source in same.items()
-        if source is not None
-    )
-
-
-def _drives_of(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
+def drives_of(warehouse: Warehouse, files: Collection[SourceRef]) -> dict[str, str]:
     """Return the stored drives of some files, with their `source_file`."""
     if not files:
         return {}
