@@ -137,7 +137,9 @@ def merge_bases(
     filled = [base for base in opened if base.has_rows]
     no_rows = pl.DataFrame(schema=columns)
     if len(filled) == 1:
-        yield from (pl.concat([no_rows, rows], how="diagonal") for rows in filled[0].batches)
+        absent = columns.keys() - filled[0].columns.keys()
+        nulls = [pl.lit(None, columns[name]).alias(name) for name in absent]
+        yield from (rows.with_columns(nulls) for rows in filled[0].batches)
         return
     starts_s = [base.start_s for base in filled]
     if log is not None and starts_s and min(starts_s) < EARLIEST_S <= max(starts_s):
