@@ -15,7 +15,11 @@ from fleet_slip.catalog.definitions import Definition
 from fleet_slip.catalog.signals import MEASURED, TRAINING_DRIVES
 from fleet_slip.errors import ConfigError, QuestionError, RefusedError
 from fleet_slip.grams.cohort import Cohort
-from fleet_slip.models.acceptance import review_challenger
+from fleet_slip.models.acceptance import (
+    require_sound_course,
+    require_sound_drives,
+    review_challenger,
+)
 from fleet_slip.models.manifest import (
     CrossValidated,
     LearnedFrom,
@@ -37,10 +41,6 @@ from fleet_slip.models.request import (
     load_model_list,
 )
 from fleet_slip.models.summary import Selection
-from fleet_slip.models.training_checks import (
-    require_sound_course,
-    require_sound_drives,
-)
 from fleet_slip.rendering import Answer, Part, Remark
 from fleet_slip.warehouse.gram_reader import open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, with_all_drives
@@ -199,10 +199,7 @@ def build_challenger(
     if manifest.learned_from and not force:
         require_sound_course(warehouse, manifest)
     if not (force or candidate or is_simulated):
-        champion = registry.champion(name)
-        champion_drives = registry.trained_drives(champion.manifest) if champion else None
-        champion_columns = len(champion.manifest.terms) if champion else 0
-        require_sound_drives(warehouse, manifest, champion_drives, champion_columns)
+        require_sound_drives(warehouse, registry, manifest)
     return manifest
 
 

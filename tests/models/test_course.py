@@ -14,7 +14,7 @@ from fleet_slip.api.fleet import Fleet
 from fleet_slip.calibration.receiver_delay import ReceiverDelays, receiver_delays
 from fleet_slip.errors import DataError, QuestionError, RefusedError
 from fleet_slip.export.c_gram import sets_on_board
-from fleet_slip.models import training_checks
+from fleet_slip.models import acceptance
 from fleet_slip.models.manifest import Manifest
 from tests.export.compiled import START_S, build, needs_cc
 from tests.support.catalog import CATALOG, SIGNALS
@@ -148,7 +148,7 @@ def test_a_course_of_another_place_is_refused(
     """As if the receiver were known to be 200 ms late: then the place is 4 m from where it was."""
     cars = fleet.sql("SELECT DISTINCT vehicle_id FROM drives").fetchall()
     late = {car: 0.2 for (car,) in cars}
-    monkeypatch.setattr("fleet_slip.models.training_checks._require_in_time", lambda *_: late)
+    monkeypatch.setattr("fleet_slip.models.acceptance._require_in_time", lambda *_: late)
     with pytest.raises(RefusedError, match="course of 1 of 1 car is implausible") as refused:
         without_label(fleet)
     assert "Check antenna_x_m" in str(refused.value)
@@ -163,7 +163,7 @@ def test_a_delay_may_be_as_uncertain_as_its_effect_on_the_label_is_small(
         cars = {c: replace(d, uncertainty=uncertainty_s) for c, d in delays.cars.items()}
         return replace(delays, cars=cars)
 
-    monkeypatch.setattr(training_checks, "receiver_delays", estimate)
+    monkeypatch.setattr(acceptance, "receiver_delays", estimate)
     if is_allowed:
         assert without_label(fleet).learned_from
         return

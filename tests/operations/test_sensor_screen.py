@@ -10,7 +10,7 @@ import fleet_slip
 from fleet_slip.api.fleet import Fleet
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.errors import DataError, NotScreenedError, RefusedError
-from fleet_slip.models import training_checks
+from fleet_slip.models import acceptance
 from fleet_slip.models.acceptance import load_thresholds
 from fleet_slip.operations import sensor_screen
 from fleet_slip.operations.sensor_screen import QualityReport
@@ -138,7 +138,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         ("min_rows_per_column", 10**6, r"rows, fewer than 1000000 for each of its \d columns?"),
     ):
         strict = load_thresholds(SHIPPED_CONFIGS).model_copy(update={name: bound})
-        monkeypatch.setattr(training_checks, "load_thresholds", lambda _, strict=strict: strict)
+        monkeypatch.setattr(acceptance, "load_thresholds", lambda _, strict=strict: strict)
         with pytest.raises(RefusedError, match=told) as refused:
             fleet.models.publish("m", asked)
         dry = fleet.models.preview("m", asked)
@@ -146,7 +146,7 @@ def test_a_first_champion_of_measured_drives_needs_drives_and_rows_for_its_colum
         assert fleet.models.preview("m", asked, candidate=True).candidate
         said = run_command(*command)
         assert "winner: " in said.stdout and said.exit_code == RefusedError.exit_code
-        monkeypatch.setattr(training_checks, "load_thresholds", load_thresholds)
+        monkeypatch.setattr(acceptance, "load_thresholds", load_thresholds)
     assert not fleet.models.versions().num_rows
     assert "m would be published. " in run_command(*command).stderr
     assert fleet.models.publish("m", asked).new
