@@ -9,14 +9,24 @@ from fleet_slip.api import calls
 from fleet_slip.api.fleet_models import FleetModels
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import UsageError
+from fleet_slip.evaluation.filters import TuningDrives
+from fleet_slip.evaluation.identify import IdentifiedVehicle, identify_held_out
+from fleet_slip.evaluation.measured_evaluation import evaluate_measured
+from fleet_slip.evaluation.scenario_evaluation import evaluate_blind, evaluate_scenarios
+from fleet_slip.evaluation.test_drives import simulate_scenarios
+from fleet_slip.grams.cohort import load_cohort
+from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.registry import ModelVersion
+from fleet_slip.models.score import Score, cohort_of_rows, find_training_overlap, score
+from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
+from fleet_slip.simulation.scenario import load_scenario, load_scenarios
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import load_car, load_measures
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.evaluation_document import Evaluation
-    from fleet_slip.evaluation.identify import IdentifiedVehicle
     from fleet_slip.evaluation.report import WrittenReport
-    from fleet_slip.models.score import Score
-    from fleet_slip.vehicle.measures import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 WATCH_PAGE = Path("watch.html")
@@ -41,7 +51,7 @@ class FleetEvaluation:
         cohort: str | None = None,
         *,
         include_faulty: bool = False,
-    ) -> "Score":
+    ) -> Score:
         """Evaluate a model on the log rows of a cohort; angles are in degrees.
 
         Parameters
@@ -61,9 +71,6 @@ class FleetEvaluation:
         QuestionError
             If the predicate is invalid.
         """
-        from fleet_slip.models.score import cohort_of_rows, find_training_overlap, score
-        from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
-
         version = self._models.get(model)
         predicate = ALL_DRIVES if cohort is None else cohort
         signals = self.warehouse.catalog.signals
@@ -129,9 +136,6 @@ class FleetEvaluation:
             If the models cannot be compared.
         """
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
-        from fleet_slip.evaluation.scenario_evaluation import evaluate_scenarios
-        from fleet_slip.evaluation.test_drives import simulate_scenarios
-        from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 
         configs = self.warehouse.configs
         chosen = tuple(load_scenario(name, configs) for name in scenarios)
@@ -149,7 +153,7 @@ class FleetEvaluation:
         cohort: str = TRAINING_DRIVES,
         challengers: Sequence[str | ModelVersion] = (),
         *,
-        vehicle: "str | VehicleMeasures | None" = None,
+        vehicle: str | VehicleMeasures | None = None,
         include_faulty: bool = False,
         threads: int | None = None,
     ) -> "Evaluation":
@@ -180,9 +184,6 @@ class FleetEvaluation:
             If there is no such vehicle, or its data are impossible for a car.
         """
         from fleet_slip.evaluation.evaluation_document import evaluations_of, store_evaluation
-        from fleet_slip.evaluation.measured_evaluation import evaluate_measured
-        from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
-        from fleet_slip.vehicle.parameters import load_car
 
         versions = self._versions(model, challengers)
         car = load_car(vehicle, self.warehouse.configs) if isinstance(vehicle, str) else vehicle
@@ -208,7 +209,6 @@ class FleetEvaluation:
         errors are those of `evaluate`.
         """
         from fleet_slip.evaluation.evaluation_document import Evaluation
-        from fleet_slip.evaluation.scenario_evaluation import evaluate_blind
 
         first, *rivals = self._versions(model, challengers)
         with calls.open_workers(self.warehouse.root, threads) as executor:
@@ -217,11 +217,11 @@ class FleetEvaluation:
     def identify(
         self,
         name: str,
-        vehicle: "str | VehicleMeasures",
+        vehicle: str | VehicleMeasures,
         cohort: str = TRAINING_DRIVES,
         *,
         threads: int | None = None,
-    ) -> "IdentifiedVehicle":
+    ) -> IdentifiedVehicle:
         """Identify the tyres and the yaw inertia of a car from labelled drives.
 
         An extended Kalman filter in the car is fitted to the labels of up to 24 drives. The result
@@ -247,18 +247,11 @@ class FleetEvaluation:
         UsageError
             If the name is invalid.
         """
-        from fleet_slip.catalog.features import PLAIN
-        from fleet_slip.evaluation.filters import TuningDrives
-        from fleet_slip.evaluation.identify import identify_held_out
-        from fleet_slip.grams.cohort import load_cohort
-        from fleet_slip.models.manifest import require_model_name
-        from fleet_slip.vehicle.parameters import load_measures
-
         require_model_name(name)
         if isinstance(vehicle, str):
             vehicle = load_measures(vehicle, self.warehouse.configs)
         car = vehicle.model_copy(update={"name": name})
-        rows = load_cohort(self.warehouse, cohort, PLAIN)
+        rows = load_cohort(self.warehouse, cohort)
         chosen = TuningDrives.choose(self.warehouse, rows, with_mass=False)
         with calls.open_workers(self.warehouse.root, threads) as executor:
             return identify_held_out(car, chosen.drives, executor)
@@ -281,7 +274,6 @@ class FleetEvaluation:
             If there is no evaluation of the model on the current data.
         """
         from fleet_slip.evaluation.report import write_report
-        from fleet_slip.storage.local import LocalFolder
 
         folder = LocalFolder(output) if output else self.warehouse.root / "report"
         return write_report(self.warehouse, self._models.get(model), folder)

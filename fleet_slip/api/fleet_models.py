@@ -6,10 +6,20 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from fleet_slip.api.calls import record_call
+from fleet_slip.api.calls import open_workers, record_call
 from fleet_slip.catalog.features import PLAIN
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.models.registry import CHAMPION, ModelVersion, Registry
+from fleet_slip.models.manifest import Manifest, require_model_name
+from fleet_slip.models.registry import (
+    CHAMPION,
+    Difference,
+    ModelVersion,
+    Registry,
+    compare_versions,
+)
+from fleet_slip.storage.local import LocalFolder
+from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import load_measures
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -20,13 +30,10 @@ if TYPE_CHECKING:
     from fleet_slip.ingest.mapping import Mapping as LogMapping
     from fleet_slip.models.diagnose import Diagnosis
     from fleet_slip.models.log_predictions import Predictions
-    from fleet_slip.models.manifest import Manifest
     from fleet_slip.models.publish import DryRun, Publication
-    from fleet_slip.models.registry import Difference
     from fleet_slip.models.request import SelectionRequest
     from fleet_slip.models.summary import Selection
     from fleet_slip.operations.sensor_screen import SensorScreen
-    from fleet_slip.vehicle.measures import VehicleMeasures
     from fleet_slip.warehouse.warehouse import Warehouse
 
 T = TypeVar("T")
@@ -154,6 +161,7 @@ class FleetCohort:
         return changed(diagnosis, remark=manifest.line_remark)
 
     def _load(self, feature_set: str) -> "Cohort":
+
         from fleet_slip.grams.cohort import load_cohort
 
         return load_cohort(self.warehouse, self.predicate, feature_set)
@@ -214,7 +222,7 @@ class FleetModels:
         *,
         force: bool = False,
         candidate: bool = False,
-        with_filter: "str | VehicleMeasures | None" = None,
+        with_filter: str | VehicleMeasures | None = None,
     ) -> "Publication":
         """Publish the winner of a selection as the next version of a model, and its champion.
 
@@ -247,22 +255,21 @@ class FleetModels:
         """
         from fleet_slip.models.publish import publish_challenger
 
-        options = {"force": force, "candidate": candidate}
-        return self._challenge(publish_challenger, name, choice, with_filter, **options)
+        return self._challenge(
+            publish_challenger, name, choice, with_filter, force=force, candidate=candidate
+        )
 
     def preview(
         self,
         name: str,
         choice: "Selection | FleetCohort | None" = None,
         *,
-        force: bool = False,
-        candidate: bool = False,
-        with_filter: "str | VehicleMeasures | None" = None,
+        with_filter: str | VehicleMeasures | None = None,
+        **options: bool,
     ) -> "DryRun":
         """Return what `publish` with these arguments would do, also a refusal; write nothing."""
         from fleet_slip.models.publish import DryRun, would_publish
 
-        options = {"force": force, "candidate": candidate}
         try:
             return self._challenge(would_publish, name, choice, with_filter, **options)
         except RefusedError as error:
@@ -270,15 +277,18 @@ class FleetModels:
 
     def _challenge(
         self,
-        publish: "Callable[..., T]",
+        publish: Callable[..., T],
         name: str,
         choice: "Selection | FleetCohort | None",
-        with_filter: "str | VehicleMeasures | None",
-        **options: bool,
+        with_filter: str | VehicleMeasures | None,
+        *,
+        force: bool = False,
+        candidate: bool = False,
     ) -> T:
         """Build the challenger of a choice and publish it, or return what would be published."""
         from fleet_slip.models.publish import build_challenger
 
+        options = {"force": force, "candidate": candidate}
         registry, selection = self.registry, self._selection(name, choice)
         manifest = build_challenger(self.warehouse, registry, selection, name, **options)
         manifest = self._with_filter(manifest, selection, with_filter)
@@ -286,19 +296,17 @@ class FleetModels:
 
     def _with_filter(
         self,
-        manifest: "Manifest",
+        manifest: Manifest,
         selection: "Selection",
-        car: "str | VehicleMeasures | None",
-    ) -> "Manifest":
+        car: str | VehicleMeasures | None,
+    ) -> Manifest:
         """Combine a model with a filter in a car, by default the champion's."""
         champion = self.registry.champion(manifest.name)
         if car is None and champion and champion.manifest.combination:
             car = champion.manifest.combination.measures
         if car in (None, "none"):
             return manifest
-        from fleet_slip.api.calls import open_workers
         from fleet_slip.evaluation.filter_column import with_filter
-        from fleet_slip.vehicle.parameters import load_measures
 
         measures = load_measures(car, self.warehouse.configs) if isinstance(car, str) else car
         with open_workers(self.warehouse.root, None) as executor:
@@ -306,19 +314,16 @@ class FleetModels:
 
     def _selection(self, name: str, choice: "Selection | FleetCohort | None") -> "Selection":
         """Return a selection, by the recipe of the model if none is given."""
-        from fleet_slip.models.manifest import require_model_name
         from fleet_slip.models.publish import recipe_for
         from fleet_slip.models.request import SelectionRequest
 
         require_model_name(name)
         if choice is not None and not isinstance(choice, FleetCohort):
             return choice
-        predicate, include_faulty = (
-            (choice.predicate, choice.include_faulty) if choice else (None, False)
-        )
+        predicate = choice.predicate if choice else None
         recipe = recipe_for(self.registry, name, SelectionRequest(), predicate)
-        cohort = FleetCohort(self.warehouse, recipe.cohort, include_faulty)
-        return cohort.select(recipe.request)
+        drives = FleetCohort(self.warehouse, recipe.cohort, bool(choice and choice.include_faulty))
+        return drives.select(recipe.request)
 
     @record_call
     def promote(self, reference: str, alias: str = CHAMPION) -> ModelVersion:
@@ -329,8 +334,6 @@ class FleetModels:
         UsageError
             If the alias is no valid name.
         """
-        from fleet_slip.models.manifest import require_model_name
-
         require_model_name(alias)
         version = self.get(reference)
         self.registry.promote(version.manifest.name, version.version, alias)
@@ -347,8 +350,6 @@ class FleetModels:
         RefusedError
             If the alias never pointed at another version.
         """
-        from fleet_slip.models.manifest import require_model_name
-
         require_model_name(name)
         self.registry.require(name)
         return self.registry.load(name, self.registry.rollback(name, alias))
@@ -363,10 +364,8 @@ class FleetModels:
         """Let publications move an alias again; return its version."""
         return self.registry.load(name, self.registry.hold(name, alias, "unpin"))
 
-    def diff(self, first: str | ModelVersion, second: str | ModelVersion) -> "Difference":
+    def diff(self, first: str | ModelVersion, second: str | ModelVersion) -> Difference:
         """Compare the manifests and training drives of two versions."""
-        from fleet_slip.models.registry import compare_versions
-
         return compare_versions(self.registry, self.get(first), self.get(second))
 
     def estimator(
@@ -431,7 +430,6 @@ class FleetModels:
             If the target needs something that the configs lack.
         """
         from fleet_slip.export.files import export_files
-        from fleet_slip.storage.local import LocalFolder
 
         folder = LocalFolder(output)
         files = export_files(self.get(model), self.warehouse, to, with_gram=with_gram)
