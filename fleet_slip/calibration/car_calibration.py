@@ -53,7 +53,7 @@ from fleet_slip.catalog.signals import ALL_DRIVES
 from fleet_slip.errors import DataError, QuestionError
 from fleet_slip.regression.exact import sqrt as sqrt_exact
 from fleet_slip.regression.gram import Gram, GramTable
-from fleet_slip.regression.least_squares import DriveTermSums, ExactSums, influence
+from fleet_slip.regression.least_squares import ExactSums, drive_term_sums, influence
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.warehouse.gram_reader import (
     GramReader,
@@ -318,7 +318,7 @@ class CarEvidence:
     ) -> tuple[FloatArray, FloatArray] | None:
         """Return the shift of a parameter by each drive, and the drive's share of its variance."""
         signals = self.sums[estimate.kind].table.signals
-        sums = DriveTermSums(self._moments[estimate.kind][drives], signals, estimate.terms)
+        sums = drive_term_sums(self._moments[estimate.kind][drives], signals, estimate.terms)
         return influence(estimate.relation, sums, float(estimate.noise), estimate.gradient)
 
     def _estimate_variances(self) -> dict[CalibrationParameterName, float]:

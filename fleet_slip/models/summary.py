@@ -338,7 +338,7 @@ def _order_table(choice: NestedChoice) -> TextTable:
     """
     evidence, criterion = choice.evidence, choice.rule.criterion
     size = len(choice.winner.model.signals)
-    columns = zip(evidence.excess(), evidence.distances(), choice.values, strict=True)
+    columns = zip(evidence.excess, evidence.distances, choice.values, strict=True)
     return TextTable(
         f"order by {choice.rule.ranking}; with {evidence.kind} as independent observations: "
         f"{evidence.rows:,.0f} effective rows",

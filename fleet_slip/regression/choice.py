@@ -254,7 +254,7 @@ def criterion_values(name: str, evidence: Evidence) -> FloatArray:
         The smallest value is the best.
     """
     size = np.arange(evidence.inputs + 1)
-    return np.asarray(evidence.excess() + PRICES[name](evidence.rows) * size)
+    return np.asarray(np.array(evidence.excess) + PRICES[name](evidence.rows) * size)
 
 
 @dataclass(frozen=True)

@@ -6,15 +6,16 @@ the evidence is taken over drives.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from fleet_slip.arrays import FloatArray, IntArray
+from fleet_slip.base import Record
 from fleet_slip.errors import DataError
 from fleet_slip.regression import exact
 from fleet_slip.regression.gram import Gram, GramTable
@@ -338,7 +339,7 @@ def _columns(fitted: Fit, drives: DriveMoments) -> list[int]:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Evidence(Record):
     """The evidence of the data for the k + 1 nested models of an order.
 
     Attributes
@@ -352,6 +353,11 @@ class Evidence:
     kind : {"rows", "drives", "vehicles"}
         The independent unit.
     """
+
+    DOCUMENT = (
+        "contributions distances_to_full=excess expected_distances=distances evidence=kind "
+        "effective_rows=rows design_effect"
+    )
 
     contributions: tuple[float, ...]
     rows: float
@@ -409,45 +415,25 @@ class Evidence:
             "vehicles" if drives.unit == "vehicle" else "drives",
         )
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return what a JSON document needs."""
-        return {
-            "contributions": list(self.contributions),
-            "distances_to_full": self.excess().tolist(),
-            "expected_distances": list(self.distances()),
-            "evidence": self.kind,
-            "effective_rows": self.rows,
-            "design_effect": self.design_effect,
-        }
-
     @property
     def inputs(self) -> int:
         """Number of signals of the order, k."""
         return len(self.contributions)
 
-    def excess(self) -> FloatArray:
-        """Return the cost of leaving out the last signals, sum_{i>j} A_i for j = 0..k.
+    @property
+    def excess(self) -> tuple[float, ...]:
+        """Cost of leaving out the last signals, sum_{i>j} A_i for j = 0..k."""
+        return tuple(np.cumsum([0.0, *reversed(self.contributions)])[::-1].tolist())
 
-        Returns
-        -------
-        float array, shape (k + 1,)
-        """
-        tail = np.cumsum([0.0, *reversed(self.contributions)])[::-1]
-        return np.ascontiguousarray(tail)
-
+    @property
     def distances(self) -> tuple[float, ...]:
-        """Return unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2) of the paper, j = 0..k.
-
-        Returns
-        -------
-        tuple of float, shape (k + 1,)
+        """Unbiased D_j = sum_{i>j} A_i + 2j - k of equation (2) of the paper, for j = 0..k.
 
         References
         ----------
         Mallows, Technometrics 15, 1973.
         """
-        size = np.arange(self.inputs + 1)
-        return tuple((self.excess() + 2 * size - self.inputs).tolist())
+        return tuple(x + 2 * size - self.inputs for size, x in enumerate(self.excess))
 
 
 # Shrinkage: estimates for the members of a group, each moved towards the group's mean.
@@ -461,7 +447,7 @@ class Evidence:
 
 MIN_MEMBERS = 4
 """Minimum number of members: fewer do not determine their variance."""
-_HALVINGS, _STEP = 60, 1e-4
+_STEP = 1e-4
 
 
 @dataclass(frozen=True)
@@ -515,8 +501,10 @@ def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
         steep = squares - weights + weights**2 / weights.sum()
         return 1 + between / 2 * float(steep.sum())
 
+    from scipy.optimize import brentq  # noqa: PLC0415 - slow
+
     high = math.log(float(np.ptp(values)) ** 2 * len(values) + float(variances.max()) * 16)
-    log_between = _root(slope, math.log(float(variances.min())) - 16, high)
+    log_between = brentq(slope, math.log(float(variances.min())) - 16, high)
     information = (slope(log_between - _STEP) - slope(log_between + _STEP)) / (2 * _STEP)
     weights = 1 / (variances + math.exp(log_between))
     mean, shrinkage = _mean(values, weights), variances * weights
@@ -541,10 +529,3 @@ def pool(values: FloatArray, variances: FloatArray) -> Pooled | None:
 
 def _mean(values: FloatArray, weights: FloatArray) -> float:
     return float((weights * values).sum() / weights.sum())
-
-
-def _root(falling: Callable[[float], float], low: float, high: float) -> float:
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if falling(middle) > 0 else (low, middle)
-    return (low + high) / 2

@@ -445,23 +445,21 @@ def influence(
     return (right - coefficients @ unknowns) @ h, np.einsum("i,gij,j->g", h, squares, h)
 
 
-class DriveTermSums:
-    """Sums of products of terms in each of several drives, in floating point."""
+def drive_term_sums(
+    moments: FloatArray, columns: Sequence[str], terms: Terms
+) -> Callable[[str, str], FloatArray]:
+    """Return the sums of products of two terms in each of several drives, in floating point.
 
-    def __init__(self, moments: FloatArray, columns: Sequence[str], terms: Terms) -> None:
-        """Take the moments of (1, columns) about zero, shape (drives, k+1, k+1)."""
-        self._at = {name: i for i, name in enumerate((ONE, *terms))}
-        turn = np.zeros((len(self._at), moments.shape[1]))
-        turn[0, 0] = 1.0
-        for name, weights in terms.items():
-            for column, weight in weights.items():
-                turn[self._at[name], 1 + columns.index(column)] = float(weight)
-        self._sums = turn @ moments @ turn.T
-
-    def __call__(self, a: str, b: str) -> FloatArray:
-        """Return the sum of the products of two terms in each drive."""
-        sums: FloatArray = self._sums[:, self._at[a], self._at[b]]
-        return sums
+    `moments` are those of (1, columns) about zero, shape (drives, k+1, k+1).
+    """
+    at = {name: i for i, name in enumerate((ONE, *terms))}
+    turn = np.zeros((len(at), moments.shape[1]))
+    turn[0, 0] = 1.0
+    for name, weights in terms.items():
+        for column, weight in weights.items():
+            turn[at[name], 1 + columns.index(column)] = float(weight)
+    sums = turn @ moments @ turn.T
+    return lambda a, b: sums[:, at[a], at[b]]
 
 
 def _stacked(rows: Sequence[Sequence[Any]]) -> FloatArray:

@@ -115,7 +115,7 @@ def test_the_distance_to_the_full_model_is_that_of_the_predictions() -> None:
     full = project(x, y)
     variance = np.sum((y - full) ** 2) / (200 - 5)
     distances = [np.sum((full - project(x[:, :j], y)) ** 2) / variance for j in range(5)]
-    np.testing.assert_allclose(evidence_of(x, y).excess(), distances, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(evidence_of(x, y).excess, distances, rtol=1e-9, atol=1e-9)
 
 
 def test_the_expected_distance_is_what_the_true_model_is_away_on_average() -> None:
@@ -126,7 +126,7 @@ def test_the_expected_distance_is_what_the_true_model_is_away_on_average() -> No
     trials = 400
     for _ in range(trials):
         y = np.rint(truth + rng.normal(0, 30, 200))
-        estimated += np.array(evidence_of(x, y).distances()) / trials
+        estimated += np.array(evidence_of(x, y).distances) / trials
         away = [np.sum((truth - project(x[:, :j], y)) ** 2) / 30**2 for j in range(5)]
         real += (np.array(away) - 1) / trials
     assert real[:2].min() > 50

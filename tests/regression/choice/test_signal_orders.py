@@ -136,8 +136,8 @@ def test_criteria_are_prices_on_contributions() -> None:
     evidence = Evidence((50.0, 9.0, 3.0, 0.5), 1000.0, 1.0, "rows")
     sizes = {name: int(np.argmin(criterion_values(name, evidence))) for name in PRICES}
     assert sizes == {"aic": 3, "bic": 2}
-    np.testing.assert_allclose(evidence.excess(), [62.5, 12.5, 3.5, 0.5, 0])
-    np.testing.assert_allclose(evidence.distances(), [58.5, 10.5, 3.5, 2.5, 4])
+    np.testing.assert_allclose(evidence.excess, [62.5, 12.5, 3.5, 0.5, 0])
+    np.testing.assert_allclose(evidence.distances, [58.5, 10.5, 3.5, 2.5, 4])
 
 
 def test_independent_rows_have_about_as_many_effective_rows() -> None:
