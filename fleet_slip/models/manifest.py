@@ -180,14 +180,6 @@ class CrossValidated(Config):
         """The RMSE without the label's noise."""
         return math.sqrt(max(self.rmse_deg**2 - (self.label_noise_deg or 0.0) ** 2, 0.0))
 
-    @property
-    def label_noise_text(self) -> str:
-        """The share of label noise in the RMSE."""
-        if self.label_noise_deg is None:
-            return "unknown, and part of the RMSE"
-        rmse_deg = self.beyond_label_noise_deg
-        return f"{self.label_noise_deg:.4f} deg, without which the RMSE is {rmse_deg:.4f} deg"
-
 
 class TrainedOn(Config):
     """Training data of a model; `drives_without_log` are drives whose cars sent Gram rows."""
@@ -525,12 +517,16 @@ class Manifest(Config):
         drives = f"{pluralize(trained.drives, 'drive')} of {pluralize(trained.vehicles, 'car')}"
         alone = ", of the linear model alone" * bool(self.line_remark)
         prior, line = self.prior, self.line
+        noise, noise_deg = "unknown, and part of the RMSE", figures.label_noise_deg
+        if noise_deg is not None:
+            rmse_deg = figures.beyond_label_noise_deg
+            noise = f"{noise_deg:.4f} deg, without which the RMSE is {rmse_deg:.4f} deg"
         properties = {
             "correlation": (
                 f"{figures.correlation:.4f} (s.e. {figures.correlation_standard_error:.2g})"
             ),
             "RMSE": f"{figures.rmse_deg:.4f} deg{alone}",
-            "label noise": figures.label_noise_text,
+            "label noise": noise,
             "error std": f"{figures.error_std_deg:.4f} deg",
             "error mean": f"{figures.error_mean_deg:+.4f} deg",
             "on board": on_board,

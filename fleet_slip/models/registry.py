@@ -277,14 +277,14 @@ class Registry:
 
     def versions(self, name: str) -> list[int]:
         """Return the version numbers of a model, ascending."""
-        return self._versions(name).numbers()
+        return self.versions_of(name).numbers()
 
     def load(self, name: str, version: int) -> ModelVersion:
         """Return a version. Raises `StorageError` if it was changed."""
         if not _IDENTIFIER.fullmatch(name):
             self.require(name)
         try:
-            document = self._versions(name).read(version)
+            document = self.versions_of(name).read(version)
         except StorageError:
             # Looked up only now: a model may have very many versions.
             self.require(name)
@@ -326,10 +326,6 @@ class Registry:
             raise _unknown(name, label, [*self.versions(name), *sorted(history.aliases())])
         return self.load(name, version)
 
-    def folder_of(self, name: str) -> Folder:
-        """Return the folder of a model's versions."""
-        return self._versions(name).folder
-
     def champion(self, name: str) -> ModelVersion | None:
         """Return the version in use, or None before the first."""
         version = self.history(name).pointed_at(CHAMPION)
@@ -342,7 +338,7 @@ class Registry:
     def trained_drives(self, manifest: Manifest) -> TrainedDrives:
         """Return what drives made a version. Raises `StorageError`."""
         expected = manifest.trained_on.drives_sha256
-        folder, file = self.folder_of(manifest.name), f"drives-{expected}.bin"
+        folder, file = self.versions_of(manifest.name).folder, f"drives-{expected}.bin"
         content = folder.read(file)
         if checksum_of_drives(content) != expected:
             raise StorageError(
@@ -357,7 +353,7 @@ class Registry:
         If the latest is the same estimator from the same rows, it is used: another process added
         it.
         """
-        name, versions = manifest.name, self._versions(manifest.name)
+        name, versions = manifest.name, self.versions_of(manifest.name)
         versions.folder.create(f"drives-{checksum_of_drives(drives)}.bin", drives)
 
         def next_version(latest: int) -> int | None:
@@ -471,7 +467,8 @@ class Registry:
             )
         return rows
 
-    def _versions(self, name: str) -> DocumentFolder:
+    def versions_of(self, name: str) -> DocumentFolder:
+        """Return the documents of a model's versions."""
         return DocumentFolder(self.root, f"{FOLDER}/{name}/versions")
 
 
@@ -545,7 +542,7 @@ def compare_versions(registry: Registry, first: ModelVersion, second: ModelVersi
     """Compare two versions. Raises `StorageError` if a file of training drives is damaged."""
     import numpy as np  # noqa: PLC0415 - not for show
 
-    a, b = (dict(_entries(version)) for version in (first, second))
+    a, b = (dict(_flat(_content(version), "")) for version in (first, second))
     names = [name for name in dict.fromkeys([*a, *b]) if a.get(name) != b.get(name)]
     facts = {name: (a.get(name), b.get(name)) for name in names}
     if first.manifest.name != second.manifest.name:  # their drives are salted differently
@@ -555,11 +552,10 @@ def compare_versions(registry: Registry, first: ModelVersion, second: ModelVersi
     return Difference(first, second, facts, (len(c) - both, len(d) - both, both))
 
 
-def _entries(version: ModelVersion) -> Iterator[tuple[str, Any]]:
-    """Yield the entries of a manifest, terms by their signals."""
+def _content(version: ModelVersion) -> dict[str, Any]:
+    """Return the content of a manifest, terms by their signals."""
     content = version.manifest.model_dump(mode="json")
-    content["terms"] = {term.pop("signal"): term for term in content["terms"]}
-    return _flat(content, "")
+    return {**content, "terms": {term.pop("signal"): term for term in content["terms"]}}
 
 
 def _flat(content: dict[str, Any], path: str) -> Iterator[tuple[str, Any]]:

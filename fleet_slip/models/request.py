@@ -399,11 +399,6 @@ class SelectionPlan:
         )
         return cls(original, request, compared, feature_set, folds)
 
-    @property
-    def is_default(self) -> bool:
-        """True if the default model list is compared because the request names none."""
-        return self.original.models is None and self.request.models == DEFAULT_MODELS
-
 
 def _default_list(request: SelectionRequest) -> str | None:
     """Return the name of the list that is compared unless the request names one."""

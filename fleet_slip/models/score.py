@@ -98,21 +98,6 @@ class Score(Answer):
             )
 
 
-def _si_rows(signals: SignalCatalog) -> str:
-    """Return a subquery: the rows of `log_counts` with the columns of the view `log`."""
-    columns = [
-        f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s",
-        *(f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in signals.signals.items()),
-    ]
-    separator = ",\n            "
-    return f"""(
-        SELECT
-            *,
-            {separator.join(columns)}
-        FROM log_counts
-    )"""
-
-
 def score(warehouse: Warehouse, manifest: Manifest, predicate: str | Predicate) -> Score:
     """Score a model on the rows of `log` that satisfy a predicate.
 
@@ -150,8 +135,13 @@ def _estimate_rows(
     needed = [*predictor.plan.signals, label, *speeds, *predictor.plan.facts, "vehicle_id"]
     cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
     counts = ", ".join(dict.fromkeys(needed))
+    # The rows of `log_counts` with the columns of the view `log`.
+    values = [f"{name} * {s.scale}::DOUBLE AS {s.column}" for name, s in signals.signals.items()]
+    time = f"tick / {int(1 / SAMPLE_TIME_S)}::DOUBLE AS time_s"
     text = read_sql("jobs", "drives_in_time.sql").format(
-        columns=counts, rows=_si_rows(signals), predicate=predicate.sql
+        columns=counts,
+        rows=f"(SELECT *, {', '.join([time, *values])} FROM log_counts)",
+        predicate=predicate.sql,
     )
     estimates: list[FloatArray] = []
     truths: list[FloatArray] = []

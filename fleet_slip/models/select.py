@@ -94,7 +94,7 @@ def run_plan(
     try:
         cohort = load_training_set(warehouse, plan, predicate)
     except NotComputedError as error:
-        if not plan.is_default:
+        if plan.original.models or plan.request.models != DEFAULT_MODELS:
             raise
         remark = f"Using model list {LOGGED_MODELS} instead of {DEFAULT_MODELS}: {error}"
         logged = replace(plan.original, models=LOGGED_MODELS)

@@ -44,30 +44,16 @@ accuracy of the best reference sensors, about 0.1 deg."""
 class RmseGap:
     """Difference of a `model`'s RMSE (rad) to the best's, over the same folds.
 
-    `square` is the difference of mean squared errors, rad^2. A gap `within_tolerance` is below the
-    smallest gain that justifies a signal.
+    The `independent_error` is the gap in rad without the noise of the label, 0 for a better model.
+    A `negligible` gap does not justify a signal: it is small, or no larger than its standard error.
     """
 
     model: CrossValidation
     rmse: float
     standard_error: float
-    square: float
-    within_tolerance: bool
-
-    @property
-    def independent_error(self) -> float:
-        """The gap in rad without the noise of the label; 0 if this model is better."""
-        return math.sqrt(max(self.square, 0.0))
-
-    @property
-    def is_significant(self) -> bool:
-        """True if it is larger than its standard error."""
-        return self.rmse > self.standard_error
-
-    @property
-    def negligible(self) -> bool:
-        """True if the best model is not relevantly better."""
-        return self.within_tolerance or not self.is_significant
+    independent_error: float
+    is_significant: bool
+    negligible: bool
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entries of a JSON document."""
@@ -119,11 +105,15 @@ def choose(models: Sequence[CrossValidation], tolerance: float = DEFAULT_TOLERAN
     if not models:
         raise QuestionError("no model to choose from: the list of models is empty.")
     best = best_correlated(models)
-    gaps = tuple(_gap(model, best, tolerance, _standard_error(model, best)) for model in models)
+    gaps = []
+    for model in models:
+        folds = zip(model.folds, best.folds, strict=True)
+        error = error_of_mean([fold.rmse - best_fold.rmse for fold, best_fold in folds])
+        gaps.append(_gap(model, best, tolerance, error))
     contenders = [gap.model for gap in gaps if gap.model is best or gap.negligible]
     min_size = min(len(model.signals) for model in contenders)
     winner = best_correlated([model for model in contenders if len(model.signals) == min_size])
-    return Winner(winner, best, _reason(winner, best, len(contenders), len(models)), gaps)
+    return Winner(winner, best, _reason(winner, best, len(contenders), len(models)), tuple(gaps))
 
 
 def best_correlated(models: Sequence[CrossValidation]) -> CrossValidation:
@@ -135,14 +125,12 @@ def _gap(
     model: CrossValidation, best: CrossValidation, tolerance: float, standard_error: float
 ) -> RmseGap:
     first, second = model.pooled.rmse, best.pooled.rmse
-    square = (first - second) * (first + second)
-    return RmseGap(model, first - second, standard_error, square, square < tolerance**2)
-
-
-def _standard_error(candidate: CrossValidation, other: CrossValidation) -> float:
-    """Return the standard error of the difference of RMSEs over the same folds."""
-    pairs = zip(candidate.folds, other.folds, strict=True)
-    return error_of_mean([first.rmse - second.rmse for first, second in pairs])
+    square, is_significant = (first - second) * (first + second), first - second > standard_error
+    negligible = square < tolerance**2 or not is_significant
+    independent_error = math.sqrt(max(square, 0.0))
+    return RmseGap(
+        model, first - second, standard_error, independent_error, is_significant, negligible
+    )
 
 
 def _reason(winner: CrossValidation, best: CrossValidation, contenders: int, total: int) -> str:

@@ -179,7 +179,9 @@ def fit_combination(pairs: PairedEstimates, method: Method) -> EstimateCombinati
     share = 1.0 - min(max((min(max(filter_weight, -1.0), 2.0) + 0.5) / 2, 0.0), 1.0)
     if method == "constant":
         return EstimateCombination("filter", (share,), (math.sqrt(square),))
-    hats = hat_functions(pairs.lateral_mps2)
+    # The hat functions of the knots, shape (knots, rows); their sum is 1.
+    units = np.eye(len(KNOTS_MPS2))
+    hats = np.stack([np.interp(pairs.lateral_mps2, KNOTS_MPS2, unit) for unit in units])
     normal = (hats * (v * z**2)) @ hats.T
     ridge = RIDGE * np.trace(normal) / len(hats) * np.eye(len(hats))
     moments = hats @ (v * z * (pairs.label - pairs.filter - share * z))
@@ -189,11 +191,6 @@ def fit_combination(pairs: PairedEstimates, method: Method) -> EstimateCombinati
     return EstimateCombination(
         anchor, tuple(shares.tolist()), tuple(np.sqrt(variances).tolist()), KNOTS_MPS2
     )
-
-
-def hat_functions(lateral_mps2: FloatArray) -> FloatArray:
-    """Return the hat functions of the knots, shape (knots, rows); their sum is 1."""
-    return np.stack([np.interp(lateral_mps2, KNOTS_MPS2, unit) for unit in np.eye(len(KNOTS_MPS2))])
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
 ) -> None:
     """With a flipped bit there, what is better on odd drives alone became champion."""
     write(champion, "odd", 8, label=1.25)
-    (kept,) = Path(str(registry_of(champion).folder_of("beta"))).glob("drives-*.bin")
+    (kept,) = Path(str(registry_of(champion).versions_of("beta").folder)).glob("drives-*.bin")
     kept.write_bytes(kept.read_bytes()[:-1] + b"x")
     with pytest.raises(
         RefusedError, match=r"no comparison on the champion's training set: .*checksum"
@@ -285,7 +285,7 @@ def test_a_version_keeps_which_drives_made_it(champion: Warehouse) -> None:
 
 
 def test_drives_that_are_gone_or_damaged_count_as_trained_on(champion: Warehouse) -> None:
-    folder = Path(str(registry_of(champion).folder_of("beta")))
+    folder = Path(str(registry_of(champion).versions_of("beta").folder))
     (kept,) = folder.glob("drives-*.bin")
     content = bytearray(kept.read_bytes())
     assert len(content) == 48 * 8
