@@ -558,8 +558,11 @@ class Definition(Config):
 
     @property
     def components(self) -> tuple["Definition", ...]:
-        """Its components without gates: itself, or the gated column and the gate's column."""
-        return (self.ungated, self.gate.by) if self.gate else (self,)
+        """Its components without gates and parameters: itself, and those that these refer to."""
+        base = self.model_copy(update={"number": None}) if self.number else self
+        components = (base.ungated, base.gate.by) if base.gate else (base,)
+        running = self.number.running if self.number else None
+        return (*components, running) if running else components
 
 
 def plain_column(name: str, sql: str = "", bits: int = COUNT_BITS) -> Definition:

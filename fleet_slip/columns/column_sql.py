@@ -4,7 +4,7 @@ Null is a missing value. Integers have 64 bits.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from fleet_slip.catalog.arithmetic import nearest_sql
@@ -63,11 +63,6 @@ DUCKDB_SQL: Mapping[str, str] = {
 DIVIDES = ("//", "nearest")
 
 
-def sql_constant(value: int) -> str:
-    """Return a constant; in parentheses if negative, as a minus may precede it."""
-    return str(value) if value >= 0 else f"({value})"
-
-
 def attribute_sql(attribute: VehicleAttribute) -> str:
     """Return the SQL of a vehicle attribute's integer from the drive's column; null if unknown."""
     if attribute.equals is None:
@@ -121,7 +116,8 @@ class SqlLayers:
     def _written(self, number: int) -> tuple[str, int]:
         step = self._steps[number]
         if step.name == "constant":
-            return sql_constant(step.plain[0]), 0
+            value = step.plain[0]  # in parentheses if negative: a minus may precede it
+            return (str(value) if value >= 0 else f"({value})"), 0
         if step.name in GIVEN:
             return self._input_sql(step.name, step.plain[0]), 0
         inline = step.name in INLINE
@@ -185,19 +181,13 @@ class CountedColumns:
         """Lower columns over time, and `rows`, which include their sources."""
         signals = dict.fromkeys(name for definition in rows.values() for name in definition.signals)
         lowered = _ClippedLast({name: place for place, name in enumerate(signals)})
-        components = [
-            component
-            for definition in over_time.values()
-            if not definition.gate
-            for component in components_of(definition)
-        ]
-        gated = [
-            component
-            for definition in over_time.values()
-            if definition.gate
-            for component in components_of(definition)
-        ]
-        components += dict.fromkeys(gated)
+        components, gated = list[Definition](), dict[Definition, None]()
+        for definition in over_time.values():
+            if definition.gate:
+                gated |= dict.fromkeys(definition.components)
+            else:
+                components += definition.components
+        components += gated
         places = {}
         for name, row in rows.items():  # each row is followed by the columns that use it
             places[name] = lowered.row(row)
@@ -212,16 +202,6 @@ class CountedColumns:
             times.update(_clips(steps, lowered.column(component), ends))
         ranges = lowered.ranges([LOGGED] * len(signals))
         return cls(lowered, steps, ranges, places | columns, times)
-
-
-def components_of(column: Definition) -> Iterator[Definition]:
-    """Yield the components of a column, without gates and calibration parameters."""
-    if column.number is not None:
-        yield from components_of(column.model_copy(update={"number": None}))
-        if column.number.running is not None:
-            yield column.number.running
-    else:
-        yield from column.components
 
 
 def rows_of(

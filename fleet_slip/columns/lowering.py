@@ -5,12 +5,12 @@ at most 63 bits, or missing. Each target (SQL, kernel, C, ONNX) has a table with
 operation, and uses the ranges, rules of missing values and look-back of this module.
 """
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from functools import reduce
 from itertools import combinations_with_replacement
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 from fleet_slip.catalog.arithmetic import nearest, parse, truncated
 from fleet_slip.catalog.definitions import (
@@ -212,8 +212,6 @@ def largest_in(step: Step, number: int, ranges: Sequence[Range]) -> int:
 
 # The lowering of `fleet_slip.catalog.definitions` to steps, each step once.
 
-Key = TypeVar("Key", bound=Hashable)
-
 LARGEST_WORD = 2**63 - 1
 """Largest absolute value of any step."""
 
@@ -271,8 +269,9 @@ class Lowering:
     ) -> tuple["Lowering", list[int]]:
         """Lower columns; return the lowering and the step of each column."""
         self = cls({name: place for place, name in enumerate(signals)})
-        for column in columns:
-            self._rows(column)
+        for column in columns:  # before steps that use past values
+            for component in column.components:
+                self.row(component)
         return self, [self.column(column) for column in columns]
 
     def ranges(self, signals: Sequence[Range]) -> list[Range]:
@@ -312,17 +311,13 @@ class Lowering:
         times = step if numerator == 1 else self.do("*", step, self.constant(numerator))
         return self.do("nearest", times, divisor)
 
+    def _add(self, steps: Iterable[int]) -> int:
+        """Return the sum of some steps."""
+        return reduce(lambda a, b: self.do("+", a, b), steps)
+
     def less(self, step: int, constant: int) -> int:
         """Return a step less a constant."""
         return self.do("-", step, self.constant(constant)) if constant else step
-
-    def _rows(self, column: Definition) -> None:
-        """Add the sources of a column, before steps that use past values."""
-        self.row(column)
-        if column.gate is not None:
-            self.row(column.gate.by)
-        if column.number is not None and column.number.running is not None:
-            self.row(column.number.running)
 
     def row(self, column: Definition) -> int:
         """Return the step of a column's source: a signal or a clipped feature or composite."""
@@ -374,12 +369,12 @@ class Lowering:
             if column.over != "sum":
                 divisor = self.do("*", divisor, self.do("values", *window))
         value, limit = self.nearest(total, numerator, divisor), limit_of(column.bits)
-        return (
-            self.clip(value, limit) if total == now else self.clip_where(value, limit, lambda: now)
-        )
+        if total == now:
+            return self.clip(value, limit)
+        return self.clip_where(value, limit, lambda: now)
 
     def _factor(self, column: Definition, fact: AttributeFactor) -> int:
-        place = _place(self.facts, VehicleAttribute(fact.name, fact.equals))
+        place = self.facts.setdefault(VehicleAttribute(fact.name, fact.equals), len(self.facts))
         base = self.column(column.model_copy(update={"fact": None}))
         less = 0 if fact.equals is not None else fact.less
         times = self.do("*", base, self.less(self.do("fact", place), less))
@@ -388,18 +383,13 @@ class Lowering:
 
     def _gated(self, ungated: Definition, gate: Gate) -> int:
         base, by = self.column(ungated), self.column(gate.by)
-        times = self.do("*", base, self.weight(by, gate))
-        return self.nearest(times, 1, self.constant(WEIGHT))
-
-    def weight(self, by: int, gate: Gate) -> int:
-        """Return the step of a gate's weight: the lesser of both ramps."""
         full, none = self.constant(WEIGHT), self.constant(0)
         rises = self._ramp(by, gate.low, gate.peak)
-        opened = self.do("max", self.do("min", rises, full), none)
-        if gate.high is None:
-            return opened
-        falls = self.do("-", full, self._ramp(by, gate.peak, gate.high))
-        return self.do("max", self.do("min", opened, falls), none)
+        weight = self.do("max", self.do("min", rises, full), none)
+        if gate.high is not None:  # the lesser of both ramps
+            falls = self.do("-", full, self._ramp(by, gate.peak, gate.high))
+            weight = self.do("max", self.do("min", weight, falls), none)
+        return self.nearest(self.do("*", base, weight), 1, full)
 
     def _ramp(self, by: int, low: int, high: int) -> int:
         times = self.do("*", self.less(by, low), self.constant(WEIGHT))
@@ -409,7 +399,8 @@ class Lowering:
         base = self.column(column.model_copy(update={"number": None}))
         running = None if number.running is None else self.column(number.running)
         unit = CALIBRATION_PARAMETERS[number.name].unit
-        place = _place(self.numbers, ParameterCount(number.name, unit, number.grain))
+        parameter = ParameterCount(number.name, unit, number.grain)
+        place = self.numbers.setdefault(parameter, len(self.numbers))
         stand_in = self.constant(0) if running is None else running
         factor = self.do("else", self.less(self.do("number", place), number.less), stand_in)
         return self.do("where", factor, base) if number.alone else self.do("*", base, factor)
@@ -428,9 +419,8 @@ class Lowering:
         if isinstance(composite, Product):
             factors = [self.column(column) for column in composite.of] or [self.constant(1)]
             product = factors[0] if len(factors) == 1 else self.do("*", *factors)
-            return self.nearest(
-                product, composite.ratio.numerator, self.constant(composite.ratio.denominator)
-            )
+            divisor = self.constant(composite.ratio.denominator)
+            return self.nearest(product, composite.ratio.numerator, divisor)
         if composite.line == "":
             raise QuestionError(
                 "its columns use the estimate of a first-stage model, which is not fitted. Run: "
@@ -442,7 +432,7 @@ class Lowering:
             else self.do("*", self.column(column), self.constant(times))
             for times, column in composite.terms
         ]
-        total = reduce(lambda a, b: self.do("+", a, b), terms, self.constant(composite.intercept))
+        total = self._add([self.constant(composite.intercept), *terms])
         return self.nearest(total, 1, self.constant(composite.divisor))
 
     def _slope(self, slope: Slope) -> int:
@@ -478,9 +468,7 @@ class Lowering:
         products = [self._products_of(equation, order) for equation in slope.equations]
         sums = {}
         for at in products[0]:
-            tick_sum = reduce(
-                lambda a, b: self.do("+", a, b), (equation[at] for equation in products)
-            )
+            tick_sum = self._add(equation[at] for equation in products)
             total = self.do("sum", tick_sum, 0, most_products(len(products)))
             unknown = order[at[0]]
             if at[0] == at[1] and unknown is not None:
@@ -500,7 +488,7 @@ class Lowering:
         varying = [
             step for step, column in zip(steps, columns, strict=True) if not isinstance(column, int)
         ]
-        presence = reduce(lambda a, b: self.do("+", a, b), varying)
+        presence = self._add(varying)
         divisor, products = GRAIN * equation.weight.denominator, {}
         for i, j in combinations_with_replacement(range(len(order)), 2):
             a, b = columns[i], columns[j]
@@ -545,8 +533,3 @@ def most_values(column: Definition) -> int:
     limit = limit_of(column.of_bits) if column.sql else COUNT_MAX
     largest = 2 * limit * column.ratio.numerator + column.ratio.denominator
     return min(MOST_VALUES, LARGEST_WORD // largest)
-
-
-def _place(places: dict[Key, int], key: Key) -> int:
-    """Return the place of a key; append a new one."""
-    return places.setdefault(key, len(places))
