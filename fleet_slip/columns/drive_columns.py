@@ -202,16 +202,16 @@ def compute_columns(plan: ColumnPlan, drive: DriveCounts) -> FloatArray:
 
 def _require_exact(plan: ColumnPlan, drive: DriveCounts) -> None:
     """Raise `DataError` for a drive whose sums may not be exact."""
-    rows = len(drive.ticks)
+    rows, most_rows = len(drive.ticks), plan.most_rows
     if (drive.ticks[1:] <= drive.ticks[:-1]).any():
         raise DataError(
             "the ticks of a drive do not increase: it has no windows. Run: fleet-slip verify"
         )
     for window in plan.windows.values():
-        summed = window.over not in {None, "lag"}
-        if summed and 2 * (rows + 1) * limit_of(window.of_bits) * window.ratio.numerator >= _EXACT:
-            raise DataError(f"the drive has {rows:,} rows: too many for windows.")
-    if rows > plan.most_rows:
+        if window.over not in {None, "lag"}:
+            per_row = 2 * limit_of(window.of_bits) * window.ratio.numerator
+            most_rows = min(most_rows, (_EXACT - 1) // per_row - 1)
+    if rows > most_rows:
         raise DataError(f"the drive has {rows:,} rows: too many for windows.")
     for name in plan.signals:
         counts = drive.counts[name]
@@ -249,38 +249,38 @@ class ColumnProgram:
     wide: frozenset[int]
     unused_after: Mapping[int, list[int]]
 
-    @classmethod
-    def from_columns(cls, counted: CountedColumns) -> "ColumnProgram":
-        """Order the steps. Raises `QuestionError` for a division by a number below 1."""
-        steps, ranges = counted.steps, counted.ranges
-        wide, of_sums = set[int](), set[int]()
-        for number, step in enumerate(steps):
-            operands = step.operands
-            if step.name in _DIVISIONS and ranges[operands[1]][1] <= 0:
-                raise QuestionError("a feature divides by a number that is not positive.")
-            if OPERATIONS[step.name].over_time:
-                of_sums.add(number)  # a drive with so many rows is refused
-            elif step.name in _ARITHMETIC:
-                if not of_sums.isdisjoint(operands):
-                    of_sums.add(number)
-                elif largest_in(step, number, ranges) >= _EXACT:
-                    wide.add(number)
-        recursion = Recursion.of_steps(steps)
-        outside = [number for number in range(len(steps)) if number not in recursion.members]
-        before = tuple(number for number in outside if number not in recursion.dependent)
-        after = tuple(number for number in outside if number in recursion.dependent)
-        last_reader = {i: number for number in (*before, *after) for i in steps[number].operands}
-        unused_after: dict[int, list[int]] = {}
-        for number in last_reader.keys() - {*counted.places.values(), *recursion.inputs}:
-            unused_after.setdefault(last_reader[number], []).append(number)
-        return cls(counted, recursion, before, after, frozenset(wide), unused_after)
-
 
 @lru_cache(maxsize=64)
 def _program(
     rows: tuple[tuple[str, Definition], ...], windows: tuple[tuple[str, Definition], ...]
 ) -> ColumnProgram:
-    return ColumnProgram.from_columns(CountedColumns.from_definitions(dict(rows), dict(windows)))
+    """Lower columns and order their steps.
+
+    Raises `QuestionError` for a division by a number below 1.
+    """
+    counted = CountedColumns.from_definitions(dict(rows), dict(windows))
+    steps, ranges = counted.steps, counted.ranges
+    wide, of_sums = set[int](), set[int]()
+    for number, step in enumerate(steps):
+        operands = step.operands
+        if step.name in _DIVISIONS and ranges[operands[1]][1] <= 0:
+            raise QuestionError("a feature divides by a number that is not positive.")
+        if OPERATIONS[step.name].over_time:
+            of_sums.add(number)  # a drive with so many rows is refused
+        elif step.name in _ARITHMETIC:
+            if not of_sums.isdisjoint(operands):
+                of_sums.add(number)
+            elif largest_in(step, number, ranges) >= _EXACT:
+                wide.add(number)
+    recursion = Recursion.of_steps(steps)
+    outside = [number for number in range(len(steps)) if number not in recursion.members]
+    before = tuple(number for number in outside if number not in recursion.dependent)
+    after = tuple(number for number in outside if number in recursion.dependent)
+    last_reader = {i: number for number in (*before, *after) for i in steps[number].operands}
+    unused_after: dict[int, list[int]] = {}
+    for number in last_reader.keys() - {*counted.places.values(), *recursion.inputs}:
+        unused_after.setdefault(last_reader[number], []).append(number)
+    return ColumnProgram(counted, recursion, before, after, frozenset(wide), unused_after)
 
 
 @dataclass(frozen=True)
@@ -393,8 +393,12 @@ class _Evaluation:
         self._is_complete = drive.is_complete
         lowered = program.counted.lowered
         self._signals = list(lowered.signals)
-        self.facts = [_of_car(fact.count(drive.facts[fact.name])) for fact in lowered.facts]
-        self.numbers = [_of_car(drive.numbers.get(number.name)) for number in lowered.numbers]
+        facts = [fact.count(drive.facts[fact.name]) for fact in lowered.facts]
+        numbers = [drive.numbers.get(number.name) for number in lowered.numbers]
+        self.facts, self.numbers = (
+            [nan if count is None else float(count) for count in counts]
+            for counts in (facts, numbers)
+        )
         self._words = program.recursion.memory()
         self._running: dict[int, _RunningSum] = {}
         self._history: dict[int, FloatArray] = {}
@@ -524,7 +528,3 @@ _READERS: Mapping[str, Callable[..., Vector]] = {
     "values": partial(_Evaluation._window, name="values"),
 }
 """Steps that read inputs or past values."""
-
-
-def _of_car(count: int | None) -> float:
-    return nan if count is None else float(count)

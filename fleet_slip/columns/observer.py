@@ -11,9 +11,9 @@ limit, so that no fault of a sensor outlasts its end.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from itertools import combinations_with_replacement, pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -114,14 +114,12 @@ class Number:
 
     def to(self, bits: int) -> "Number":
         """Round to fewer bits; more bits are exact."""
+        if bits == self.bits:
+            return self
         if bits < self.bits:
             return Number(self.low, self.low.do("shift", self.step, self.bits - bits), bits)
         factor = self.low.constant(2 ** (bits - self.bits))
-        return (
-            self
-            if bits == self.bits
-            else Number(self.low, self.low.do("*", self.step, factor), bits)
-        )
+        return Number(self.low, self.low.do("*", self.step, factor), bits)
 
     def times(self, factor: float, bits: int | None = None) -> "Number":
         """Multiply by a constant of 20 significant bits, or 2⁻⁴⁰, and round once."""
@@ -153,11 +151,8 @@ class Number:
 
     def exceeds(self, value: "Number | float") -> "Number":
         """Return 1 with no bits where this is larger, else 0."""
-        return (self - value).do("sign").at_zero_bits().at_least(0)
-
-    def at_zero_bits(self) -> "Number":
-        """Return the same count without a fraction."""
-        return Number(self.low, self.step, 0)
+        sign = (self - value).do("sign")
+        return Number(self.low, sign.step, 0).at_least(0)
 
     def orelse(self, other: "Number | float") -> "Number":
         """Return the other number where this is missing."""
@@ -227,9 +222,8 @@ class ObserverLowering:
         innovation = (now["ay"] - motion.lateral - x.mean[3]).within(2 * ACCELERATION_MPS2)
         x = self._correct(x, row, innovation, car.ay_std_mps2, logged["ay"])
 
-        self._keep(zip(velocity, x.mean, strict=True))
-        self._keep((stored[pair], x.covariance[pair]) for pair in pairs)
-        self._keep((held[name], now[name]) for name in held)
+        self._keep(velocity, stored, x)
+        self._next += [(held[name], now[name]) for name in held]
         runs = arrives.at_most(started.at_least(begins))
         for state, value in [*self._next, (started, started.like(1.0))]:
             self.low.do("next", choose(runs, value, state).step, state.step)
@@ -242,31 +236,28 @@ class ObserverLowering:
         bound = round(limit * 2**bits)
         return Number(self.low, self.low.do("state", slot, bound), bits)
 
-    def _keep(self, pairs: Iterable[tuple[Number, Number]]) -> None:
-        self._next += pairs
+    def _keep(
+        self,
+        means: Sequence[Number],
+        covariance: Mapping[tuple[int, int], Number],
+        following: "Gaussian",
+    ) -> None:
+        """Replace the stored mean and covariance after the tick."""
+        self._next += zip(means, following.mean, strict=True)
+        self._next += [(stored, following.covariance[at]) for at, stored in covariance.items()]
 
     def _inputs(self) -> dict[str, Number]:
         """Return the logged inputs in SI units by name; missing where the signals are missing."""
-        observer = self.observer
-        inputs = {
-            "ay": observer.ay,
-            "yaw_rate": observer.yaw_rate,
-            "speed": observer.speed,
-            "steer": observer.steer,
-            "ax": observer.ax,
-            "wheels": observer.wheels,
-        }
-        return {
-            name: self._input(entry).within(_LIMITS[name])
-            for name, entry in inputs.items()
-            if entry is not None
-        }
-
-    def _input(self, entry: ObserverInput) -> Number:
-        columns = [self.low.column(column) for column in entry.of]
-        total = reduce(lambda a, b: self.low.do("+" if entry.adds else "-", a, b), columns)
-        value = Number(self.low, total, 0).times(entry.scale, STATE)
-        return value - entry.offset if entry.offset else value
+        inputs = {}
+        for name, limit in _LIMITS.items():
+            entry: ObserverInput | None = getattr(self.observer, name)
+            if entry is None:
+                continue
+            first, *others = (Number(self.low, self.low.column(column), 0) for column in entry.of)
+            total = reduce(Number.__add__ if entry.adds else Number.__sub__, others, first)
+            value = total.times(entry.scale, STATE)
+            inputs[name] = (value - entry.offset if entry.offset else value).within(limit)
+        return inputs
 
     def _ax_from(self, speed: Number, before: Number, begins: Number) -> Number:
         """Return the acceleration from the change of the wheels' speed, with a lag."""
@@ -275,7 +266,7 @@ class ObserverLowering:
         zero = lagged.like(0.0)
         following = (lagged + (change - lagged).times(LAG_SHARE)).within(ACCELERATION_MPS2)
         new = choose(begins, zero, following)
-        self._keep([(lagged, new)])
+        self._next.append((lagged, new))
         return new
 
     def _yaw_rate(
@@ -306,24 +297,20 @@ class ObserverLowering:
         wheels = self._wheel_yaw_rate(logged, ax, cosine)
         innovation = (wheels.orelse(0.0) - x.mean[0]).within(2 * YAW_RAD_S)
         x = self._correct(x, {0: None}, innovation, car.wheel_yaw_rate_std_rad_s, wheels)
-        self._keep(zip(means, x.mean, strict=True))
-        self._keep((stored[pair], x.covariance[pair]) for pair in pairs)
+        self._keep(means, stored, x)
         return x.mean[0]
 
     def _wheel_yaw_rate(self, logged: Mapping[str, Number], ax: Number, cosine: Number) -> Number:
         """Return the yaw rate of the wheels where they roll freely; at rest it is zero."""
         speed = logged["speed"]
         if "wheels" not in logged:
-            rests = self._number(1, 0) - abs(speed).exceeds(0.0)
+            rests = Number(self.low, self.low.constant(1), 0) - abs(speed).exceeds(0.0)
             return speed.like(0.0).where(rests.where(speed.present()).orelse(0.0))
         track = self.car.track_front_m if self.observer.axle == "front" else self.car.track_rear_m
         wheels = logged["wheels"].times(1 / track)
         if self.observer.axle == "front":
             wheels = wheels.over(cosine, STATE)
         return wheels.within(YAW_RAD_S).where(ax.exceeds(BRAKING_MPS2))
-
-    def _number(self, value: float, bits: int) -> Number:
-        return Number(self.low, self.low.constant(round(value * 2**bits)), bits)
 
     def _axles(self, ax: Number, ay: Number, begins: Number) -> tuple["Axle", "Axle"]:
         """Return both axles under the load of the moment, which follows with a lag."""
@@ -334,7 +321,7 @@ class ObserverLowering:
             state = self._state(ACCELERATION_MPS2)
             new = state + (value - state).times(STEP_S / lag_s)
             lagged.append(choose(begins, value, new).within(ACCELERATION_MPS2))
-            self._keep([(state, lagged[-1])])
+            self._next.append((state, lagged[-1]))
         pitch = lagged[0].times(car.height_m / wheelbase / 2)
         axles = []
         for sign, share, distance, track, peak in (
@@ -417,12 +404,9 @@ class ObserverLowering:
             for row in slopes
         ]
 
-        def entry(i: int, j: int) -> Number:
-            return x.covariance[min(i, j), max(i, j)]
-
         fp = [
             [
-                _grow(entry(i, j), f[i], [entry(k, j) for k in range(3)]).within(2 * VARIANCE)
+                _grow(x.entry(i, j), f[i], [x.entry(k, j) for k in range(3)]).within(2 * VARIANCE)
                 for j in range(4)
             ]
             for i in range(3)
@@ -452,33 +436,25 @@ class ObserverLowering:
         """
         n = len(x.mean)
 
-        def entry(i: int, j: int) -> Number:
-            return x.covariance[min(i, j), max(i, j)]
-
-        def product(terms: Sequence[tuple[Number, Number | None]]) -> Number:
-            parts = [value.to(bits) if h is None else (value * h).to(bits) for value, h in terms]
+        def product(column: Callable[[int], Number], bits: int) -> Number:
+            terms = [(column(j).to(bits), h) for j, h in row.items()]
+            parts = [value if h is None else (value * h).to(bits) for value, h in terms]
             return reduce(Number.__add__, parts)
 
-        bits = COVARIANCE
-        u = [product([(entry(i, j), h) for j, h in row.items()]) for i in range(n)]
-        limit = VARIANCE
-        if any(h is not None for h in row.values()):
-            limit = 2.0**7
-            u = [value.within(limit) for value in u]
-            bits = TRANSITION
-            predicted = product([(u[j].to(bits), h) for j, h in row.items()]).to(COVARIANCE)
-            bits = COVARIANCE
-        else:
-            predicted = product([(u[j], h) for j, h in row.items()])
-        noise = max(std**2, 2.0**-COVARIANCE)
-        total = predicted.at_least(0.0) + noise
-        gains = [value.over(total, GAIN).within(2.0 if limit > VARIANCE else 31.0) for value in u]
+        derived = any(h is not None for h in row.values())
+        u = [product(partial(x.entry, i), COVARIANCE) for i in range(n)]
+        if derived:
+            u = [value.within(2.0**7) for value in u]
+        bits = TRANSITION if derived else COVARIANCE
+        predicted = product(lambda j: u[j], bits).to(COVARIANCE)
+        total = predicted.at_least(0.0) + max(std**2, 2.0**-COVARIANCE)
+        gains = [value.over(total, GAIN).within(2.0 if derived else 31.0) for value in u]
         mean = [
             (value + (gain * innovation).to(STATE)).within(bound)
             for value, gain, bound in zip(x.mean, gains, _bounds(n), strict=True)
         ]
         covariance = {
-            (i, j): _bounded(entry(i, j) - (gains[i] * u[j]).to(COVARIANCE), diagonal=i == j)
+            (i, j): _bounded(x.entry(i, j) - (gains[i] * u[j]).to(COVARIANCE), diagonal=i == j)
             for i, j in x.covariance
         }
         return choose_state(measured.present(), Gaussian(mean, covariance), x)
@@ -507,17 +483,17 @@ class Gaussian:
     mean: Sequence[Number]
     covariance: Mapping[tuple[int, int], Number]
 
+    def entry(self, i: int, j: int) -> Number:
+        """Return an entry of the covariance, which is symmetric."""
+        return self.covariance[min(i, j), max(i, j)]
+
 
 def choose_state(condition: Number, first: Gaussian, second: Gaussian) -> Gaussian:
     """Return the first state where a condition is 1, else the second."""
     means = zip(first.mean, second.mean, strict=True)
-    return Gaussian(
-        [choose(condition, *pair) for pair in means],
-        {
-            at: choose(condition, first.covariance[at], value)
-            for at, value in second.covariance.items()
-        },
-    )
+    mean = [choose(condition, *pair) for pair in means]
+    pairs = ((at, first.covariance[at], value) for at, value in second.covariance.items())
+    return Gaussian(mean, {at: choose(condition, a, b) for at, a, b in pairs})
 
 
 class Axle(NamedTuple):
@@ -600,13 +576,14 @@ def _arctan(y: Number, x: Number) -> Number:
 
 
 _LIMITS = {
-    "ax": ACCELERATION_MPS2,
     "ay": ACCELERATION_MPS2,
     "yaw_rate": YAW_RAD_S,
     "speed": VX_MPS,
     "steer": STEER_RAD,
+    "ax": ACCELERATION_MPS2,
     "wheels": VX_MPS,
 }
+"""Inputs of an observer in order, and their limits."""
 
 
 def lower_blend(low: "Lowering", blend: Blend) -> int:

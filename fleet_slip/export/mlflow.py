@@ -4,8 +4,8 @@ MLflow and pandas are the extra `fleet-slip[mlflow]`, imported on use.
 """
 
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from dataclasses import dataclass
 from http.client import HTTPException
 from importlib.metadata import version as package_version
 from pathlib import Path
@@ -45,23 +45,38 @@ def log_to_mlflow(uri: str, subject: Subject, aliases: Mapping[str, int]) -> str
 
     A version with the same checksum is not registered again. The `aliases` of the version are
     copied. Raises `UsageError` for a URI with a password, and `StorageError` if the server rejects
-    it.
+    it; `ConfigError` without the package.
     """
     if urlsplit(uri).username is not None or urlsplit(uri).password is not None:
         raise UsageError(
             "the URI of MLflow contains a name or password, which logs would store. Set "
             "MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD instead."
         )
-    mlflow, version = _library(), subject.version
-    require_answer(uri, version.reference)
     try:
-        with _tracking(mlflow, uri), TemporaryDirectory() as folder:
-            number = _registered(mlflow, version) or _log(mlflow, subject, Path(folder))
-            describe(mlflow.MlflowClient(), version, number, aliases)
-            return number
+        import mlflow  # noqa: PLC0415 - optional package
+        import pandas as pd  # noqa: F401, PLC0415
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"MLflow needs the package {error.name}. {install_command('mlflow')}"
+        ) from None
+    version = subject.version
+    require_answer(uri, version.reference)
+    earlier = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
+    try:
+        mlflow.set_tracking_uri(uri)
+        mlflow.set_registry_uri(uri)
+        client, name = mlflow.MlflowClient(), version.manifest.name
+        registered = client.search_model_versions(f"name = '{name}'")
+        same = [v for v in registered if v.tags.get(SHA256_TAG) == version.sha256]
+        number = str(same[0].version) if same else _log(mlflow, subject)
+        describe(client, version, number, aliases)
     except mlflow.exceptions.MlflowException as error:
         reason = shorten(str(error), 300, placeholder=" …")
         raise _rejected(version.reference, reason) from None
+    finally:
+        mlflow.set_tracking_uri(earlier[0])
+        mlflow.set_registry_uri(earlier[1])
+    return number
 
 
 def require_answer(uri: str, reference: str, timeout_s: float = ANSWER_S) -> None:
@@ -90,62 +105,37 @@ def _rejected(reference: str, reason: str) -> StorageError:
     )
 
 
-def _library() -> Any:
-    """Import MLflow. Raises `ConfigError` if it is not installed."""
-    try:
-        import mlflow  # noqa: PLC0415 - optional package
-        import pandas as pd  # noqa: F401, PLC0415
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"MLflow needs the package {error.name}. {install_command('mlflow')}"
-        ) from None
-    return mlflow
-
-
-@contextmanager
-def _tracking(mlflow: Any, uri: str) -> Iterator[None]:
-    tracking, registry = mlflow.get_tracking_uri(), mlflow.get_registry_uri()
-    mlflow.set_tracking_uri(uri)
-    mlflow.set_registry_uri(uri)
-    try:
-        yield
-    finally:
-        mlflow.set_tracking_uri(tracking)
-        mlflow.set_registry_uri(registry)
-
-
-def _registered(mlflow: Any, version: ModelVersion) -> str | None:
-    """Return the number of a registered version; None if it is not registered."""
-    client = mlflow.MlflowClient()
-    name = version.manifest.name
-    for registered in client.search_model_versions(f"name = '{name}'"):
-        if registered.tags.get(SHA256_TAG) == version.sha256:
-            return str(registered.version)
-    return None
-
-
-def _log(mlflow: Any, subject: Subject, folder: Path) -> str:
+def _log(mlflow: Any, subject: Subject) -> str:
+    """Register a version; return its number."""
     version, program = subject.version, subject.program
-    manifest = version.manifest
-    (folder / DOCUMENT).write_text(render(document_of(subject)), "utf-8")
-    tags = _tags(version)
-    with mlflow.start_run(run_name=version.reference, tags=tags):
+    manifest, trained = version.manifest, version.manifest.trained_on
+    tags = {
+        "fleet_slip.reference": version.reference,
+        SHA256_TAG: version.sha256,
+        "fleet_slip.drives_sha256": trained.drives_sha256,
+        "fleet_slip.drives": str(trained.drives),
+        "fleet_slip.feature_set": trained.feature_set,
+        "fleet_slip.model": manifest.selected_by.model,
+    }
+    metrics = manifest.cross_validation.model_dump(mode="json")
+    with TemporaryDirectory() as folder, mlflow.start_run(run_name=version.reference, tags=tags):
+        document = Path(folder) / DOCUMENT
+        document.write_text(render(document_of(subject)), "utf-8")
         mlflow.log_params(parameters(version))
-        mlflow.log_metrics(_metrics(version))
+        mlflow.log_metrics({k: float(v) for k, v in metrics.items() if isinstance(v, int | float)})
         logged = mlflow.pyfunc.log_model(
             name=manifest.name,
             loader_module=__name__,
-            data_path=str(folder / DOCUMENT),
+            data_path=str(document),
             signature=_signature(mlflow, program),
             input_example=_example(program, subject.checks[0]),
             registered_model_name=manifest.name,
             pip_requirements=[f"fleet-slip=={package_version('fleet-slip')}"],
             metadata=tags,
         )
-    client = mlflow.MlflowClient()
     number = str(logged.registered_model_version)
     for key, value in tags.items():
-        client.set_model_version_tag(manifest.name, number, key, value)
+        mlflow.MlflowClient().set_model_version_tag(manifest.name, number, key, value)
     return number
 
 
@@ -175,23 +165,6 @@ def parameters(version: ModelVersion) -> dict[str, str]:
         **(chosen.options or {}),
     }
     return {key: str(value)[:MAX_PARAMETER_CHARACTERS] for key, value in values.items()}
-
-
-def _tags(version: ModelVersion) -> dict[str, str]:
-    trained = version.manifest.trained_on
-    return {
-        "fleet_slip.reference": version.reference,
-        SHA256_TAG: version.sha256,
-        "fleet_slip.drives_sha256": trained.drives_sha256,
-        "fleet_slip.drives": str(trained.drives),
-        "fleet_slip.feature_set": trained.feature_set,
-        "fleet_slip.model": version.manifest.selected_by.model,
-    }
-
-
-def _metrics(version: ModelVersion) -> dict[str, float]:
-    content = version.manifest.cross_validation.model_dump(mode="json")
-    return {k: float(v) for k, v in content.items() if isinstance(v, int | float)}
 
 
 def _columns(program: Program) -> dict[str, str]:
@@ -224,6 +197,7 @@ def _example(program: Program, check: TestVector) -> Any:
     return frame.astype({n: "float64" for n, kind in kinds.items() if kind == "double"})
 
 
+@dataclass(frozen=True)
 class LoggedVersion:
     """A version as a pyfunc model.
 
@@ -235,14 +209,12 @@ class LoggedVersion:
         Manifest of the version.
     """
 
-    def __init__(self, signals: SignalCatalog, manifest: Manifest) -> None:
-        self.signals = signals
-        self.manifest = manifest
+    signals: SignalCatalog
+    manifest: Manifest
 
     def predict(self, model_input: Any, params: Any = None) -> Any:  # noqa: ARG002 - MLflow passes it
         """Return a frame with the angle of each row in rad. Raises as `predict`."""
-        angles = predict(self.signals, self.manifest, model_input)
-        return angles.to_frame()
+        return predict(self.signals, self.manifest, model_input).to_frame()
 
 
 def _load_pyfunc(path: str) -> LoggedVersion:
