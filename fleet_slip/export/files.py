@@ -8,12 +8,12 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from platform import machine
 from shutil import which
 from tempfile import TemporaryDirectory
 from typing import Any, get_args
+from uuid import UUID
 
 from fleet_slip.base import canonical_json, install_command, sha256_of
 from fleet_slip.catalog.definitions import MAX_ATTRIBUTE
@@ -202,8 +202,7 @@ def with_states(version: ModelVersion, program: Program, check: TestVector) -> T
     """Return a test vector with the states of the filter after each tick."""
     numbers = zip(program.numbers, check.numbers, strict=True)
     car = {number.name: None if n is None else n * number.grain for number, n in numbers}
-    used = {fact.name for fact in program.facts}
-    facts = {name: value for name, value in check.car.items() if name in used}
+    facts = {fact.name: check.car.get(fact.name) for fact in program.facts}
     estimator = Estimator(version.catalog, version.manifest, {**facts, **car})
     states = []
     for sample in check.samples:
@@ -302,23 +301,19 @@ def _sql_within(value: str, low: int, high: int) -> str:
 
 
 def _step_layers(program: Program) -> list[list[str]]:
-    """Return the columns of each layer; the last layer has the parts of the angle."""
+    """Return the columns of each layer; the last layer has both parts of the angle.
+
+    These are the sums of the upper and of the lower parts of the coefficients; see `fixed_point`.
+    """
     sql = SqlLayers(program.steps, program.ranges, PLAIN_SQL, lambda name, place: f"{name}_{place}")
-    terms = [sql.text(step) for step, _ in program.angle.terms]
-    last = max(layer for _, layer in terms)
-    sql.layers[last + 1] += _sql_sums(program, [text for text, _ in terms])
+    texts = [sql.text(step) for step, _ in program.angle.terms]
+    last = max(layer for _, layer in texts)
+    intercept, *coefficients = program.angle.parts
+    for i, name in enumerate(("high", "low")):
+        pairs = zip(coefficients, texts, strict=True)
+        terms = " + ".join(f"({part[i]}) * {text}" for part, (text, _) in pairs)
+        sql.layers[last + 1].append(f"{intercept[i]} + {terms} AS {name}")
     return [sql.layers[number] for number in sorted(sql.layers)]
-
-
-def _sql_sums(program: Program, terms: list[str]) -> list[str]:
-    """Return the sums of the upper and of the lower parts; see `fixed_point`."""
-    (high, low), *parts = program.angle.parts
-    return [
-        f"{first} + "
-        + " + ".join(f"({part[i]}) * {t}" for part, t in zip(parts, terms, strict=True))
-        + f" AS {name}"
-        for i, (name, first) in enumerate((("high", high), ("low", low)))
-    ]
 
 
 def _sql_angle(program: Program) -> str:
@@ -391,46 +386,41 @@ FILE_TIME = (1980, 1, 1, 0, 0, 0)
 """Time of all files in the archive, so that an export is reproducible."""
 
 
-def fmu_archive(version: ModelVersion, program: Program, checks: str) -> bytes:
-    """Return the archive; `checks` is the content of a resource.
+def _fmu(subject: Subject) -> dict[str, bytes]:
+    """Write the archive.
 
     Raises `ConfigError` without a C compiler, or on a machine other than x86-64.
     """
-    prefix = c_prefix(version)
+    version, program, prefix = subject.version, subject.program, c_prefix(subject.version)
     words = {
-        "token": _token(version),
+        "token": f"{{{UUID(version.sha256[:32])}}}",
         "about": f"{version.reference}, SHA-256 {version.sha256}, trained on drives with SHA-256 "
         f"{version.manifest.trained_on.drives_sha256}",
         "parameters": _parameters(program),
-        "units": _units(program),
+        "units": {
+            unit: _base_units(unit)
+            for unit in (*(signal.unit for signal in program.signals), program.angle.unit)
+        },
         "valid": "true if there is an angle; otherwise the angle is 0",
     }
-
-    def filled(file: str) -> str:
-        return fill_in_version(f"fmu_sources/{file}", version, program, **words)
-
     sources = {
         f"{prefix}.h": c_header(version, program),
         f"{prefix}.c": c_source(version, program),
-        "fmi_model.h": filled("fmi_model.h"),
+        "fmi_model.h": fill_in_version("fmu_sources/fmi_model.h", version, program, **words),
         "fmi2.c": read_source("fmu_sources/fmi2.c"),
     }
-    return _archive(
-        {
-            "modelDescription.xml": filled("modelDescription.xml"),
-            **{f"sources/{name}": text for name, text in sources.items()},
-            f"binaries/linux64/{prefix}.so": _compile(sources),
-            "resources/checks.csv": checks,
-        }
-    )
-
-
-def _archive(content: Mapping[str, str | bytes]) -> bytes:
+    description = fill_in_version("fmu_sources/modelDescription.xml", version, program, **words)
+    content: dict[str, str | bytes] = {
+        "modelDescription.xml": description,
+        **{f"sources/{name}": text for name, text in sources.items()},
+        f"binaries/linux64/{prefix}.so": _compile(sources),
+        "resources/checks.csv": subject.table,
+    }
     file = BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in content.items():
             archive.writestr(zipfile.ZipInfo(name, FILE_TIME), data, zipfile.ZIP_DEFLATED)
-    return file.getvalue()
+    return {f"{file_prefix(version)}_fmi2.fmu": file.getvalue()}
 
 
 def _compile(sources: Mapping[str, str]) -> bytes:
@@ -458,40 +448,26 @@ def _compile(sources: Mapping[str, str]) -> bytes:
         return (Path(folder) / "library.so").read_bytes()
 
 
-def _token(version: ModelVersion) -> str:
-    digits = version.sha256
-    ends = (0, 8, 12, 16, 20, 32)
-    return "{" + "-".join(digits[a:b] for a, b in pairwise(ends)) + "}"
-
-
 def _parameters(program: Program) -> list[tuple[str, str]]:
     """Return the names and descriptions of the parameters."""
-    descriptions = [
-        "whole number" if fact.equals is None else f"1 if it is {fact.equals}, else 0"
+    parameters = [
+        (fact.field, "whole number" if fact.equals is None else f"1 if it is {fact.equals}, else 0")
         for fact in program.facts
-    ] + [f"in counts of {number.grain:f} {number.unit}" for number in program.numbers]
-    names = [fact.field for fact in program.facts] + [number.name for number in program.numbers]
+    ] + [(n.name, f"in counts of {n.grain:f} {n.unit}") for n in program.numbers]
+    names = distinct([name for name, _ in parameters])
     return [
         (name, f"{description}; -2147483648 if unknown")
-        for name, description in zip(distinct(names), descriptions, strict=True)
+        for name, (_, description) in zip(names, parameters, strict=True)
     ]
 
 
-def _units(program: Program) -> dict[str, str]:
-    """Return all units, each as powers of SI base units."""
-    units = {}
-    for unit in (*(signal.unit for signal in program.signals), program.angle.unit):
-        powers: dict[str, int] = {}
-        for sign, factor in zip((1, -1), unit.split("/"), strict=False):
-            name = factor.rstrip("^0123456789")
-            powers[name] = sign * int(factor[len(name) :].strip("^") or 1)
-        units[unit] = " ".join(f'{name}="{power}"' for name, power in powers.items() if name != "1")
-    return units
-
-
-def _fmu(subject: Subject) -> dict[str, bytes]:
-    archive = fmu_archive(subject.version, subject.program, subject.table)
-    return {f"{file_prefix(subject.version)}_fmi2.fmu": archive}
+def _base_units(unit: str) -> str:
+    """Return a unit as powers of SI base units."""
+    powers: dict[str, int] = {}
+    for sign, factor in zip((1, -1), unit.split("/"), strict=False):
+        name = factor.rstrip("^0123456789")
+        powers[name] = sign * int(factor[len(name) :].strip("^") or 1)
+    return " ".join(f'{name}="{power}"' for name, power in powers.items() if name != "1")
 
 
 def render(content: Mapping[str, Any]) -> str:
