@@ -476,7 +476,9 @@ def cost_on_board(catalog: Catalog, manifest: Manifest) -> Costs:
 
 def count_costs(program: Program) -> Costs:
     """Count the costs of a program at a tick."""
-    counts, terms = count_steps(program), len(program.angle.terms)
+    writer, terms = StepWriter(program), len(program.angle.terms)
+    step_lines(program, writer)
+    counts = writer.counts
     total = {
         kind: sum(n * _COSTS.get(name, {}).get(kind, 0) for name, n in counts.items())
         for kind in ("*", "+", "//", "//64")
@@ -519,13 +521,6 @@ def costs_content(version: ModelVersion) -> dict[str, Any]:
         return cost_on_board(version.catalog, version.manifest).as_dict()
     except FleetSlipError as error:
         return {"error": str(error)}
-
-
-def count_steps(program: Program) -> Counter[str]:
-    """Count the calls of helpers and the operations in the C of a tick."""
-    writer = StepWriter(program)
-    step_lines(program, writer)
-    return writer.counts
 
 
 _COSTS: Mapping[str, Mapping[str, int]] = {

@@ -62,12 +62,6 @@ MAX_SUM = 2**62
 MAX_ANGLE = 2**31 - 1
 """Limit of the angle, a word of 32 bits: angles of thousands of turns are clipped."""
 
-_TOO_LARGE = (
-    "the coefficients are too large to bound the rounding error of the angle. Publish a model with "
-    "fewer or other signals."
-)
-
-
 Target = Literal["json", "c", "sql", "dbc", "onnx", "fmu"]
 """Formats of an export."""
 
@@ -110,32 +104,27 @@ def fixed_point(
 
     Raises `RefusedError` if the bound of the error is above half a count of the label.
     """
-    sizes = sum(largest)
-    low_bits = min(MAX_LOW_BITS, (MAX_SUM - 1).bit_length() - (sizes + 1).bit_length())
-    bits = _max_bits(intercept, coefficients, largest, low_bits)
-    scaled = [round(value * 2**bits) for value in (intercept, *coefficients)]
-    error = Fraction(1, 2) + Fraction(1 + sizes, 2 ** (bits + 1))
-    size = abs(intercept) + sum(abs(g) * n for g, n in zip(coefficients, largest, strict=True))
-    if error > Fraction(OUTPUT_COUNTS, 2):
-        raise RefusedError(_TOO_LARGE)
-    return FixedPoint(bits, low_bits, scaled[0], tuple(scaled[1:]), error, int(size + error))
+    sizes, values = (1, *largest), (intercept, *coefficients)
+    low_bits = min(MAX_LOW_BITS, (MAX_SUM - 1).bit_length() - sum(sizes).bit_length())
 
-
-def _max_bits(
-    intercept: Fraction, coefficients: Sequence[Fraction], largest: Sequence[int], low_bits: int
-) -> int:
-    """Return the largest F for which the sum of the upper parts is below `MAX_SUM`."""
-    sizes = (1, *largest)
-    bits = low_bits + 62
-    while bits > low_bits:
-        upper = [round(value * 2**bits) >> low_bits for value in (intercept, *coefficients)]
+    def fits(bits: int) -> bool:
+        """Return True if the parts of the coefficients fit into words, and their sums too."""
+        upper = [round(value * 2**bits) >> low_bits for value in values]
         total = sum(abs(c) * n for c, n in zip(upper, sizes, strict=True))
         # Plus the carry of the lower parts, and half of an output count.
         carried = total + 2 ** (62 - low_bits) + 2 ** (bits - low_bits)
-        if carried < MAX_SUM and max(map(abs, upper[1:])) <= MAX_UPPER_PART:
-            return bits
-        bits -= 1
-    raise RefusedError(_TOO_LARGE)
+        return carried < MAX_SUM and max(map(abs, upper[1:])) <= MAX_UPPER_PART
+
+    bits = next(filter(fits, range(low_bits + 62, low_bits, -1)), 0)
+    error = Fraction(1, 2) + Fraction(sum(sizes), 2 ** (bits + 1))
+    if not bits or error > Fraction(OUTPUT_COUNTS, 2):
+        raise RefusedError(
+            "the coefficients are too large to bound the rounding error of the angle. Publish a "
+            "model with fewer or other signals."
+        )
+    size = sum(abs(g) * n for g, n in zip(values, sizes, strict=True))
+    scaled = [round(value * 2**bits) for value in values]
+    return FixedPoint(bits, low_bits, scaled[0], tuple(scaled[1:]), error, int(size + error))
 
 
 @dataclass(frozen=True)

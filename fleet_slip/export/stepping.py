@@ -277,7 +277,9 @@ def make_checks(
     signals: SignalCatalog, manifest: Manifest, program: Program
 ) -> tuple[TestVector, ...]:
     """Return a smooth drive and adversarial ones, with the angle at every tick."""
-    hostile = _hostile_car(program)
+    facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
+    ends = ((number.name, (-1) ** (i + 1) * COUNT_MAX) for i, number in enumerate(program.numbers))
+    hostile = Car(facts, dict(ends))
     drives: dict[str, tuple[Car, Iterable[Sample]]] = {
         "smooth": (UNKNOWN_CAR, _smooth(program)),
         "extremes": (hostile, _extremes(program, np.random.default_rng(1))),
@@ -309,11 +311,10 @@ def drive_counts(
     program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
 ) -> DriveCounts:
     """Convert samples of consecutive ticks to a drive of the warehouse."""
-    names = [signal.name for signal in program.signals]
-    valid = [_valid(sample, program.signals) for sample in samples]
+    valid = zip(*(_valid(sample, program.signals) for sample in samples), strict=True)
     counts = {
-        name: pa.array(values, pa.int16())
-        for name, values in zip(names, zip(*valid, strict=True), strict=True)
+        signal.name: pa.array(values, pa.int16())
+        for signal, values in zip(program.signals, valid, strict=True)
     }
     rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
     facts = {name: car.facts.get(name) for name in predictor.plan.facts}
@@ -342,25 +343,14 @@ def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
 
 def _smooth(program: Program) -> Iterable[Sample]:
     """Yield a drive without missing counts: every signal oscillates with its own period."""
-    for tick in range(SMOOTH_TICKS):
-        yield tuple(_swing(signal, tick, 60 + 14 * i) for i, signal in enumerate(program.signals))
-
-
-def _swing(signal: Input, tick: int, period: int) -> int:
-    """Return a count of a triangular wave with the height of an eighth of the range."""
-    height = (signal.max_count - signal.min_count) // 8
-    middle = (signal.min_count + signal.max_count) // (4 if signal.min_count >= 0 else 2)
-    distance = abs(2 * (tick % period) - period)  # from the middle of the period, 0 to `period`
-    return middle + height * distance // period - height // 2
-
-
-def _hostile_car(program: Program) -> Car:
-    """Return a car with extreme facts and numbers."""
-    facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
-    numbers = {
-        number.name: COUNT_MAX if i % 2 else -COUNT_MAX for i, number in enumerate(program.numbers)
-    }
-    return Car(facts, numbers)
+    ticks = np.arange(SMOOTH_TICKS)
+    waves = []
+    for i, signal in enumerate(program.signals):  # triangles of an eighth of the range
+        low, high, period = signal.min_count, signal.max_count, 60 + 14 * i
+        height, middle = (high - low) // 8, (low + high) // (4 if low >= 0 else 2)
+        distance = abs(2 * (ticks % period) - period)
+        waves.append((middle + height * distance // period - height // 2).tolist())
+    yield from zip(*waves, strict=True)
 
 
 def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]:
@@ -374,11 +364,11 @@ def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]
 
 
 def _extreme(signal: Input, random: np.random.Generator) -> int | None:
-    within = (signal.min_count, signal.max_count, -1, 0, 1, signal.max_count // 2)
-    beyond = (signal.min_count - 1, signal.max_count + 1, None)
-    if random.random() < 0.98:
-        return within[random.integers(len(within))]
-    return beyond[random.integers(len(beyond))]
+    low, high = signal.min_count, signal.max_count
+    counts = (low, high, -1, 0, 1, high // 2)
+    if random.random() >= 0.98:
+        counts = (low - 1, high + 1, None)
+    return counts[random.integers(len(counts))]
 
 
 def _holes(program: Program, random: np.random.Generator) -> Iterable[Sample]:

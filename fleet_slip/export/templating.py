@@ -80,11 +80,6 @@ def plain_text(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9 @_.:,^-]", "_", text)
 
 
-def plain_unit(unit: str) -> str:
-    """Return a unit for a comment."""
-    return plain_text(unit.replace("/", " per ").replace("*", " "))
-
-
 AXES = "x forward, y left, z up; angles and yaw rate are positive to the left (ISO 8855)"
 
 
@@ -139,7 +134,7 @@ def _environment() -> "Environment":
         "literal": literal,
         "plain": plain_text,
         "quoted": quoteattr,
-        "unit": plain_unit,
+        "unit": lambda unit: plain_text(unit.replace("/", " per ").replace("*", " ")),
         "word": lambda count: "INT16_MIN" if count is None or abs(count) >= 2**15 else count,
     }
     return environment
