@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from datetime import date, datetime
 from decimal import Decimal
-from typing import Any, overload
+from typing import Any
 
 from fleet_slip.errors import ExtraError, UsageError
 
@@ -98,12 +98,6 @@ def hash_fold(key: str, count: int) -> int:
 EXAMPLE = "2024-05-01"
 
 
-@overload
-def date_of(day: date | str, name: str, example: str = EXAMPLE) -> date: ...
-@overload
-def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date | None: ...
-
-
 def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date | None:
     """Parse a date; return the day of a time. Raises `UsageError` for anything else."""
     if isinstance(day, datetime):
@@ -116,9 +110,11 @@ def date_of(day: date | str | None, name: str, example: str = EXAMPLE) -> date |
         raise UsageError(f"{name} {day}: not a date; write it as {example}.") from None
 
 
-def last_day(through: date | str | None, name: str = "--through") -> date | None:
+def last_day(through: date | str | None) -> date | None:
     """Parse a date or "today". Raises `UsageError` for anything else."""
-    return date.today() if through == "today" else date_of(through, name, f"{EXAMPLE}, or today")
+    if through == "today":
+        return date.today()
+    return date_of(through, "through", f"{EXAMPLE}, or today")
 
 
 # Extras of the package.

@@ -122,7 +122,7 @@ def test_an_invalid_date_is_refused_with_an_example() -> None:
     with pytest.raises(UsageError, match=r"since 6 May: not a date; write it as 2024-05-01\."):
         date_of("6 May", "since")
     with pytest.raises(UsageError, match="write it as 2024-05-01, or today"):
-        last_day("soon", "through")
+        last_day("soon")
 
 
 class OfColumn(Config):

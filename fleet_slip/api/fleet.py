@@ -212,7 +212,7 @@ class Fleet:
 
         if isinstance(campaign, str):
             campaign = load_campaign(campaign, self.warehouse.configs)
-        chosen_days = campaign.chosen_days(days, last_day(through, "through"))
+        chosen_days = campaign.chosen_days(days, last_day(through))
         with calls.open_workers(self.root, workers) as executor, step("simulate") as figures:
             report = simulate_campaign(
                 calls.for_workers(self.warehouse, executor),

@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Context, Option
 
 from fleet_slip.api.calls import open_workers
-from fleet_slip.base import last_day, pluralize
+from fleet_slip.base import pluralize
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of
 from fleet_slip.cli.output import (
@@ -60,7 +60,7 @@ def simulate(
         report = fleet_of(context).simulate(
             campaign,
             days=days,
-            through=last_day(through),
+            through=through,
             engine=engine,
             workers=cluster or threads,
             progress=show,

@@ -5,7 +5,6 @@ from typing import Annotated
 
 from typer import Context, Option
 
-from fleet_slip.base import date_of
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.options import fleet_of
@@ -100,8 +99,7 @@ def monitor(
 
     Example: fleet-slip monitor waterford --since 2024-05-03
     """
-    day = date_of(since, "--since")
-    print_answer(fleet_of(context).maintenance.monitor(model, cohort, since=day), json)
+    print_answer(fleet_of(context).maintenance.monitor(model, cohort, since=since), json)
 
 
 def verify(

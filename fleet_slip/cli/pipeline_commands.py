@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Context, Option
 
-from fleet_slip.base import date_of, last_day
 from fleet_slip.catalog.signals import TRAINING_DRIVES
 from fleet_slip.cli import options as opt
 from fleet_slip.cli.data_commands import warn_of_passed_over
@@ -99,7 +98,7 @@ def run(
         report = fleet.run(
             campaign,
             days=days,
-            through=last_day(through),
+            through=through,
             name=name,
             models=models,
             workers=cluster or threads,
@@ -182,7 +181,6 @@ def nightly(
 
     Example: fleet-slip nightly --inbox /srv/logs --mapping logger.toml --model fleet
     """
-    date = date_of(night, "--night")
     with progress_of_steps() as show:
         report = fleet_of(context).nightly(
             inbox,
@@ -192,7 +190,7 @@ def nightly(
             models=models,
             candidate=candidate,
             retention=retention,
-            night=date,
+            night=night,
             workers=cluster or threads,
             progress=show,
         )

@@ -79,7 +79,9 @@ def sql(
             if json:
                 print_json(session.table(statement).to_pylist())
             elif csv:
-                _print_csv(session.table(statement), exact)
+                content = io.BytesIO()
+                _write_csv(session.table(statement), content, exact)
+                print_text(content.getvalue().decode().removesuffix("\n"))
             else:
                 _show(session, statement, everything)
 
@@ -104,17 +106,6 @@ def _write_csv(rows: pa.Table, to: Any, exact: bool) -> None:
     from pyarrow.csv import write_csv
 
     write_csv(rows if exact else _mark_formulas(rows), to)
-
-
-def _print_csv(rows: pa.Table, exact: bool) -> None:
-    if sys.stdout.isatty():
-        content = io.BytesIO()
-        _write_csv(rows, content, exact)
-        print_text(content.getvalue().decode().removesuffix("\n"))
-        return
-    sys.stdout.flush()
-    _write_csv(rows, sys.stdout.buffer, exact)
-    sys.stdout.buffer.flush()
 
 
 _CUT = re.compile(r"│ … │|\S… │|rows .*shown\)|columns .*shown\)")

@@ -296,7 +296,7 @@ def test_what_means_nothing_is_refused_before_anything_is_written(
         *("nightly", "--inbox", ".", "--mapping", "m", "--model", "m", "--night", "yesterday")
     )
     assert done.exit_code == 2
-    assert "--night yesterday: not a date" in done.stderr
+    assert "night yesterday: not a date" in done.stderr
     fleet = fleet_slip.open(tmp_path / "data")
     with pytest.raises(UsageError, match="no/name"):
         fleet.nightly(tmp_path, "m", "no/name")
