@@ -113,7 +113,7 @@ def fixed_point(
         total = sum(abs(c) * n for c, n in zip(upper, sizes, strict=True))
         # Plus the carry of the lower parts, and half of an output count.
         carried = total + 2 ** (62 - low_bits) + 2 ** (bits - low_bits)
-        return carried < MAX_SUM and max(map(abs, upper[1:])) <= MAX_UPPER_PART
+        return bool(carried < MAX_SUM and max(map(abs, upper[1:])) <= MAX_UPPER_PART)
 
     bits = next(filter(fits, range(low_bits + 62, low_bits, -1)), 0)
     error = Fraction(1, 2) + Fraction(sum(sizes), 2 ** (bits + 1))

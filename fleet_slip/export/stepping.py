@@ -365,7 +365,7 @@ def _extremes(program: Program, random: np.random.Generator) -> Iterable[Sample]
 
 def _extreme(signal: Input, random: np.random.Generator) -> int | None:
     low, high = signal.min_count, signal.max_count
-    counts = (low, high, -1, 0, 1, high // 2)
+    counts: Sample = (low, high, -1, 0, 1, high // 2)
     if random.random() >= 0.98:
         counts = (low - 1, high + 1, None)
     return counts[random.integers(len(counts))]
