@@ -18,7 +18,7 @@ from fleet_slip.models.registry import (
     compare_versions,
 )
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.vehicle.parameters import load_measures
 
 if TYPE_CHECKING:

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from fleet_slip.operations.monitor import Chart
     from fleet_slip.operations.sensor_screen import SensorFault
     from fleet_slip.simulation.simulate import SimulationReport
-    from fleet_slip.vehicle.measures import VehicleMeasures
+    from fleet_slip.vehicle.parameters import VehicleMeasures
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.summary import Selection
 from fleet_slip.regression.combination import CLIP_STD, CombinationChoice
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 
 COUNT_RAD = Fraction(1, 2**16)

@@ -36,8 +36,7 @@ from fleet_slip.resources import Configs
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.measures import VehicleMeasures
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from fleet_slip.warehouse.warehouse import Warehouse
 
 TABLE_ONE = "table1"

@@ -27,8 +27,7 @@ from fleet_slip.evaluation import ekf
 from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.evaluation.single_track import measured_speed_mps
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
-from fleet_slip.vehicle.measures import VehicleMeasures
-from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleParameters
+from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleMeasures, VehicleParameters
 
 # Search for the parameters of an estimator with the smallest error on training drives.
 

@@ -78,8 +78,7 @@ from fleet_slip.regression.combination import (
 from fleet_slip.simulation.campaign import Campaign, load_campaign
 from fleet_slip.simulation.sensors import SAMPLE_RATE_HZ
 from fleet_slip.storage.runs import LOGGER
-from fleet_slip.vehicle.measures import VehicleMeasures
-from fleet_slip.vehicle.parameters import VehicleParameters
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters
 from fleet_slip.warehouse.warehouse import Warehouse
 
 # Measured drives, and the segments that are held out together.

@@ -56,7 +56,7 @@ from fleet_slip.ingest.formats.source import describe_unknown
 from fleet_slip.quality.drive_signals import OWN_SPEEDS, RADIUS_M
 from fleet_slip.storage.documents import DocumentFolder
 from fleet_slip.storage.folder import Folder
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 
 FRONT_WHEELS = ("steer_fl", "steer_fr")
 MAX_CONDITIONS = 64

@@ -40,7 +40,7 @@ from fleet_slip.catalog.definitions import (
 from fleet_slip.catalog.signals import IDENTIFIER_PATTERN, Identifier, SignalCatalog
 from fleet_slip.config import Config
 from fleet_slip.errors import RefusedError, UsageError
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 
 if TYPE_CHECKING:
     from fleet_slip.arrays import BoolArray, Hashes

@@ -55,10 +55,12 @@ def wheel_speed_mps(signals: Signals) -> FloatArray | None:
     return np.asarray(np.median(wheels, axis=0) * RADIUS_M, dtype=np.float64)
 
 
-def speed_mps(signals: Signals) -> FloatArray | None:
-    """Return a rough speed: that of the wheels, else `vx` or the car's own; None without any."""
+def speed_mps(signals: Signals) -> FloatArray:
+    """Return a rough speed: that of the wheels, else `vx` or the car's own; NaN without any."""
     wheels = wheel_speed_mps(signals)
-    return signals.get("vx", signals.get("vehicle_speed")) if wheels is None else wheels
+    if wheels is not None:
+        return wheels
+    return signals.get("vx", signals.get("vehicle_speed", np.full(1, np.nan)))
 
 
 def is_moving(signals: Signals) -> BoolArray:

@@ -320,19 +320,8 @@ def find_reversed_labels(table: GramTable, in_order: BoolArray, label: str) -> d
 def _gains(drives: MeanMoments, label: int) -> FloatArray | None:
     """Return the gain of each drive's label on the common relation; None without one."""
     inputs, with_label, variances = _label_moments(drives, label)
-    start = _leading_signs(inputs.sum(axis=0), with_label)
-    signs, weights, gains = _fit_signs(inputs, with_label, start)
-    if not weights @ (signs @ with_label) > MIN_EXPLAINED * variances.sum():
-        return None
-    majority = np.sign(signs.sum()) or signs[0]
-    return np.asarray(gains * majority)
-
-
-def _fit_signs(
-    inputs: FloatArray, with_label: FloatArray, signs: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return signs that agree with the relation fitted with them, the relation, and the gains."""
     total = inputs.sum(axis=0)
+    signs = _leading_signs(total, with_label)
     for _ in range(SIGN_ROUNDS):
         weights = solve(total, signs @ with_label)
         gains = with_label @ weights / _predicted(inputs, weights)
@@ -340,7 +329,10 @@ def _fit_signs(
         if (agreeing == signs).all():
             break
         signs = agreeing
-    return signs, weights, gains
+    if not weights @ (signs @ with_label) > MIN_EXPLAINED * variances.sum():
+        return None
+    majority = np.sign(signs.sum()) or signs[0]
+    return np.asarray(gains * majority)
 
 
 def _label_moments(drives: MeanMoments, label: int) -> tuple[FloatArray, FloatArray, FloatArray]:

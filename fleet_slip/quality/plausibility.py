@@ -5,10 +5,10 @@ The values are all well formed. Axes and signs are ISO 8855.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import date
 from itertools import islice
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -50,12 +50,12 @@ from fleet_slip.warehouse.warehouse import Warehouse
 
 @dataclass(frozen=True)
 class SoundDrive:
-    """Signals of a drive, the rows in which it moves, and its speed in m/s, if that is sound."""
+    """Signals of a drive, the rows in which it moves, and its speed in m/s, NaN if not sound."""
 
     signals: Signals
     label: str
     moving: BoolArray
-    speed: FloatArray | None = None
+    speed: FloatArray = field(default_factory=lambda: np.full(1, np.nan))
 
     def has(self, *names: str) -> bool:
         """Return True if the drive has these signals."""
@@ -68,11 +68,16 @@ class SoundDrive:
         return replace(self, signals=sound)
 
     @property
+    def has_speed(self) -> bool:
+        """Return True if any speed is sound."""
+        return bool(np.isfinite(self.speed).any())
+
+    @property
     def curvature(self) -> FloatArray:
         """The yaw rate over the speed; the yaw rate itself without a speed."""
         yaw_rate = self.signals["yaw_rate"]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return yaw_rate if self.speed is None else np.asarray(yaw_rate / self.speed)
+            return np.asarray(yaw_rate / self.speed) if self.has_speed else yaw_rate
 
 
 def check_plausibility(
@@ -93,9 +98,9 @@ def check_plausibility(
     wrong_speeds = list(_speeds(sound))
     faults += wrong_speeds
     sound = replace(sound, speed=speed_mps(sound.without(wrong_speeds).signals))
-    if sound.speed is not None:
-        faults += _sizes(sound.without(faults), sound.speed)
-        faults += _axles(sound.without(faults), sound.speed)
+    if sound.has_speed:
+        faults += _sizes(sound.without(faults))
+        faults += _axles(sound.without(faults))
     of_label = check_label(sound.without(faults), from_velocities=from_velocities)
     if one_sided and label in one_sided[-1].signals:
         # A biased label is on one side, too.
@@ -211,9 +216,9 @@ def _turning(drive: SoundDrive) -> list[Fault]:
 def _decide(fault: Fault, drive: SoundDrive) -> Fault:
     """Return which one of ay and yaw rate contradicts the label, too; the fault if none does."""
     drive = replace(drive, speed=speed_mps(drive.signals))
-    if drive.speed is None or not drive.has(drive.label, "yaw_rate", "ay"):
+    if not drive.has(drive.label, "yaw_rate", "ay"):
         return fault
-    lever_m, _, explained = _fit_lever(drive.signals[drive.label], drive, drive.speed)
+    lever_m, _, explained = _fit_lever(drive.signals[drive.label], drive)
     if explained <= MIN_EXPLAINED or abs(lever_m) < -CHECKS["sign of the label"].low:
         return fault
     wrong, other = ("yaw_rate", "ay") if lever_m < 0 else ("ay", "yaw_rate")
@@ -270,11 +275,9 @@ def _turns_at(speed: FloatArray, drive: SoundDrive) -> bool:
     return abs(correlation) > MIN_CORRELATION and CHECKS["speeds of the car"].passes(abs(slope))
 
 
-def _compared(
-    drive: SoundDrive, speed: FloatArray
-) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
+def _compared(drive: SoundDrive) -> Iterator[tuple[tuple[str, ...], str, float, float]]:
     """Yield signals, the predictor of the first, its ratio to that, and their correlation."""
-    signals, moving = drive.signals, drive.moving
+    signals, moving, speed = drive.signals, drive.moving, drive.speed
     yaw_rate, ay = signals.get("yaw_rate"), signals.get("ay")
     if yaw_rate is not None and drive.has("wheel_rl", "wheel_rr"):
         turn = (signals["wheel_rr"] - signals["wheel_rl"]) * RADIUS_M / TRACK_M
@@ -295,9 +298,9 @@ def _compared(
         yield ("steering_wheel", angle), "15 times the other", *slope_of(wheel, column, moving)
 
 
-def _sizes(drive: SoundDrive, speed: FloatArray) -> Iterator[Fault]:
+def _sizes(drive: SoundDrive) -> Iterator[Fault]:
     """Compare the sizes of signals with those that others predict; and the sign of `ax`."""
-    for names, expected, slope, correlation in _compared(drive, speed):
+    for names, expected, slope, correlation in _compared(drive):
         ratio = slope if correlation > 0 else -slope
         if names == ("ax",) and not CHECKS["sign of ax"].passes(correlation):
             yield CHECKS["sign of ax"].fault(*names, correlation=correlation)
@@ -310,11 +313,11 @@ MAX_BEND_MPS, MAX_BEND_MPS2, MIN_BEND_PER_M = 12.0, 6.0, 0.05
 """Bends of 20 m and less, at a speed and yaw rate times speed at which the tyres hardly slip."""
 
 
-def _axles(drive: SoundDrive, speed: FloatArray) -> Iterator[Fault]:
+def _axles(drive: SoundDrive) -> Iterator[Fault]:
     """Compare axles in tight bends: the front one drives the longer way."""
     if not drive.has("yaw_rate", *WHEELS):
         return
-    signals, tightness = drive.signals, drive.curvature**2
+    signals, speed, tightness = drive.signals, drive.speed, drive.curvature**2
     front, rear = (signals[f"wheel_{axle}l"] + signals[f"wheel_{axle}r"] for axle in "fr")
     with np.errstate(divide="ignore", invalid="ignore"):
         longer = front / rear - 1
@@ -348,58 +351,50 @@ WHEELBASE_M, MAX_WHEELBASE_SHARE = (2.0, 4.5), 0.75
 MAX_COMPLIANCE = 0.012
 """Side-slip of the rear axle in rad per m/s²: twice that of a usual car."""
 
-Contradiction: TypeAlias = tuple[str, Mapping[str, float]]
-"""Name of a check that the label fails, and its figures."""
-NONE: Contradiction = ("", {})
-
 
 def check_label(drive: SoundDrive, *, from_velocities: bool) -> list[Fault]:
     """Return the first fault of a label that the motion of its car shows."""
     if not drive.has(drive.label, "yaw_rate"):
         return []
-    name, figures = _contradiction(drive)
-    if not name:
-        return []
-    check = CHECKS[name]
-    if from_velocities:
-        check = replace(check, remedy=check.remedy_of_velocities or check.remedy)
-    return [check.fault(drive.label, **figures)]
+    for name, figures in _contradictions(drive):
+        check = CHECKS[name]
+        if from_velocities:
+            check = replace(check, remedy=check.remedy_of_velocities or check.remedy)
+        return [check.fault(drive.label, **figures)]
+    return []
 
 
-def _contradiction(drive: SoundDrive) -> Contradiction:
-    signals, speed, moving = drive.signals, drive.speed, drive.moving
+def _contradictions(drive: SoundDrive) -> Iterator[tuple[str, Mapping[str, float]]]:
+    """Yield checks that the label fails, by name, and their figures."""
+    signals, moving = drive.signals, drive.moving
     angle = np.where(moving, signals[drive.label], np.nan)
-    if speed is not None:
-        large = np.abs(angle[(speed > FAST_MPS) & np.isfinite(angle)])
-        median_deg = float(np.degrees(np.median(large))) if large.size >= MIN_TICKS else 0.0
-        if median_deg > CHECKS["size of the label"].high:
-            return "size of the label", {"median_deg": median_deg}
+    large = np.abs(angle[(drive.speed > FAST_MPS) & np.isfinite(angle)])
+    median_deg = float(np.degrees(np.median(large))) if large.size >= MIN_TICKS else 0.0
+    if median_deg > CHECKS["size of the label"].high:
+        yield "size of the label", {"median_deg": median_deg}
     inputs = np.array([drive.curvature, *([signals["ay"]] if "ay" in signals else [])])
     delay = estimate_delay(angle, inputs, moving & np.isfinite(inputs).all(axis=0))
     if delay is not None and delay.exceeds(CHECKS["delay of the label"].high):
-        return "delay of the label", {"delay_s": delay.value_s, "error_s": delay.error_s}
-    if speed is not None and len(inputs) == 2:
+        yield "delay of the label", {"delay_s": delay.value_s, "error_s": delay.error_s}
+    if len(inputs) == 2:
         sliding = large.size >= MIN_TICKS and float(np.quantile(large, 0.9)) > SLIDING_RAD
-        return _lever(drive, speed, sliding=sliding)
-    return NONE
+        yield from _lever(drive, sliding=sliding)
 
 
-def _gentle(drive: SoundDrive, speed: FloatArray) -> BoolArray:
+def _gentle(drive: SoundDrive) -> BoolArray:
     """Return where the car turns gently and slowly, or not at all."""
-    signals = drive.signals
+    signals, speed = drive.signals, drive.speed
     slow = (speed < SLOW_MPS) & (speed > 0) & (np.abs(signals["ay"]) < GENTLE_MPS2)
     return drive.moving & slow & np.isfinite(signals["yaw_rate"])
 
 
-def _fit_lever(
-    angle: FloatArray, drive: SoundDrive, speed: FloatArray
-) -> tuple[float, float, float]:
+def _fit_lever(angle: FloatArray, drive: SoundDrive) -> tuple[float, float, float]:
     """Return the slope on the curvature in m, the constant and the explained share.
 
     The curvature has no effect on ay of its own: both are inputs. All are 0 at one speed.
     """
-    rows, inputs = _gentle(drive, speed), np.array([drive.curvature, drive.signals["ay"]])
-    if rows.sum() < MIN_GENTLE_TICKS or _is_one_speed(inputs[0, rows], speed[rows]):
+    rows, inputs = _gentle(drive), np.array([drive.curvature, drive.signals["ay"]])
+    if rows.sum() < MIN_GENTLE_TICKS or _is_one_speed(inputs[0, rows], drive.speed[rows]):
         return 0.0, 0.0, 0.0
     (lever_m, _), zero, explained = fit(angle, inputs, rows)
     return float(lever_m), zero, explained
@@ -413,18 +408,18 @@ def _is_one_speed(curvature: FloatArray, speed: FloatArray) -> bool:
     return bool(abs(np.corrcoef(curvature, squared)[0, 1]) > MAX_COLLINEARITY)
 
 
-def _lever(drive: SoundDrive, speed: FloatArray, *, sliding: bool) -> Contradiction:
+def _lever(drive: SoundDrive, *, sliding: bool) -> Iterator[tuple[str, Mapping[str, float]]]:
     """Compare the label's slope on the curvature with the places of rear axles, and its zero."""
-    lever_m, zero, explained = _fit_lever(drive.signals[drive.label], drive, speed)
+    lever_m, zero, explained = _fit_lever(drive.signals[drive.label], drive)
     check, sign = CHECKS["scale of the label"], CHECKS["sign of the label"]
     low, high = check.low, check.high
     if explained:
-        high = min(high, MAX_WHEELBASE_SHARE * _wheelbase_m(drive, speed))
+        high = min(high, MAX_WHEELBASE_SHARE * _wheelbase_m(drive))
         is_reversed = explained > MIN_EXPLAINED and lever_m < sign.low
         is_large = explained > MIN_EXPLAINED and lever_m > SLIDING_M and sliding
         is_scaled = explained > MIN_SURE_EXPLAINED and not low < lever_m < high
     else:
-        lever_m, mean_square, explained = _fit_one_speed(drive, speed)
+        lever_m, mean_square, explained = _fit_one_speed(drive)
         low -= MAX_COMPLIANCE * mean_square
         is_sure = explained > MIN_SURE_EXPLAINED
         is_reversed = is_sure and lever_m < min(low, 0) + sign.low
@@ -432,36 +427,35 @@ def _lever(drive: SoundDrive, speed: FloatArray, *, sliding: bool) -> Contradict
         is_scaled = is_sure and 0 < lever_m < low
     bounds = {"lever_m": lever_m, "low": low, "high": high}
     if is_reversed:
-        return "sign of the label", bounds
+        yield "sign of the label", bounds
     if is_large or is_scaled:
-        return "scale of the label", bounds
+        yield "scale of the label", bounds
     zero_deg = math.degrees(zero)
     if explained > MIN_SURE_EXPLAINED and not CHECKS["zero of the label"].passes(zero_deg):
-        return "zero of the label", {"zero_deg": zero_deg, "offset_rad": -zero}
-    return NONE
+        yield "zero of the label", {"zero_deg": zero_deg, "offset_rad": -zero}
 
 
-def _wheelbase_m(drive: SoundDrive, speed: FloatArray) -> float:
+def _wheelbase_m(drive: SoundDrive) -> float:
     """Return the wheelbase that the road wheels show, infinity if they show none."""
     angle = next((drive.signals[name] for name in ROAD_WHEELS if drive.has(name)), None)
     if angle is None:
         return math.inf
-    wheelbase_m, _, explained = _fit_lever(angle, drive, speed)
+    wheelbase_m, _, explained = _fit_lever(angle, drive)
     shortest, longest = WHEELBASE_M
     is_sure = explained > MIN_SURE_EXPLAINED and shortest < wheelbase_m < longest
     return wheelbase_m if is_sure else math.inf
 
 
-def _fit_one_speed(drive: SoundDrive, speed: FloatArray) -> tuple[float, float, float]:
+def _fit_one_speed(drive: SoundDrive) -> tuple[float, float, float]:
     """Return the slope on the curvature in m, the mean squared speed and the explained share.
 
     At one speed the slope is the lever less the compliance times the squared speed.
     """
-    rows = _gentle(drive, speed)
+    rows = _gentle(drive)
     if rows.sum() < MIN_GENTLE_TICKS:
         return 0.0, 0.0, 0.0
     (slope,), _, explained = fit(drive.signals[drive.label], drive.curvature[None], rows)
-    return float(slope), float(np.mean(speed[rows] ** 2)), explained
+    return float(slope), float(np.mean(drive.speed[rows] ** 2)), explained
 
 
 # The checks of rows on some long drives of a cohort, read from the logs.

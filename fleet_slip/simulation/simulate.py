@@ -37,9 +37,6 @@ from fleet_slip.vehicle.parameters import PERFECT
 from fleet_slip.warehouse.erasure_log import ErasureLog, skipped_drives
 from fleet_slip.warehouse.warehouse import Warehouse
 
-DRIVES_AT_ONCE = 128
-"""Drives that are simulated together. It limits the memory for their roads."""
-
 TOLERANCE = 1e-9
 """Largest difference from highway-env, relative to the largest value of a quantity."""
 
@@ -58,11 +55,6 @@ class DriveLog:
     """Log of the satellite receiver, if the campaign has receivers."""
     motion: Mapping[str, FloatArray] = field(default_factory=dict)
     """Requested channels of the truth at 100 Hz, not rounded to counts."""
-
-    @property
-    def signals(self) -> set[str]:
-        """Names of the logged signals."""
-        return {*self.measurement.counts, *(self.fixes.counts if self.fixes else ())}
 
     @property
     def rows(self) -> int:
@@ -111,11 +103,10 @@ def check_against_highway_env(drives: Sequence[DriveSpec]) -> None:
 
     Raises `RefusedError` if the kernel, highway-env or its traffic differs from the tested version.
     """
-    from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - imports highway-env
+    from fleet_slip.simulation.traffic import require_known_traffic  # noqa: PLC0415 - highway-env
+    from fleet_slip.vehicle.highway import require_agreement  # noqa: PLC0415 - as above
 
     for name in sorted({name for spec in drives if spec.traffic for name in spec.traffic.roads}):
-        from fleet_slip.simulation.traffic import require_known_traffic  # noqa: PLC0415 - as above
-
         require_known_traffic(name)
     spec = drives[0]
     drive = lane_drive(spec)
@@ -136,11 +127,7 @@ def simulate_batch(signals: SignalCatalog, batch: Batch, engine: Engine = "kerne
     Columns are in the order of `SignalCatalog.log_schema`, without extra signals that no drive has.
     Strings are dictionaries. Rows are in the order of drives and ticks.
     """
-    logs: list[DriveLog] = []
-    for first in range(0, len(batch.drives), DRIVES_AT_ONCE):
-        drives = batch.drives[first : first + DRIVES_AT_ONCE]
-        logs += simulate_logs(signals, drives, engine=engine)
-    return tabulate(signals, batch, logs)
+    return tabulate(signals, batch, simulate_logs(signals, batch.drives, engine=engine))
 
 
 MOTION = ("vx_mps", "vy_mps", "station_m", "lateral_offset_m")
@@ -200,8 +187,9 @@ def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> 
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in signals.signals:
-        if name not in signals.extras or any(name in log.signals for log in logs):
-            columns[name] = pa.chunked_array([_counts(log, name) for log in logs])
+        counts = pa.chunked_array([_counts(log, name) for log in logs])
+        if name not in signals.extras or counts.null_count < len(counts):
+            columns[name] = counts
     names = [name for name in signals.log_schema.names if name in columns]
     return pa.table({name: columns[name] for name in names})
 
@@ -299,8 +287,8 @@ class _Written:
     batch: Batch
     drives: tuple[DriveSpec, ...]
     """Drives of the batch that are not erased."""
-    action: AddAction | None
-    """The file of the drives; None without drives."""
+    files: list[AddAction]
+    """The file of the drives, if there are any."""
     rows: int
 
 
@@ -388,16 +376,18 @@ def _simulate(
             rows += sum(drive.expected_rows for batch in missing for drive in batch.drives)
             yield from missing
 
-    for _, result in run_tasks(
-        executor, partial(_write, warehouse, engine=engine), backlog(), _task_name
-    ):
-        if landed := _commit(warehouse, result):
+    def name(batch: Batch) -> str:
+        return f"{batch.campaign}, {batch.day}, file {batch.index}"
+
+    write = partial(_write, warehouse, engine)
+    for _, result in run_tasks(executor, write, backlog(), name):
+        if landed := _commit(warehouse, result, write):
             report.batches_written += 1
             report.drives += len(landed.drives)
             report.drives_checked += bool(landed.drives)
             report.drives_forgotten += len(landed.batch.drives) - len(landed.drives)
             report.rows += landed.rows
-            report.size_bytes += landed.action.size if landed.action else 0
+            report.size_bytes += sum(file.size for file in landed.files)
         # Days that are not planned yet are assumed to have the mean number of rows.
         progress(result.rows, rows * days // days_planned)
     report.logs_version = warehouse.logs.snapshot().version
@@ -405,19 +395,15 @@ def _simulate(
     return report
 
 
-def _task_name(batch: Batch) -> str:
-    return f"{batch.campaign}, {batch.day}, file {batch.index}"
-
-
-def _write(warehouse: Warehouse, batch: Batch, engine: Engine = "kernel") -> _Written:
+def _write(warehouse: Warehouse, engine: Engine, batch: Batch) -> _Written:
     drives = _not_erased(warehouse, batch.drives)
     if not drives:
-        return _Written(batch, (), None, 0)
+        return _Written(batch, (), [], 0)
     check_against_highway_env(drives)
     rows = simulate_batch(warehouse.catalog.signals, replace(batch, drives=drives), engine)
     name = f"{batch.campaign}-{batch.index:04d}-{batch.digest[:12]}"  # before its checksum
     action = warehouse.logs.put(name, warehouse.logs.encode(rows), batch.day)
-    return _Written(batch, drives, action, rows.num_rows)
+    return _Written(batch, drives, [action], rows.num_rows)
 
 
 def _not_erased(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[DriveSpec, ...]:
@@ -431,34 +417,24 @@ def _not_erased(warehouse: Warehouse, drives: tuple[DriveSpec, ...]) -> tuple[Dr
     )
 
 
-def _commit(warehouse: Warehouse, written: _Written) -> _Written | None:
+def _commit(
+    warehouse: Warehouse, written: _Written, write: Callable[[Batch], _Written]
+) -> _Written | None:
     """Commit a batch and return it; None if another process committed it first."""
 
     def attempt() -> _Written | None:
         nonlocal written
         snapshot = warehouse.logs.snapshot()
-        landed = has_landed(snapshot, batch_transaction(written.batch))
+        transaction, batch = batch_transaction(written.batch), written.batch
+        landed = has_landed(snapshot, transaction)
         # Read after the snapshot: a later erasure makes this commit a conflict.
-        while landed or written.drives != _not_erased(warehouse, written.drives):
-            warehouse.logs.discard(_files(written))
+        if landed or written.drives != _not_erased(warehouse, written.drives):
+            warehouse.logs.discard(written.files)
             if landed:
                 return None
-            written = _write(warehouse, written.batch)
-        snapshot.commit(
-            Change(
-                add=_files(written),
-                transactions=[batch_transaction(written.batch)],
-                note={
-                    "job": "simulate",
-                    "campaign": written.batch.campaign,
-                    "digest": written.batch.digest,
-                },
-            )
-        )
+            written = write(batch)
+        note = {"job": "simulate", "campaign": batch.campaign, "digest": batch.digest}
+        snapshot.commit(Change(add=written.files, transactions=[transaction], note=note))
         return written
 
     return retry_conflicts(attempt)
-
-
-def _files(written: _Written) -> list[AddAction]:
-    return [written.action] if written.action else []

@@ -479,20 +479,20 @@ def require_valid_road(road: Road) -> None:
     entries = len(road.curvature_1pm)
     intervals = entries if road.closed else entries - 1
     columns = (road.curvature_1pm, road.speed_mps, *(road.surface or ()))
-    if entries < 2 or any(len(c) != entries or not np.isfinite(c).all() for c in columns):
-        raise ConfigError(
-            "the road has missing or infinite entries of curvature, speed or surface. Give as many "
-            "finite ones of each, at least two."
+    problems = {
+        "missing or infinite entries of curvature, speed or surface": entries < 2
+        or any(len(c) != entries or not np.isfinite(c).all() for c in columns),
+        f"{intervals} intervals of {road.spacing_m} m, but a length of {road.length_m} m": abs(
+            intervals * road.spacing_m - road.length_m
         )
-    if abs(intervals * road.spacing_m - road.length_m) > 1e-6 * road.length_m:
-        raise ConfigError(
-            f"the road has {intervals} intervals of {road.spacing_m} m, but a length of "
-            f"{road.length_m} m. Give a length that agrees."
-        )
-    if not (road.speed_mps > LOST_SPEED_MPS).all():
-        raise ConfigError(
-            f"the road has a target speed that is too low. Give speeds above {LOST_SPEED_MPS} m/s."
-        )
+        > 1e-6 * road.length_m,
+        f"target speeds that are not above {LOST_SPEED_MPS} m/s": (
+            road.speed_mps <= LOST_SPEED_MPS
+        ).any(),
+    }
+    for problem, is_present in problems.items():
+        if is_present:
+            raise ConfigError(f"the road has {problem}. Correct its tables.")
 
 
 STEPS_PER_SAMPLE = round(SAMPLE_S / STEP_S)

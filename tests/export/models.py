@@ -27,7 +27,7 @@ from fleet_slip.export.program import Car, Program
 from fleet_slip.export.stepping import Sample
 from fleet_slip.models.manifest import CombinedWithFilter, Manifest, ModelTerm
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.manifests import manifest

@@ -36,7 +36,7 @@ from fleet_slip.export.stepping import (
 )
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.export import plain
 from tests.export.models import (
     BLENDS,

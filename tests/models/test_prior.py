@@ -25,7 +25,7 @@ from fleet_slip.regression.least_squares import fit
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import load_campaign
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from fleet_slip.warehouse.warehouse import Warehouse
 from tests.support.catalog import CATALOG, SIGNALS
 from tests.support.commands import RunCommand, done_on, run_on

@@ -22,7 +22,7 @@ from fleet_slip.regression.combination import (
     PairedEstimates,
     choose_combination,
 )
-from fleet_slip.vehicle.measures import VehicleMeasures
+from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.support.catalog import CATALOG
 from tests.support.commands import done_on
 from tests.support.measured import OWN_MAPPING, ingest_own

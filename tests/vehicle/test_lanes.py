@@ -214,7 +214,7 @@ def test_a_drive_that_gets_nowhere_ends() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"speed_mps": np.full(3, 10.0)}, "Give as many"),
+        ({"speed_mps": np.full(3, 10.0)}, "missing or infinite entries"),
         ({"length_m": 300.0}, "length of 300.0 m"),
         ({"speed_mps": np.full(200, 0.0)}, "above 0.5 m/s"),
         ({"curvature_1pm": np.full(200, np.nan)}, "missing or infinite entries"),

@@ -24,8 +24,7 @@ from fleet_slip.evaluation.identify import (
 from fleet_slip.evaluation.kalman import FilterNoise
 from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.vehicle.measures import VehicleMeasures
-from fleet_slip.vehicle.parameters import VehicleParameters, load_vehicle
+from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from tests.support.drives import noisy, simulated_drive, slalom
 
 CAR = load_vehicle("d_class_sedan", SHIPPED_CONFIGS)
