@@ -247,18 +247,13 @@ class Sensors(Config):
     @property
     def bias_and_std(self) -> dict[str, tuple[float, float]]:
         """Bias and standard deviation of the signals at the full rate, in SI units."""
-        wheel, steer = (0.0, self.wheel_speed_std_rad_s), (0.0, self.steer_std_rad)
         return {
             "ax": (self.ax_bias_mps2, self.acceleration_std_mps2),
             "ay": (self.ay_bias_mps2, self.acceleration_std_mps2),
             "yaw_rate": (self.yaw_rate_bias_rad_s, self.yaw_rate_std_rad_s),
             "steering_wheel": (0.0, self.steering_wheel_std_rad),
-            "wheel_fl": wheel,
-            "wheel_fr": wheel,
-            "wheel_rl": wheel,
-            "wheel_rr": wheel,
-            "steer_fl": steer,
-            "steer_fr": steer,
+            **dict.fromkeys(("steer_fl", "steer_fr"), (0.0, self.steer_std_rad)),
+            **{name.removesuffix("_rad_s"): (0.0, self.wheel_speed_std_rad_s) for name in WHEELS},
             "sideslip": (0.0, self.sideslip_std_rad),
         }
 

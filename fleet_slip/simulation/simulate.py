@@ -40,9 +40,6 @@ from fleet_slip.warehouse.warehouse import Warehouse
 TOLERANCE = 1e-9
 """Largest difference from highway-env, relative to the largest value of a quantity."""
 
-CHUNK_ROWS = 2**16
-"""Rows of a chunk of a column that is constant in a drive."""
-
 
 @dataclass(frozen=True)
 class DriveLog:
@@ -179,11 +176,14 @@ def at_reference(channels: dict[str, FloatArray], reference_m: float) -> dict[st
 def tabulate(signals: SignalCatalog, batch: Batch, logs: Sequence[DriveLog]) -> pa.Table:
     """Return the rows of logs as a table."""
     rows = [log.rows for log in logs]
+    drive_of_row = pa.array(np.repeat(np.arange(len(rows)), rows))
     columns = {"day": pa.repeat(pa.scalar(batch.day), sum(rows))}
     for column in signals.drive_schema:
         values = pa.array([log.metadata.get(column.name) for log in logs], type=column.type)
         if column.name not in signals.optional or values.null_count < len(values):
-            columns[column.name] = _repeated(values, rows)
+            is_text = pa.types.is_string(column.type)
+            distinct = values.dictionary_encode() if is_text else values
+            columns[column.name] = distinct.take(drive_of_row)
     ticks = pa.array(np.arange(max(rows), dtype=np.int32))
     columns["tick"] = pa.chunked_array([ticks[:n] for n in rows])
     for name in signals.signals:
@@ -200,16 +200,6 @@ def _counts(log: DriveLog, name: str) -> pa.Array:
         return pa.nulls(log.rows, pa.int16())
     at_fixes = source is log.fixes or name in GPS_SIGNALS
     return pa.array(source.counts[name], mask=~source.gps_fix if at_fixes else None)
-
-
-def _repeated(values: pa.Array, times: Sequence[int]) -> pa.ChunkedArray:
-    """Repeat each value, strings as a dictionary; the chunks of a drive share their memory."""
-    encoded = values.dictionary_encode() if pa.types.is_string(values.type) else values
-    chunks = []
-    for drive, count in enumerate(times):
-        same = encoded.take(pa.array(np.full(min(count, CHUNK_ROWS), drive)))
-        chunks += [same[: count - first] for first in range(0, count, CHUNK_ROWS)]
-    return pa.chunked_array(chunks, type=encoded.type)
 
 
 def batch_transaction(batch: Batch) -> AppTransaction:
@@ -308,10 +298,6 @@ def simulate_campaign(
     snapshot = warehouse.logs.snapshot()
     days = tuple(days)
     open_days = _open_days(snapshot, campaign, days)
-    for day in open_days:  # before anything is written, so that a changed campaign is refused
-        if snapshot.transaction_version(f"{day_name(campaign.name, day)}/0") is not None:
-            for batch in campaign.batches(day):
-                has_landed(snapshot, batch_transaction(batch))
     plan = (campaign.batches(day) for day in open_days)
     report = _simulate(warehouse, plan, len(open_days), executor, progress, engine)
     report.campaign, report.days_present = campaign.name, len(days) - len(open_days)
