@@ -21,8 +21,7 @@ from fleet_slip.models.score import Score, cohort_of_rows, find_training_overlap
 from fleet_slip.operations.sensor_screen import SensorScreen, screen_computed_drives
 from fleet_slip.simulation.scenario import load_scenario, load_scenarios
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle.parameters import VehicleMeasures
-from fleet_slip.vehicle.parameters import load_car, load_measures
+from fleet_slip.vehicle.parameters import VehicleMeasures, load_car, load_measures
 
 if TYPE_CHECKING:
     from fleet_slip.evaluation.evaluation_document import Evaluation

@@ -18,8 +18,7 @@ from fleet_slip.models.registry import (
     compare_versions,
 )
 from fleet_slip.storage.local import LocalFolder
-from fleet_slip.vehicle.parameters import VehicleMeasures
-from fleet_slip.vehicle.parameters import load_measures
+from fleet_slip.vehicle.parameters import VehicleMeasures, load_measures
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from fleet_slip.errors import ConfigError
 from fleet_slip.evaluation.test_drives import blind_scenarios
 from fleet_slip.resources import SHIPPED_CONFIGS
-from fleet_slip.simulation import simulate
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, load_track, road_with
 from fleet_slip.simulation.scenario import load_scenarios
@@ -153,15 +152,6 @@ def test_clipped_values_are_counted_in_every_row_of_their_drive() -> None:
     table = synthetic_table(synthetic_truth(30), truth)
     assert table["saturated"].to_pylist() == [0] * 30 + [2] * 12
     assert table["ay"].to_pylist()[33:35] == [30000, 30000]
-
-
-@pytest.mark.parametrize("together", [1, 3])
-def test_bytes_do_not_depend_on_which_drives_run_side_by_side(
-    together: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    expected = simulate_batch(SIGNALS, short_batch())
-    monkeypatch.setattr(simulate, "DRIVES_AT_ONCE", together)
-    assert simulate_batch(SIGNALS, short_batch()).equals(expected)
 
 
 def test_bytes_do_not_depend_on_threads_or_on_the_order_of_batches() -> None:
