@@ -18,13 +18,13 @@ from fleet_slip.errors import UsageError
 def score(
     context: Context,
     model: opt.Model = None,
-    cohort: Annotated[
-        str | None, Option(help="SQL predicate on the view drives. Default: drives of no training.")
-    ] = None,
+    cohort: opt.OtherCohort = None,
     include_faulty: opt.IncludeFaulty = False,
     json: opt.Json = False,
 ) -> None:
     """Evaluate a model on the rows of a cohort: RMSE, largest error and percentiles.
+
+    Default: all drives that the model was not trained on, or all if there are no others.
 
     Example: fleet-slip score waterford --cohort "speed_factor > 0.9"
     """
@@ -56,22 +56,11 @@ def evaluate(
     context: Context,
     model: opt.Model = None,
     compare: Annotated[list[str] | None, Option(help="Another model. May be repeated.")] = None,
-    scenario: Annotated[
-        list[str] | None,
-        Option(
-            help="Scenario of configs/scenarios, or a TOML file. May be repeated. Default: all."
-        ),
-    ] = None,
+    scenario: Annotated[list[str] | None, Option(help="Scenario. May be repeated.")] = None,
     blind: Annotated[
         bool, Option("--blind", help="Evaluate on random drives, drawn from the version's hash.")
     ] = False,
-    cohort: Annotated[
-        str | None,
-        Option(
-            help="SQL predicate on the view drives: evaluate on these measured drives with a label "
-            "instead, each by models and filters that were trained without it."
-        ),
-    ] = None,
+    cohort: opt.OtherCohort = None,
     include_faulty: opt.IncludeFaulty = False,
     vehicle: opt.Vehicle = None,
     threads: opt.Threads = None,
@@ -82,7 +71,11 @@ def evaluate(
 
     The models of Table I, trained on the cohort of the model, are evaluated beside it. Prints the
     best estimator of each test drive. The results are stored as a JSON document in evaluations/ of
-    the data root; --json prints it.
+    the data root; --json prints it. --scenario is a scenario of configs/scenarios, or a TOML file.
+
+    With --cohort the drives are measured ones with a label. Models and filters are trained without
+    the drives, or parts, that they are evaluated on. With --blind roads, cars, weather and drivers
+    were unknown before the version was published.
 
     Example: fleet-slip evaluate waterford --scenario nominal
     """
@@ -117,13 +110,7 @@ def evaluate(
 def identify(
     context: Context,
     name: Annotated[str, Argument(help="Name of the car.")],
-    vehicle: Annotated[
-        str,
-        Option(
-            help="Measured data of the car: a TOML file with mass_kg, front_axle_m, rear_axle_m, "
-            "optionally track_m, height_m, rolling_radius_m, front_drive_share."
-        ),
-    ],
+    vehicle: Annotated[str, Option(help="TOML file with measured data of the car.")],
     cohort: opt.Cohort = TRAINING_DRIVES,
     threads: opt.Threads = None,
     output: Annotated[Path | None, Option(help="Vehicle file to write.")] = None,
@@ -134,9 +121,10 @@ def identify(
 ) -> None:
     """Identify a car's tyres and inertia from labelled drives, as a vehicle file for filters.
 
-    An extended Kalman filter in the car, of measured mass and axle distances at least, is fitted to
-    the label. The result contains its error on drives that were left out. A logged steering wheel
-    angle suffices where no road wheel angle is logged.
+    An extended Kalman filter in the car is fitted to the label. --vehicle has mass_kg, front_axle_m
+    and rear_axle_m, optionally track_m, height_m, rolling_radius_m and front_drive_share. The
+    result contains its error on drives that were left out. A logged steering wheel angle suffices
+    where no road wheel angle is logged.
 
     Example: fleet-slip identify hatchback --vehicle measures.toml --output hatchback.toml
     """
@@ -182,12 +170,7 @@ def report(
 
 def watch(
     context: Context,
-    drive: Annotated[
-        str,
-        Argument(
-            metavar="SCENARIO|DRIVE", help="A scenario, or a drive by its drive_id, name or file."
-        ),
-    ],
+    drive: Annotated[str, Argument(metavar="SCENARIO|DRIVE", help="Scenario or logged drive.")],
     model: opt.Model = None,
     output: Annotated[Path, Option(help="Page to write, .html.")] = Path("watch.html"),
     from_s: Annotated[float, Option("--from", help="First second of the drive.")] = 0.0,
@@ -195,7 +178,8 @@ def watch(
 ) -> None:
     """Show a drive: the car on its track, its angle and the estimate, wheels and gates.
 
-    The page is one file and needs no server.
+    It is a scenario of configs/scenarios, a TOML file, or a logged drive: its drive_id, its name,
+    or the name of its file. The page is one file and needs no server.
 
     Example: fleet-slip watch adhesion_0_4 --output slippery.html
     """

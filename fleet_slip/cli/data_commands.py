@@ -45,8 +45,7 @@ def simulate(
     days: opt.CampaignDays = None,
     through: opt.Through = None,
     engine: Annotated[
-        Literal["kernel", "highway-env"],
-        Option(help="highway-env is slower; the logs are the same."),
+        Literal["kernel", "highway-env"], Option(help="highway-env is slower; same logs.")
     ] = "kernel",
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -70,19 +69,12 @@ def simulate(
 
 def ingest(
     context: Context,
-    files: Annotated[
-        list[str],
-        Argument(
-            help="Log files (CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO) or folders. "
-            "Of folders, files that were ingested before are skipped."
-        ),
-    ],
+    files: Annotated[list[str], Argument(help="Log files or folders.")],
     mapping: Annotated[
         str | None, Option(help="Mapping of configs/mappings, or a TOML file; none for Gram rows.")
     ] = None,
     dry_run: Annotated[
-        bool,
-        Option("--dry-run", help="Store nothing; show the result (exit code 10 if it is odd)."),
+        bool, Option("--dry-run", help="Store nothing; exit code 10 if anything looks wrong.")
     ] = False,
     replace: Annotated[
         bool, Option("--replace", help="Replace the drives of the same recordings.")
@@ -91,6 +83,9 @@ def ingest(
     json: opt.Json = False,
 ) -> None:
     """Bring measured logs into the data root through a mapping of columns, units and axes.
+
+    Formats: CSV, Parquet, MDF, MATLAB, CAN traces, MCAP, TDMS, VBO. Of folders, files that were
+    ingested before are skipped.
 
     Without a mapping, files are tables of Gram rows that cars computed on board (docs/export.md).
 
@@ -302,10 +297,7 @@ def gram(
     features: Annotated[
         str, Option(help="Feature set of configs/features.toml, signals (the logged ones), or all.")
     ] = "signals",
-    cohort: Annotated[
-        str | None,
-        Option(help="SQL predicate on the view drives: read only files with such a drive."),
-    ] = None,
+    cohort: opt.OtherCohort = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
     sql: Annotated[bool, Option("--sql", help="Print the SQL; compute nothing.")] = False,
@@ -313,7 +305,8 @@ def gram(
 ) -> None:
     """Reduce new log files to Gram rows, and drop the Gram rows of deleted files.
 
-    The first run for a feature set reads all logs; later runs read new files.
+    The first run for a feature set reads all logs; later runs read new files. With --cohort, only
+    log files with such a drive are read.
 
     Every set: fleet-slip gram --features all
 

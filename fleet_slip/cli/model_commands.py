@@ -67,10 +67,7 @@ def select(
 def publish(
     context: Context,
     name: opt.ModelName,
-    cohort: Annotated[
-        str | None,
-        Option(help="SQL predicate on the view drives. Default: the champion's, or all."),
-    ] = None,
+    cohort: opt.OtherCohort = None,
     include_faulty: opt.IncludeFaulty = False,
     models: opt.ModelList = None,
     label: opt.Label = None,
@@ -78,11 +75,7 @@ def publish(
     half_life: opt.HalfLife = None,
     prior: opt.Prior = None,
     with_filter: Annotated[
-        str | None,
-        Option(
-            help="Combine it with a Kalman filter in this car, a vehicle of configs/vehicles or a "
-            "TOML file with mass_kg, front_axle_m, rear_axle_m; or none. Default: the champion's."
-        ),
+        str | None, Option(help="Combine it with a filter in this car, or none for no filter.")
     ] = None,
     force: Annotated[bool, Option("--force", help="Publish even a worse model.")] = False,
     candidate: opt.Candidate = False,
@@ -91,8 +84,12 @@ def publish(
 ) -> None:
     """Select from a model list and publish the winner as a model's next version, its champion.
 
-    A model that exists is trained again with the options of its champion; options that are given
-    replace them. Explore with select; its --save writes a list for --models.
+    A model that exists is trained again with the cohort and options of its champion; options that
+    are given replace them. A new model is trained on all drives. Explore with select; its --save
+    writes a list for --models.
+
+    --with-filter identifies a Kalman filter in a car from the drives: a vehicle of
+    configs/vehicles, or a TOML file with mass_kg, front_axle_m and rear_axle_m.
 
     Try it first: fleet-slip publish waterford --dry-run
 
@@ -132,8 +129,7 @@ def diagnose(
     model: opt.Model = None,
     cohort: opt.Cohort = TRAINING_DRIVES,
     signals: Annotated[
-        str | None,
-        Option(help="Signals to fit instead, separated by commas; or 'catalogue' for all."),
+        str | None, Option(help="Signals to fit instead, separated by commas; or catalogue.")
     ] = None,
     features: Annotated[str | None, Option(help="Feature set of --signals.")] = None,
     json: opt.Json = False,

@@ -85,15 +85,13 @@ def calibrate(
 def monitor(
     context: Context,
     model: opt.Model = None,
-    cohort: Annotated[
-        str | None, Option(help="SQL predicate on the view drives. Default: the training's.")
-    ] = None,
-    since: Annotated[
-        str | None, Option(help="First new day, YYYY-MM-DD. Default: the one after the training.")
-    ] = None,
+    cohort: opt.OtherCohort = None,
+    since: Annotated[str | None, Option(help="First new day, YYYY-MM-DD.")] = None,
     json: opt.Json = False,
 ) -> None:
     """Chart a model's error on each day since its training, with control limits.
+
+    Default: the predicate of its training, from the day after the training data.
 
     Reads Gram rows only. Exit code 10 if a new day is beyond the limits.
 
@@ -110,8 +108,7 @@ def verify(
     ] = False,
     repair: Annotated[bool, Option("--repair", help="Rebuild damaged Gram rows.")] = False,
     accept_loss: Annotated[
-        list[str] | None,
-        Option(help="Lost document to give up: FOLDER/NUMBER.json, or FOLDER. May be repeated."),
+        list[str] | None, Option(help="Lost FOLDER/NUMBER.json, or FOLDER, to give up.")
     ] = None,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,
@@ -141,8 +138,7 @@ def compact(
         int | None, Option(min=1, help="Maximum number of rows of a file. Default: 2,000,000.")
     ] = None,
     retention_hours: Annotated[
-        float | None,
-        Option(min=1, max=168, help="Age at which replaced files are removed. Default: 168 h."),
+        float | None, Option(min=1, max=168, help="Age of files to remove. Default: 168.")
     ] = None,
     dry_run: Annotated[bool, Option("--dry-run", help="List the files; change nothing.")] = False,
     json: opt.Json = False,

@@ -93,6 +93,7 @@ Candidate = Annotated[
 ]
 
 Cohort = Annotated[str, Option(help="SQL predicate on the view drives.")]
+OtherCohort = Annotated[str | None, Option(help="SQL predicate on the view drives.")]
 IncludeFaulty = Annotated[
     bool, Option("--include-faulty", help="Include drives with faulty sensors.")
 ]

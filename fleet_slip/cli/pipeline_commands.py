@@ -122,10 +122,7 @@ def run(
 def learn(
     context: Context,
     name: opt.ModelName,
-    logs: Annotated[
-        list[str],
-        Argument(help="Log files or folders. Files that were ingested before are skipped."),
-    ],
+    logs: Annotated[list[str], Argument(help="Log files or folders.")],
     mapping: opt.Mapping,
     threads: opt.Threads = None,
     cluster: opt.Cluster = None,

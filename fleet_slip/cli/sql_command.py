@@ -34,10 +34,7 @@ FORMULA = "^[=+@\\t\\r\\n＝＋－＠-]"
 
 def sql(
     context: Context,
-    query: Annotated[
-        str,
-        Argument(help='SQL, such as "FROM drives LIMIT 5". - or nothing: statements from stdin.'),
-    ] = "-",
+    query: Annotated[str, Argument(help="SQL; - or nothing: statements from stdin.")] = "-",
     json: opt.Json = False,
     csv: Annotated[bool, Option("--csv", help="Print CSV on stdout.")] = False,
     exact: Annotated[
@@ -46,8 +43,7 @@ def sql(
     output: Annotated[Path | None, Option(help="File to write: .parquet, .csv or .json.")] = None,
     everything: opt.All = False,
     unsafe: Annotated[
-        bool,
-        Option("--unsafe", help="Allow any statement and file. It can overwrite the data root."),
+        bool, Option("--unsafe", help="Allow any statement and file: it can overwrite data.")
     ] = False,
 ) -> None:
     """Query the data root: log (SI), log_counts, drives, grams, models, quarantine, dictionary.
