@@ -24,10 +24,15 @@ import numpy as np
 
 import fleet_slip
 from fleet_slip.config import load_config
+from fleet_slip.evaluation.evaluated_drives import (
+    BlindSet,
+    TestDrive,
+    blind_scenarios,
+    simulate_drives,
+)
 from fleet_slip.evaluation.evaluator import Estimator as DriveEstimator
 from fleet_slip.evaluation.evaluator import evaluate, pooled_statistics
 from fleet_slip.evaluation.scenario_evaluation import train_competitors
-from fleet_slip.evaluation.test_drives import BlindSet, TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.export.stepping import Estimator
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.resources import SHIPPED_CONFIGS
@@ -122,7 +127,7 @@ def errors_deg(
 
 
 def _laden(drive: TestDrive) -> TestDrive:
-    turned = drive.scenario.car.body.reference_m * drive.signals["yaw_rate_rad_s"]
+    turned = drive.scenario.car.body.reference_m * drive.columns["yaw_rate_rad_s"]
     turned = turned / np.maximum(drive.vx_mps, 1.0)
     return replace(drive, vy_mps=drive.vy_mps - drive.vx_mps * turned)
 
@@ -144,7 +149,7 @@ def print_nights(version: ModelVersion, seed: int) -> None:
         for drive in drives:
             estimator.restart(retained)
             rows = min(2 * MINUTE_TICKS, len(drive.time_s))
-            columns = [drive.signals[name][:rows].tolist() for name in estimator.columns]
+            columns = [drive.columns[name][:rows].tolist() for name in estimator.columns]
             angles = [
                 estimator.step(dict(zip(estimator.columns, sample, strict=True)))
                 for sample in zip(*columns, strict=True)

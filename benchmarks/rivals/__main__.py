@@ -30,15 +30,15 @@ from benchmarks.rivals.learners import (
 )
 from benchmarks.rivals.tree_filter import fit_tree_filter
 from fleet_slip.calibration.car_calibration import calibrate
+from fleet_slip.evaluation.evaluated_drives import TestDrive, simulate_drives
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import (
     FILTERS,
     TABLE_ONE,
     FilterEstimate,
-    TuningDrives,
     published_estimate,
+    read_tuning_drives,
 )
-from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
@@ -122,13 +122,13 @@ def train(
     if not (is_wanted(FILTER.name) or is_wanted(TREE)):
         return
     car = load_scenario("nominal", SHIPPED_CONFIGS).car
-    drives = TuningDrives.choose(fleet.warehouse, cohort, with_mass=False)
+    drives = read_tuning_drives(fleet.warehouse, cohort)
     with ThreadPoolExecutor(1) as executor:
-        best, took_s = timed(partial(FILTER.tune, drives.drives, car, executor))
+        best, took_s = timed(partial(FILTER.tune, drives, car, executor))
         estimate = FilterEstimate(FILTER, best.parameters)
         yield FILTER.name, Rival(estimate, training_s=took_s)
         if is_wanted(TREE):
-            tree, took_s = timed(partial(fit_tree_filter, estimate, car, drives.drives, executor))
+            tree, took_s = timed(partial(fit_tree_filter, estimate, car, drives, executor))
             yield TREE, Rival(tree, tree.size_bytes, took_s)
 
 

@@ -12,8 +12,8 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.catalog.definitions import Definition
 from fleet_slip.columns.drive_columns import ColumnPlan, DriveCounts, as_counts, compute_columns
 from fleet_slip.errors import DataError
+from fleet_slip.evaluation.evaluated_drives import TestDrive
 from fleet_slip.evaluation.evaluator import ErrorStatistics, error_statistics
-from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, assign_folds
 from fleet_slip.grams.compute import read_drives
@@ -97,7 +97,7 @@ class LearnedEstimate:
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Estimate side-slip in rad at every tick; NaN where an input is missing."""
-        return self.estimate(drive.signals, drive.vehicle_attributes)
+        return self.estimate(drive.columns, drive.vehicle_attributes)
 
     def estimate(
         self, signals: Mapping[str, FloatArray], attributes: Mapping[str, Any]

@@ -21,12 +21,22 @@ from fleet_slip.arrays import FloatArray, IntArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.filters import FilterEstimate, drive_signals
+from fleet_slip.evaluation.ekf import Axles
+from fleet_slip.evaluation.evaluated_drives import (
+    STEP_S,
+    DriveSignals,
+    LabelledDrive,
+    TestDrive,
+    hold_last,
+)
+from fleet_slip.evaluation.filters import FilterEstimate
 from fleet_slip.evaluation.identify import tune
-from fleet_slip.evaluation.kalman import independent_state
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive, hold_last
-from fleet_slip.evaluation.single_track import Axles, follow, measured_speed_mps, sideslip_angle
-from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.evaluation.kalman import (
+    follow,
+    independent_state,
+    measured_speed_mps,
+    sideslip_angle,
+)
 from fleet_slip.vehicle.parameters import VehicleParameters
 
 LEAVES = 6
@@ -96,7 +106,7 @@ class TreeFilter:
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick."""
-        return self.estimate(drive_signals(drive), self.base.car(drive), self.noise)
+        return self.estimate(drive.signals, self.base.car(drive), self.noise)
 
     def leaf(self, drive: DriveSignals, car: VehicleParameters) -> IntArray:
         """Return the number of the leaf of each row, shape (rows,)."""

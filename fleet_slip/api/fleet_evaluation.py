@@ -9,11 +9,11 @@ from fleet_slip.api import calls
 from fleet_slip.api.fleet_models import FleetModels
 from fleet_slip.catalog.signals import ALL_DRIVES, TRAINING_DRIVES
 from fleet_slip.errors import UsageError
-from fleet_slip.evaluation.filters import TuningDrives
+from fleet_slip.evaluation.evaluated_drives import simulate_scenarios
+from fleet_slip.evaluation.filters import read_tuning_drives
 from fleet_slip.evaluation.identify import IdentifiedVehicle, identify_held_out
 from fleet_slip.evaluation.measured_evaluation import evaluate_measured
-from fleet_slip.evaluation.scenario_evaluation import evaluate_blind, evaluate_scenarios
-from fleet_slip.evaluation.test_drives import simulate_scenarios
+from fleet_slip.evaluation.scenario_evaluation import evaluate_simulated
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.models.manifest import require_model_name
 from fleet_slip.models.registry import ModelVersion
@@ -142,7 +142,7 @@ class FleetEvaluation:
         first, *rivals = self._versions(model, challengers)
         with calls.open_workers(self.warehouse.root, threads) as executor:
             simulate_scenarios(self.warehouse, chosen, executor, calls.total_progress(progress))
-            content = evaluate_scenarios(self.warehouse, chosen, first, rivals, executor)
+            content = evaluate_simulated(self.warehouse, chosen, first, rivals, executor)
         return store_evaluation(evaluations_of(self.warehouse), content)
 
     @calls.record_call
@@ -211,7 +211,7 @@ class FleetEvaluation:
 
         first, *rivals = self._versions(model, challengers)
         with calls.open_workers(self.warehouse.root, threads) as executor:
-            return Evaluation(evaluate_blind(self.warehouse, first, rivals, executor))
+            return Evaluation(evaluate_simulated(self.warehouse, None, first, rivals, executor))
 
     def identify(
         self,
@@ -251,9 +251,9 @@ class FleetEvaluation:
             vehicle = load_measures(vehicle, self.warehouse.configs)
         car = vehicle.model_copy(update={"name": name})
         rows = load_cohort(self.warehouse, cohort)
-        chosen = TuningDrives.choose(self.warehouse, rows, with_mass=False)
+        drives = read_tuning_drives(self.warehouse, rows)
         with calls.open_workers(self.warehouse.root, threads) as executor:
-            return identify_held_out(car, chosen.drives, executor)
+            return identify_held_out(car, drives, executor)
 
     def report(
         self, model: str | ModelVersion | None = None, output: Path | None = None
@@ -308,20 +308,11 @@ class FleetEvaluation:
         QuestionError
             If there is no such drive.
         """
-        from fleet_slip.evaluation.watch import (
-            drive_frames,
-            is_scenario,
-            scenario_frames,
-            write_page,
-        )
+        from fleet_slip.evaluation.watch import drive_frames, write_page
 
         if output.suffix != ".html":
             raise UsageError(f"{output}: a drive is shown as a page. Choose a name in .html.")
-        version = self._models.get(model)
-        if is_scenario(drive, self.warehouse.configs):
-            frames = scenario_frames(drive, version)
-        else:
-            frames = drive_frames(self.warehouse, drive, version)
+        frames = drive_frames(self.warehouse, drive, self._models.get(model))
         write_page(frames.part(from_s, until_s), output)
         return output
 

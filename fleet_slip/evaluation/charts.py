@@ -1,6 +1,7 @@
 """The paper's figures, in its order: angles and speed over time, captions from the same data."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,9 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Patch
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.evaluated_drives import TestDrive, find_stretches
 from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, ReportData
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
-from fleet_slip.evaluation.test_drives import TestDrive, find_stretches
 from fleet_slip.pages.page import BINS, WIDTH_IN, Picture, colour, degrees, join_words
 
 ANGLE_IN = 2.3
@@ -25,65 +26,44 @@ KMH_PER_MPS = 3.6
 
 
 class PaperFigure(NamedTuple):
-    """A figure of the paper, and the title of each drive in it by scenario.
+    """A figure of the paper, its title, and that of each drive in it by scenario.
 
     It shows speeds, or the angles of the models of Table I or estimators named in `estimators`,
     where `CHOICE` is the model that the paper chooses.
     """
 
-    key: str
+    number: str
     title: str
     drives: Mapping[str, str]
     estimators: tuple[str, ...] = ()
 
 
 CHOICE = "choice"
+NOMINAL = {"nominal": ""}
 TEST_DRIVE = "side-slip angle on the test drive"
+NOISE = {"nominal": "Initial noise", "noise_doubled": "Bias and noise doubled"}
+MASS = {"mass_1000": "Sprung mass 1000 kg", "mass_1740": "Sprung mass 1740 kg"}
+ADHESION = {"adhesion_0_7": "Adhesion 0.7", "adhesion_0_4": "Adhesion 0.4"}
+CIRCUIT = {"melbourne": "Melbourne Grand Prix Circuit"}
+FILTERED = (*DRAWN_FILTERS, CHOICE)
 FIGURES = (
+    PaperFigure("1a", f"1(a). Models 1 and 2: {TEST_DRIVE}", NOMINAL, ("1", "2")),
+    PaperFigure("1b", f"1(b). Models 3 to 5: {TEST_DRIVE}", NOMINAL, ("3", "4", "5")),
+    PaperFigure("2", "2. Speed during the test drive", NOMINAL),
+    PaperFigure("3", "3. Effect of increased noise", NOISE, (CHOICE,)),
+    PaperFigure("4", "4. Effect of the car's mass", MASS, (CHOICE,)),
+    PaperFigure("5", "5. Effect of the adhesion coefficient", ADHESION, (CHOICE,)),
+    PaperFigure("6", "6. Speed on the Melbourne circuit", CIRCUIT),
+    PaperFigure("7", "7. Side-slip angle on the Melbourne circuit", CIRCUIT, (CHOICE,)),
     PaperFigure(
-        "figure-1a", f"Figure 1(a). Models 1 and 2: {TEST_DRIVE}", {"nominal": ""}, ("1", "2")
-    ),
-    PaperFigure(
-        "figure-1b", f"Figure 1(b). Models 3 to 5: {TEST_DRIVE}", {"nominal": ""}, ("3", "4", "5")
-    ),
-    PaperFigure("figure-2", "Figure 2. Speed during the test drive", {"nominal": ""}),
-    PaperFigure(
-        "figure-3",
-        "Figure 3. Effect of increased noise",
-        {"nominal": "Initial noise", "noise_doubled": "Bias and noise doubled"},
-        (CHOICE,),
-    ),
-    PaperFigure(
-        "figure-4",
-        "Figure 4. Effect of the car's mass",
-        {"mass_1000": "Sprung mass 1000 kg", "mass_1740": "Sprung mass 1740 kg"},
-        (CHOICE,),
-    ),
-    PaperFigure(
-        "figure-5",
-        "Figure 5. Effect of the adhesion coefficient",
-        {"adhesion_0_7": "Adhesion 0.7", "adhesion_0_4": "Adhesion 0.4"},
-        (CHOICE,),
-    ),
-    PaperFigure("figure-6", "Figure 6. Speed on the Melbourne circuit", {"melbourne": ""}),
-    PaperFigure(
-        "figure-7",
-        "Figure 7. Side-slip angle on the Melbourne circuit",
-        {"melbourne": "Melbourne Grand Prix Circuit"},
-        (CHOICE,),
-    ),
-    PaperFigure(
-        "figure-8",
-        "Figure 8. The Kalman filter and the regression",
-        {"nominal": "Nominal drive"},
-        (*DRAWN_FILTERS, CHOICE),
+        "8", "8. The Kalman filter and the regression", {"nominal": "Nominal drive"}, FILTERED
     ),
 )
 DRAWN_SCENARIOS = frozenset[str]().union(*(figure.drives for figure in FIGURES))
 
 
 class Line(NamedTuple):
-    """One estimator in a figure."""
+    """One estimator in a figure; without a name it is the true angle."""
 
     estimator: str
     label: str
@@ -102,16 +82,6 @@ class DriveBlock(NamedTuple):
         """Height of its panels."""
         return [ANGLE_IN, *[STRIP_IN] * len(self.lines)]
 
-    @property
-    def truth_deg(self) -> FloatArray:
-        """The true angle, shape (ticks,)."""
-        return np.degrees(self.run.drive.sideslip_rad)
-
-    def estimate_deg(self, line: Line) -> FloatArray:
-        """Return an estimate, shape (ticks,); NaN where the drive is not evaluated."""
-        estimate = np.degrees(self.run.estimates[line.estimator])
-        return np.where(self.run.rows, estimate, np.nan)
-
     def errors(self, line: Line) -> str:
         """Return the errors of an estimator in words."""
         errors = self.run.statistics[line.estimator]
@@ -126,14 +96,29 @@ def draw_pictures(data: ReportData) -> Iterator[Picture]:
         lines = list(_lines(data, figure.estimators))
         if len(runs) < len(figure.drives) or (figure.estimators and not lines):
             continue
-        if not figure.estimators:
-            yield _speed(figure, runs[0].drive)
-            continue
-        blocks = [
-            DriveBlock(title or join_words([line.label for line in lines]), run, lines)
-            for title, run in zip(figure.drives.values(), runs, strict=True)
-        ]
-        yield _series(figure, blocks)
+        if figure.estimators:
+            blocks = [
+                DriveBlock(title or join_words([line.label for line in lines]), run, lines)
+                for title, run in zip(figure.drives.values(), runs, strict=True)
+            ]
+            caption = " ".join(
+                f"{block.title}: {'; '.join(map(block.errors, lines))}." for block in blocks
+            )
+            description = (
+                "Lines over time of the true angle and of the estimates, and beneath them the "
+                "differences."
+            )
+            drawn = partial(side_slip, blocks)
+        else:
+            drive = runs[0].drive
+            kmh = drive.speed_mps * KMH_PER_MPS
+            caption = (
+                f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {drive.time_s[-1]:.0f} s, over "
+                f"{drive.scenario.track.length_m / 1000:.2f} km."
+            )
+            description, drawn = "A line of speed over time.", partial(speed, drive.time_s, kmh)
+        key, title = f"figure-{figure.number}", f"Figure {figure.title}"
+        yield Picture(key, title, caption, description, drawn)
 
 
 def _lines(data: ReportData, names: Sequence[str]) -> Iterator[Line]:
@@ -145,16 +130,6 @@ def _lines(data: ReportData, names: Sequence[str]) -> Iterator[Line]:
         elif name in data.estimators:
             label = "Kalman filter" + (", tuned" if name.endswith("tuned") else "")
             yield Line(name, label, name)
-
-
-def _series(figure: PaperFigure, blocks: Sequence[DriveBlock]) -> Picture:
-    caption = " ".join(
-        f"{block.title}: {'; '.join(map(block.errors, block.lines))}." for block in blocks
-    )
-    description = (
-        "Lines over time of the true angle and of the estimates, and beneath them the differences."
-    )
-    return Picture(figure.key, figure.title, caption, description, lambda: side_slip(blocks))
 
 
 def side_slip(blocks: Sequence[DriveBlock]) -> Figure:
@@ -172,28 +147,35 @@ def _draw_block(figure: FigureBase, block: DriveBlock) -> None:
     panels = figure.subplots(len(block.heights_in), sharex=True, gridspec_kw=ratios)
     angle, *strips = panels
     drive = block.run.drive
+    truth_deg = np.degrees(drive.sideslip_rad)
     angle.set_xlim(drive.time_s[0], drive.time_s[-1])
     angle.set_ylabel("side-slip angle (deg)")
     angle.set_title(f"{block.title}\n", fontweight="bold")
-    lines = [_plot(angle, drive.time_s, block.estimate_deg(line), line) for line in block.lines]
-    lines.insert(0, _plot(angle, drive.time_s, block.truth_deg, Line("", "true", "truth")))
-    for section in drive.sections:
-        if section.name == "unstable":
-            for stretch in find_stretches(drive, section.rows):
-                for axes in panels:
-                    shade = {"color": colour("unstable"), "alpha": 0.16, "linewidth": 0}
-                    axes.axvspan(stretch.from_s, stretch.until_s, **shade)
-            lines.append(Patch(color=colour("unstable"), label="unstable"))
+    estimates_deg = [
+        np.where(block.run.rows, np.degrees(block.run.estimates[line.estimator]), np.nan)
+        for line in block.lines
+    ]
+    artists = [
+        _plot(angle, drive.time_s, estimate_deg, line)
+        for estimate_deg, line in zip(estimates_deg, block.lines, strict=True)
+    ]
+    artists.insert(0, _plot(angle, drive.time_s, truth_deg, Line("", "true", "truth")))
+    if "unstable" in drive.sections:
+        for stretch in find_stretches(drive, drive.sections["unstable"]):
+            for axes in panels:
+                shade = {"color": colour("unstable"), "alpha": 0.16, "linewidth": 0}
+                axes.axvspan(stretch["from_s"], stretch["until_s"], **shade)
+        artists.append(Patch(color=colour("unstable"), label="unstable"))
     angle.legend(
-        handles=lines,
-        ncols=len(lines),
+        handles=artists,
+        ncols=len(artists),
         loc="lower left",
         bbox_to_anchor=(0, 1),
         borderaxespad=0,
         frameon=False,
     )
-    for axes, line in zip(strips, block.lines, strict=True):
-        _plot(axes, drive.time_s, block.estimate_deg(line) - block.truth_deg, line)
+    for axes, line, estimate_deg in zip(strips, block.lines, estimates_deg, strict=True):
+        _plot(axes, drive.time_s, estimate_deg - truth_deg, line)
         axes.locator_params(axis="y", nbins=3, symmetric=True)
         axes.set_title(block.errors(line), color=colour(line.colour), pad=1)
     reach_deg = max(abs(limit) for axes in strips for limit in axes.get_ylim())
@@ -229,23 +211,12 @@ def band(x: FloatArray, y: FloatArray, bins: int) -> dict[str, FloatArray]:
     return {name: series[name].to_numpy() for name in ("x", "mean", "low", "high")}
 
 
-def _speed(figure: PaperFigure, drive: TestDrive) -> Picture:
-    kmh = drive.speed_mps * KMH_PER_MPS
-    caption = (
-        f"From {kmh.min():.0f} to {kmh.max():.0f} km/h in {drive.time_s[-1]:.0f} s, over "
-        f"{drive.scenario.track.length_m / 1000:.2f} km."
-    )
-    description = "A line of speed over time."
-    return Picture(figure.key, figure.title, caption, description, lambda: speed(drive))
-
-
-def speed(drive: TestDrive) -> Figure:
+def speed(time_s: FloatArray, kmh: FloatArray) -> Figure:
     """Draw the true speed of a drive."""
     figure = Figure(figsize=(WIDTH_IN, SPEED_IN), layout="constrained")
-    axes, kmh = figure.subplots(), drive.speed_mps * KMH_PER_MPS
-    series = band(drive.time_s, kmh, BINS)
+    axes, series = figure.subplots(), band(time_s, kmh, BINS)
     axes.plot(series["x"], series["mean"], color=colour("model_4"), linewidth=1.3)
-    axes.set_xlim(drive.time_s[0], drive.time_s[-1])
+    axes.set_xlim(time_s[0], time_s[-1])
     axes.set_ylim(0, 1.05 * float(kmh.max()))
     axes.set_xlabel("time (s)")
     axes.set_title("speed (km/h)", color=colour("muted"))

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fleet_slip.arrays import FloatArray
+from fleet_slip.evaluation.evaluated_drives import TestDrive
 from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, NotEvaluatedError, ReportData
 from fleet_slip.evaluation.evaluator import EvaluatedDrive
-from fleet_slip.evaluation.test_drives import TestDrive
 from fleet_slip.export.c import COEFFICIENT_BYTES, describe_costs, dot_product_operations
 from fleet_slip.pages.page import count, degrees, join_words, number, percent, scientific
 from fleet_slip.regression.choice import nested_fits

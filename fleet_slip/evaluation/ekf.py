@@ -17,7 +17,7 @@ slide there, where their force has no slope that leads back.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from pydantic import Field, FiniteFloat
@@ -25,26 +25,144 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.config import Config
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals, hold_last
 from fleet_slip.evaluation.kalman import (
     YAW_RATE_TUNABLE,
     GaussianState,
     Row,
     YawRateNoise,
     estimate_yaw_rate,
+    follow,
     independent_state,
-    measurement_update,
-    predict_covariance,
-)
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
-from fleet_slip.evaluation.single_track import (
-    Axles,
-    loaded_axles,
     measured_speed_mps,
     measured_steer_rad,
-    rates,
+    measurement_update,
+    predict_covariance,
     sideslip_angle,
 )
+from fleet_slip.vehicle.dynamics import cornering_stiffness
 from fleet_slip.vehicle.parameters import Constants, VehicleParameters, constants
+
+# The single-track model, with the forces of its axles.
+#
+# The lateral forces follow the loads of the moment: bends load the outer wheels and braking the
+# front ones. Two wheels with different loads hold less than two with their mean, because a tyre's
+# stiffness and grip grow less than its load (Pacejka, "Tire and Vehicle Dynamics" (2012), sections
+# 1.2.3 and 4.E25).
+
+SLOWEST_MPS = 5.0
+"""Speed below which slip is measured against this speed; the poles stay within 100/s."""
+
+LEAST_LOAD = 0.05
+"""Smallest load of a wheel over its load at rest, so that noise lifts no wheel."""
+
+
+class Axles(NamedTuple):
+    """Cornering stiffness and grip of both tyres of each axle together."""
+
+    stiffness_front_n: float
+    """Cornering stiffness per unit of slip."""
+    stiffness_rear_n: float
+    grip_front_n: float
+    """Largest lateral force."""
+    grip_rear_n: float
+
+
+def loaded_axles(
+    car: VehicleParameters, ax_mps2: FloatArray, ay_mps2: FloatArray, adhesion: float
+) -> FloatArray:
+    """Return the `Axles` of a car under accelerations of shape (rows,), as measured.
+
+    The shape is (4, rows): a row for each of their fields. The body leans with the lag of its
+    suspension, which takes the accelerations' noise away.
+    """
+    c = constants(car, adhesion)
+    pitch = c.pitch_transfer * follow(ax_mps2, c.inverse_pitch_lag * STEP_S)
+    leaning = follow(ay_mps2, c.inverse_roll_lag * STEP_S)
+
+    def axle(mean: FloatArray, roll: FloatArray, peak: float) -> tuple[FloatArray, FloatArray]:
+        loads = np.maximum(np.stack([mean - roll, mean + roll]), LEAST_LOAD * c.static_rear)
+        stiffness = cast(FloatArray, cornering_stiffness(cast(float, loads), peak, c))
+        grip = (c.friction - c.friction_per_load * loads) * loads
+        return stiffness.sum(axis=0), grip.sum(axis=0)
+
+    front = axle(c.static_front - pitch, c.roll_transfer_front * leaning, c.stiffness_front)
+    rear = axle(c.static_rear + pitch, c.roll_transfer_rear * leaning, c.stiffness_rear)
+    return np.stack([front[0], rear[0], front[1], rear[1]])
+
+
+class LateralForce(NamedTuple):
+    """Lateral force of an axle across the car, and its derivatives."""
+
+    force: float
+    per_vx: float
+    per_vy: float
+    per_r: float
+
+
+@kernel
+def lateral_force(
+    vx: float, vy: float, r: float, steer: float, lever: float, stiffness: float, grip: float
+) -> LateralForce:
+    """Return the force of an axle at the distance `lever` before the centre of gravity.
+
+    With slip σ = −across / along of the axle's velocity in the wheel's frame, the brush tyre of
+    Fiala gives, up to the slip where all of it slides,
+
+        F = C σ − C² |σ| σ / (3 G) + C³ σ³ / (27 G²),   dF/dσ = C (1 − C |σ| / (3 G))²
+
+    and beyond it ±G (Pacejka, "Tire and Vehicle Dynamics" (2012), section 3.2.1).
+    """
+    cosine, sine = np.cos(steer), np.sin(steer)
+    side = vy + lever * r
+    across = cosine * side - sine * vx
+    along = cosine * vx + sine * side
+    rolling = max(along, SLOWEST_MPS)
+    turning = 1.0 if along > SLOWEST_MPS else 0.0
+    slip = -across / rolling
+    use = stiffness * slip / (3.0 * grip)
+    stuck = max(1.0 - abs(use), 0.0)
+    force = 3.0 * grip * use * (1.0 - abs(use) + use * use / 3.0)
+    if stuck == 0.0:
+        force = grip if slip > 0.0 else -grip
+    per_slip = stiffness * stuck * stuck / rolling
+    # dσ = −(d across + σ d along) / rolling
+    per_side = -per_slip * (cosine + turning * slip * sine) * cosine
+    per_vx = -per_slip * (-sine + turning * slip * cosine) * cosine
+    return LateralForce(cosine * force, per_vx, per_side, lever * per_side)
+
+
+class Rates(NamedTuple):
+    """Lateral acceleration and yaw acceleration, with their derivatives."""
+
+    ay: float
+    ay_vx: float
+    ay_vy: float
+    ay_r: float
+    yaw: float
+    yaw_vx: float
+    yaw_vy: float
+    yaw_r: float
+
+
+@kernel
+def rates(vx: float, vy: float, r: float, steer: float, axles: Axles, c: Constants) -> Rates:
+    """Return (Ff cos δ + Fr)/m and (a Ff cos δ − b Fr)/I, linearised."""
+    f = lateral_force(vx, vy, r, steer, c.front, axles.stiffness_front_n, axles.grip_front_n)
+    b = lateral_force(vx, vy, r, 0.0, -c.rear, axles.stiffness_rear_n, axles.grip_rear_n)
+    return Rates(
+        (f.force + b.force) / c.mass,
+        (f.per_vx + b.per_vx) / c.mass,
+        (f.per_vy + b.per_vy) / c.mass,
+        (f.per_r + b.per_r) / c.mass,
+        (c.front * f.force - c.rear * b.force) / c.yaw_inertia,
+        (c.front * f.per_vx - c.rear * b.per_vx) / c.yaw_inertia,
+        (c.front * f.per_vy - c.rear * b.per_vy) / c.yaw_inertia,
+        (c.front * f.per_r - c.rear * b.per_r) / c.yaw_inertia,
+    )
+
+
+# The filter.
 
 INITIAL_STD = (1.0, 1.0, 0.1)
 """Standard deviations of vx, vy (m/s) and r (rad/s) at the first row."""

@@ -6,21 +6,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from string import ascii_lowercase
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fleet_slip.base import pluralize
 from fleet_slip.errors import DataError
+from fleet_slip.evaluation.evaluated_drives import TestDrive
 from fleet_slip.evaluation.evaluator import ErrorStatistics, EvaluatedDrive
+from fleet_slip.evaluation.filters import TrainedModels
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import degrees
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.storage.documents import Document, DocumentFolder, checksum
 from fleet_slip.warehouse.predicate import describe_cohort
 from fleet_slip.warehouse.warehouse import Warehouse
-
-if TYPE_CHECKING:
-    from fleet_slip.evaluation.filters import TrainedModels
-    from fleet_slip.evaluation.test_drives import TestDrive
 
 BLIND_COLUMNS = 5
 """Estimators of the table that is printed first: published models, then the best of the others."""
@@ -211,8 +209,8 @@ class ReportData:
 
     version: ModelVersion
     document: Document
-    trained: "TrainedModels"
-    runs: "Mapping[str, EvaluatedDrive[TestDrive]]"
+    trained: TrainedModels
+    runs: Mapping[str, EvaluatedDrive[TestDrive]]
 
     @property
     def estimators(self) -> Mapping[str, Mapping[str, Any]]:
@@ -308,14 +306,8 @@ class ReportData:
         for scenario, run in self.runs.items():
             for name, current in run.statistics.items():
                 stored = self.statistics(scenario, name)
-                errors = [
-                    math.nan if statistics is None or statistics.rmse_deg is None
-                    else statistics.rmse_deg
-                    for statistics in (stored, current)
-                ]  # fmt: skip
-                if not math.isclose(*errors, rel_tol=TOLERANCE) and not all(
-                    map(math.isnan, errors)
-                ):
+                before, now = stored and stored.rmse_deg, current.rmse_deg
+                if before != now and not math.isclose(before or 0, now or 0, rel_tol=TOLERANCE):
                     changed.append(f"the drive of {scenario}, or {name},")
         if changed:
             raise DataError(

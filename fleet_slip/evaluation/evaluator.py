@@ -168,14 +168,15 @@ def on_common_rows(
         name: rows & np.isfinite(np.concatenate([drive.estimates[name] for drive in drives]))
         for name in drives[0].estimates
     }
-    largest = max((int(mask.sum()) for mask in estimated.values()), default=0)
-    common, comparable, excluded = rows, set[str](), dict[str, str]()
-    for name in sorted(estimated, key=lambda name: -int(estimated[name].sum())):
+    counts = {name: int(mask.sum()) for name, mask in estimated.items()}
+    largest = max(counts.values(), default=0)
+    common, excluded = rows, dict[str, str]()
+    for name in sorted(counts, key=lambda name: -counts[name]):
         remaining = common & estimated[name]
         if largest and remaining.sum() >= MIN_COMMON_SHARE * largest:
-            common, comparable = remaining, comparable | {name}
-        elif estimated[name].any():
-            share = estimated[name].sum() / largest
+            common = remaining
+        elif counts[name]:
+            share = counts[name] / largest
             excluded[name] = f"it estimates {share:.0%} of the rows, too few to compare"
         else:
             excluded[name] = "no drive has the signals that it needs"
@@ -184,7 +185,7 @@ def on_common_rows(
         replace(
             evaluated,
             rows=mask,
-            estimates={n: e for n, e in evaluated.estimates.items() if n in comparable},
+            estimates={n: e for n, e in evaluated.estimates.items() if n not in excluded},
         )
         for evaluated, mask in zip(drives, np.split(common, stops), strict=True)
     ), excluded

@@ -5,6 +5,7 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import Executor
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,9 @@ from fleet_slip.catalog.definitions import (
 )
 from fleet_slip.catalog.signals import SignalCatalog
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.evaluated_drives import LabelledDrive, Segments
 from fleet_slip.evaluation.evaluator import MissingSignalError
 from fleet_slip.evaluation.identify import IdentifiedVehicle, identify, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import (
     LATERAL_ROWS,
     Learner,
@@ -122,34 +123,29 @@ def with_filter(
     In every inner group of drives the car is identified and the line chosen again. If the drives
     lack what the filter needs, the line stays alone, with the reason.
     """
-    predicate = selection.cohort.predicate.text
+    predicate, nothing = selection.cohort.predicate.text, Segments()
+    combined: dict[str, Any] = {"method": "line", "rmse_deg": {}, "worst_rmse_deg": {}, "groups": 0}
     try:
         drives = [
             prepare_drive(drive, vehicle_with_fit(measures))
             for drive in read_measured_drives(warehouse, load_cohort(warehouse, predicate))
         ]
         learner = Learner.prepare(warehouse, selection.request, predicate, drives)
-        nothing: Segments = frozenset()
         vehicle = identify(measures, training_drives(drives, nothing), executor)
         choice = cross_validate_combination(
             learner, measures, vehicle, nothing, executor, selection.cohort.prior
         )
         observer = observer_of_drives(vehicle, warehouse.catalog.signals, drives)
     except (DataError, QuestionError) as error:
-        combination = CombinedWithFilter(
-            method="line", rmse_deg={}, worst_rmse_deg={}, groups=0, measures=measures,
-            reason=str(error),
-        )  # fmt: skip
-        return manifest.model_copy(update={"combination": combination})
-    is_line = choice.method == "line"
-    combination = CombinedWithFilter(
-        method=choice.method,
-        term=None if is_line else combined_term(warehouse.catalog, manifest, choice, observer),
-        rmse_deg={name: math.degrees(rad) for name, rad in choice.rmse_rad.items()},
-        worst_rmse_deg={name: math.degrees(rad) for name, rad in choice.worst_rmse_rad.items()},
-        groups=choice.groups,
-        measures=measures,
-    )
+        combined["reason"] = str(error)
+    else:
+        for name in ("rmse", "worst_rmse"):
+            errors = getattr(choice, f"{name}_rad")
+            combined[f"{name}_deg"] = {key: math.degrees(rad) for key, rad in errors.items()}
+        combined |= {"method": choice.method, "groups": choice.groups}
+        if choice.method != "line":
+            combined["term"] = combined_term(warehouse.catalog, manifest, choice, observer)
+    combination = CombinedWithFilter(measures=measures, **combined)
     return manifest.model_copy(update={"combination": combination})
 
 

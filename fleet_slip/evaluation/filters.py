@@ -7,8 +7,8 @@ parameters with the smallest error on drives that the regression was trained on.
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,11 +21,10 @@ from fleet_slip.columns.drive_columns import as_counts
 from fleet_slip.config import Config
 from fleet_slip.errors import ConfigError, DataError
 from fleet_slip.evaluation import ekf, kalman
+from fleet_slip.evaluation.evaluated_drives import LabelledDrive, TestDrive, read_drives
 from fleet_slip.evaluation.evaluator import Estimator
 from fleet_slip.evaluation.identify import IdentifiedVehicle, TuningResult, identify, tune
-from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, read_drives
-from fleet_slip.evaluation.single_track import measured_speed_mps
-from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.evaluation.kalman import measured_speed_mps
 from fleet_slip.grams.cohort import Cohort, load_cohort
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
@@ -50,7 +49,7 @@ def linear_estimate(
     intercept: float, coefficients: Mapping[str, float], drive: TestDrive
 ) -> FloatArray:
     """Return intercept in rad + sum of coefficient times SI column; NaN where one is null."""
-    terms = [weight * drive.signals[column] for column, weight in coefficients.items()]
+    terms = [weight * drive.columns[column] for column, weight in coefficients.items()]
     total: FloatArray = np.sum(terms, axis=0) + intercept
     return total
 
@@ -60,7 +59,7 @@ def published_estimate(
 ) -> FloatArray:
     """Return the estimate of a model on counts: the integers that its Gram rows are made of."""
     names = predictor.plan.signals
-    return predictor(as_counts(signals, drive.signals, names, drive.vehicle_attributes))
+    return predictor(as_counts(signals, drive.columns, names, drive.vehicle_attributes))
 
 
 @dataclass(frozen=True)
@@ -77,47 +76,49 @@ class TrainedModels:
 
     def bank(self) -> EstimatorBank:
         """Return the models of Table I, then the published one."""
-        version, manifest = self.version, self.version.manifest
+        version, manifest, cohort = self.version, self.version.manifest, self.selection.cohort
         common = {
             "kind": "regression",
             "group": version.reference,
-            "cohort": self.selection.cohort.predicate.text,
-            "drives": self.selection.cohort.drives.num_rows,
-            "rows": self.selection.cohort.rows,
+            "cohort": cohort.predicate.text,
+            "drives": cohort.drives.num_rows,
+            "rows": cohort.rows,
         }
         signals = version.catalog.signals
         bank: EstimatorBank = {}
         for name, model in zip(self.table_one.values(), self.selection.models, strict=True):
-            weights = {
-                signals[signal].column: weight for signal, weight in model.model.weights.items()
-            }
-            about = {
+            offset, weights = model.model.offset, model.model.weights
+            coefficients = {signals[signal].column: weight for signal, weight in weights.items()}
+            bank[name] = (
+                partial(linear_estimate, offset, coefficients),
+                {
+                    **common,
+                    "table_one": model.name,
+                    "signals": list(model.signals),
+                    "cross_validated": model.pooled.as_dict(),
+                    "intercept": offset,
+                    "coefficients": coefficients,
+                },
+            )
+        bank[version.reference] = (
+            partial(published_estimate, signals, Predictor.from_manifest(signals, manifest)),
+            {
                 **common,
-                "table_one": model.name,
-                "signals": list(model.signals),
-                "cross_validated": model.pooled.as_dict(),
-                "intercept": model.model.offset,
-                "coefficients": weights,
-            }
-            bank[name] = partial(linear_estimate, model.model.offset, weights), about
-        about = {
-            **common,
-            "published": version.reference,
-            "sha256": version.sha256,
-            "signals": list(manifest.signals),
-            "cross_validated": manifest.cross_validation.model_dump(mode="json"),
-            "intercept": manifest.intercept,
-            "coefficients": {term.column: term.coefficient for term in manifest.terms},
-            "columns": {
-                term.signal: term.definition.model_dump(mode="json")
-                if term.definition
-                else term.sql
-                for term in manifest.terms
-                if not term.logged
+                "published": version.reference,
+                "sha256": version.sha256,
+                "signals": list(manifest.signals),
+                "cross_validated": manifest.cross_validation.model_dump(mode="json"),
+                "intercept": manifest.intercept,
+                "coefficients": {term.column: term.coefficient for term in manifest.terms},
+                "columns": {
+                    term.signal: term.definition.model_dump(mode="json")
+                    if term.definition
+                    else term.sql
+                    for term in manifest.terms
+                    if not term.logged
+                },
             },
-        }
-        predictor = Predictor.from_manifest(signals, manifest)
-        bank[version.reference] = partial(published_estimate, signals, predictor), about
+        )
         return bank
 
 
@@ -198,14 +199,14 @@ class FilterEstimate:
 
     def __call__(self, drive: TestDrive) -> FloatArray:
         """Return the estimate at each tick, at the reference point of the car."""
-        signals, car, parameters = drive_signals(drive), self.car(drive), self.parameters
+        car, parameters = self.car(drive), self.parameters
         if self.filter.informed:
             parameters = parameters.model_copy(update={"adhesion": drive.scenario.adhesion})
-        angle_rad: FloatArray = self.filter.module.estimate(signals, car, parameters)
+        angle_rad: FloatArray = self.filter.module.estimate(drive.signals, car, parameters)
         if not (reference_m := car.body.reference_m):
             return angle_rad
-        speed_mps = np.maximum(measured_speed_mps(signals, car), 1.0)
-        return angle_rad + reference_m * signals.yaw_rate_rad_s / speed_mps
+        speed_mps = np.maximum(measured_speed_mps(drive.signals, car), 1.0)
+        return angle_rad + reference_m * drive.signals.yaw_rate_rad_s / speed_mps
 
     def on_labelled(self, default_car: VehicleParameters, drive: LabelledDrive) -> FloatArray:
         """Return the estimate of a drive of the logs, at each row."""
@@ -225,12 +226,6 @@ class FilterEstimate:
         }
 
 
-def drive_signals(drive: TestDrive) -> DriveSignals:
-    """Return the signals of a drive that filters read."""
-    names = (column.name for column in fields(DriveSignals))
-    return DriveSignals(**{name: drive.signals[name] for name in names})
-
-
 def restore_filter(name: str, about: Mapping[str, Any]) -> FilterEstimate:
     """Restore a filter from its name among the estimators and its description in a document."""
     (kind,) = (kind for kind in FILTERS if kind.name == name.removesuffix("_tuned"))
@@ -239,36 +234,39 @@ def restore_filter(name: str, about: Mapping[str, Any]) -> FilterEstimate:
 
 
 def filter_bank(
-    drives: "TuningDrives", car: VehicleParameters, executor: Executor
+    warehouse: Warehouse,
+    drives: Sequence[LabelledDrive],
+    car: VehicleParameters,
+    executor: Executor,
+    *,
+    with_mass: bool,
 ) -> EstimatorBank:
     """Return each filter with default and with tuned parameters, and one in an identified car.
 
     A filter for which the drives lack a signal is not tuned, and a warning names it.
     """
-    stored = drives.load_or_tune(car, executor)
+    stored = load_or_tune(warehouse, drives, car, executor, with_mass=with_mass)
     for failure in stored["failing"]:
         LOGGER.warning("%s", failure)
     bank: EstimatorBank = {}
     if stored["cars"]:
         cars = {name: IdentifiedVehicle.load(content) for name, content in stored["cars"].items()}
         about = {"kind": "filter", "group": GROUP, "gps": False, "told": "labelled drives"}
-        about |= {"parameters": {name: car.dump() for name, car in cars.items()}}
+        about |= {"parameters": stored["cars"]}
         bank[IDENTIFIED_NAME] = partial(identified_estimate, cars), about
     for kind in FILTERS:
-        default = FilterEstimate(kind, kind.default, drives.with_mass)
-        best = stored["parameters"].get(kind.module_name)
-        parameters = type(kind.default).model_validate(best) if best else kind.default
-        tuned = replace(default, parameters=parameters)
-        tuned_on = {"tuned_on": drives.names if best else []}
-        bank[kind.name] = default, default.description()
-        bank[f"{kind.name}_tuned"] = tuned, {**tuned.description(), **tuned_on}
+        default = tuned = FilterEstimate(kind, kind.default, with_mass)
+        bank[kind.name], names = (default, default.description()), []
+        if best := stored["parameters"].get(kind.module_name):
+            names = [drive.name for drive in drives]
+            tuned = replace(default, parameters=type(kind.default).model_validate(best))
+        bank[f"{kind.name}_tuned"] = tuned, {**tuned.description(), "tuned_on": names}
     return bank
 
 
-# The extended Kalman filter in a car that was identified from the training drives of a model, with
-# scales, a tape measure and labelled drives.
-
 IDENTIFIED_NAME = "ekf_identified"
+"""The extended Kalman filter in a car that was identified from the training drives of a model, with
+scales, a tape measure and labelled drives."""
 
 DRIVES_OF_A_CLASS = 12
 """Drives of each class of cars; a dozen give as good a car in half the time."""
@@ -277,7 +275,7 @@ DRIVES_OF_A_CLASS = 12
 def identified_estimate(cars: Mapping[str, IdentifiedVehicle], drive: TestDrive) -> FloatArray:
     """Return the filter's estimate in the identified car of a drive's class, or in the first."""
     default = next(iter(cars.values()))
-    return cars.get(drive.scenario.vehicle.name, default).estimate(drive_signals(drive))
+    return cars.get(drive.scenario.vehicle.name, default).estimate_drive(drive)
 
 
 def checksum_of_sources(folder: Path = Path(__file__).parent) -> str:
@@ -302,90 +300,75 @@ TUNING_S = 120
 """Length of the beginning of each tuning drive."""
 
 
-@dataclass(frozen=True)
-class TuningDrives:
-    """Drives of a cohort to tune filters on: name, vehicle model, and mass if filters use it."""
+def read_tuning_drives(
+    warehouse: Warehouse, cohort: Cohort, *, with_mass: bool = False
+) -> list[LabelledDrive]:
+    """Read the beginnings of drives of a cohort, evenly chosen, in the cars of their classes.
 
-    warehouse: Warehouse
-    keys: tuple[tuple[str, str, float | None], ...]
-    with_mass: bool
+    `with_mass`: with the stated mass of each car. Biases of the sensors are unknown.
+    """
+    names = sorted(set(cohort.drives["drive_id"].to_pylist()))
+    drives = []
+    for drive in read_drives(warehouse, choose_evenly(names, TUNING_DRIVES)):
+        model, mass_kg = _class_of(drive, with_mass)
+        car = class_car(model, mass_kg, warehouse.configs)
+        drives.append(replace(drive.beginning(TUNING_S * SAMPLE_RATE_HZ), car=car))
+    return drives
 
-    @classmethod
-    def choose(cls, warehouse: Warehouse, cohort: Cohort, *, with_mass: bool) -> "TuningDrives":
-        """Choose drives evenly, by name."""
-        columns = cohort.drives.select(["drive_id", "vehicle_model", "mass_kg"])
-        rows = {row["drive_id"]: row for row in columns.to_pylist()}
-        keys = (
-            (name, rows[name]["vehicle_model"], rows[name]["mass_kg"] if with_mass else None)
-            for name in choose_evenly(sorted(rows), TUNING_DRIVES)
-        )
-        return cls(warehouse, tuple(keys), with_mass)
 
-    @property
-    def names(self) -> list[str]:
-        """The drives' names."""
-        return [name for name, _, _ in self.keys]
+def _class_of(drive: LabelledDrive, with_mass: bool) -> tuple[str, float | None]:
+    """Return the vehicle model of a drive, and its mass if filters use it."""
+    mass_kg = drive.rows["mass_kg"][0].as_py() if with_mass else None
+    return drive.rows["vehicle_model"][0].as_py(), mass_kg
 
-    @cached_property
-    def drives(self) -> tuple[LabelledDrive, ...]:
-        """The beginning of each drive, as filters meet it: with unknown biases."""
-        drives = read_drives(self.warehouse, self.names)
-        return tuple(
-            replace(
-                drive.beginning(TUNING_S * SAMPLE_RATE_HZ),
-                car=class_car(model, mass_kg, self.warehouse.configs),
-            )
-            for drive, (_, model, mass_kg) in zip(drives, self.keys, strict=True)
-        )
 
-    def load_or_tune(self, car: VehicleParameters, executor: Executor) -> Mapping[str, Any]:
-        """Return the parameters stored below `tuned/`, or tune and store them.
+def load_or_tune(
+    warehouse: Warehouse,
+    drives: Sequence[LabelledDrive],
+    car: VehicleParameters,
+    executor: Executor,
+    *,
+    with_mass: bool,
+) -> Mapping[str, Any]:
+    """Return the parameters stored below `tuned/`, or tune and store them.
 
-        The document has `parameters` by module, the identified `cars` by vehicle model, and a
-        message for each failure: a fix, wheel speeds, steering or a label is missing (`failing`).
-        """
-        key = {
-            "drives": [TUNING_S, *map(list, self.keys)],
-            "car": car.model_dump(mode="json"),
-            "program": checksum_of_sources(),
-        }
-        folder = DocumentFolder(self.warehouse.root, "tuned")
-        documents = (folder.read(number).content for number in reversed(folder.numbers()))
-        stored = next((content for content in documents if content["key"] == key), None)
-        return stored or folder.append({"key": key, **self._tuned(car, executor)}).content
-
-    def _tuned(self, car: VehicleParameters, executor: Executor) -> dict[str, Any]:
-        drives = pluralize(len(self.names), "drive")
-        LOGGER.info("tuning filters and identifying the car on %s, once", drives)
-        cars: dict[str, Any] = {}
-        parameters: dict[str, Any] = {}
-        failures: list[str] = []
+    The document has `parameters` by module, the identified `cars` by vehicle model, and a message
+    for each failure: a fix, wheel speeds, steering or a label is missing (`failing`).
+    """
+    keys = [[drive.name, *_class_of(drive, with_mass)] for drive in drives]
+    key = {
+        "drives": [TUNING_S, *keys],
+        "car": car.model_dump(mode="json"),
+        "program": checksum_of_sources(),
+    }
+    folder = DocumentFolder(warehouse.root, "tuned")
+    for number in reversed(folder.numbers()):
+        stored = folder.read(number).content
+        if stored["key"] == key:
+            return stored
+    LOGGER.info(
+        "tuning filters and identifying the car on %s, once", pluralize(len(drives), "drive")
+    )
+    cars: dict[str, Any] = {}
+    parameters: dict[str, Any] = {}
+    failures: list[str] = []
+    try:
+        models = [_class_of(drive, with_mass)[0] for drive in drives if drive.car]
+        for model in sorted(set(models)):
+            measures = VehicleMeasures.of_vehicle(load_vehicle(model, warehouse.configs))
+            of_class = [drive for drive in drives if _class_of(drive, with_mass)[0] == model]
+            chosen = choose_evenly(of_class, DRIVES_OF_A_CLASS)
+            cars[model] = identify(measures, chosen, executor).dump()
+    except DataError as error:
+        failures.append(f"no car can be identified: {error}")
+    for kind in {kind.module_name: kind for kind in reversed(FILTERS)}.values():
         try:
-            cars = self._identified(executor)
+            best = kind.tune(drives, car, executor)
+            parameters[kind.module_name] = best.parameters.model_dump(mode="json")
         except DataError as error:
-            failures.append(f"no car can be identified: {error}")
-        for kind in {kind.module_name: kind for kind in reversed(FILTERS)}.values():
-            try:
-                best = kind.tune(self.drives, car, executor)
-                parameters[kind.module_name] = best.parameters.model_dump(mode="json")
-            except DataError as error:
-                failures.append(f"{kind.name} left untuned: {error}")
-        return {"cars": cars, "parameters": parameters, "failing": failures}
-
-    def _identified(self, executor: Executor) -> dict[str, Any]:
-        """Identify each class of cars that has a file. Raises `DataError` as `identify`."""
-        cars = {}
-        for model in sorted({model for _, model, _ in self.keys if model}):
-            drives = [
-                replace(drive, car=None)
-                for (_, drive_model, _), drive in zip(self.keys, self.drives, strict=True)
-                if drive_model == model and drive.car is not None
-            ]
-            if drives:
-                car = VehicleMeasures.of_vehicle(load_vehicle(model, self.warehouse.configs))
-                chosen = choose_evenly(drives, DRIVES_OF_A_CLASS)
-                cars[model] = identify(car, chosen, executor).dump()
-        return cars
+            failures.append(f"{kind.name} left untuned: {error}")
+    content = {"key": key, "cars": cars, "parameters": parameters, "failing": failures}
+    return folder.append(content).content
 
 
 def class_car(model: str, mass_kg: float | None, configs: Configs) -> VehicleParameters | None:

@@ -24,8 +24,9 @@ from fleet_slip.base import pluralize
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive
-from fleet_slip.evaluation.single_track import measured_speed_mps
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals, LabelledDrive, TestDrive
+from fleet_slip.evaluation.evaluator import Estimator
+from fleet_slip.evaluation.kalman import measured_speed_mps
 from fleet_slip.rendering import Answer, Part, Remark, TextTable
 from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleMeasures, VehicleParameters
 
@@ -34,6 +35,8 @@ from fleet_slip.vehicle.parameters import GRAVITY_MPS2, VehicleMeasures, Vehicle
 P = TypeVar("P", bound=Config)
 TunableEstimator = Callable[[DriveSignals, VehicleParameters, P], FloatArray]
 """Side-slip in rad by row, from the signals of a drive, its vehicle and parameters."""
+
+DriveEstimator = Estimator[LabelledDrive]
 
 SUBSAMPLE = 5
 """Rows for each residual: errors of neighbouring rows at 100 Hz are correlated."""
@@ -217,10 +220,7 @@ def tune(
 
 
 def estimation_errors_rad(
-    estimate: Callable[[LabelledDrive], FloatArray],
-    drives: Sequence[LabelledDrive],
-    executor: Executor,
-    step: int = 1,
+    estimate: DriveEstimator, drives: Sequence[LabelledDrive], executor: Executor, step: int = 1
 ) -> FloatArray:
     """Return the errors on every `step`-th row of each drive; NaN without estimate or label."""
     estimates = executor.map(estimate, drives)
@@ -237,9 +237,7 @@ def require_finite(errors: FloatArray) -> BoolArray:
 
 
 def rmse_rad(
-    estimate: Callable[[LabelledDrive], FloatArray],
-    drives: Sequence[LabelledDrive],
-    executor: Executor,
+    estimate: DriveEstimator, drives: Sequence[LabelledDrive], executor: Executor
 ) -> float:
     """Return the RMSE over rows with estimate and label. Raises as `require_finite`."""
     errors = estimation_errors_rad(estimate, drives, executor)
@@ -380,13 +378,9 @@ class IdentifiedVehicle(Answer):
             names = ", ".join(content["not_identifiable"])
             yield Remark(f"not identifiable from these drives: {names}.")
 
-    def estimate(self, signals: DriveSignals) -> FloatArray:
-        """Estimate side-slip in rad by the filter, shape (rows,)."""
-        return ekf.estimate(signals, self.car, self.noise)
-
-    def estimate_drive(self, drive: LabelledDrive) -> FloatArray:
+    def estimate_drive(self, drive: LabelledDrive | TestDrive) -> FloatArray:
         """Estimate side-slip of a drive in rad by the filter, shape (rows,)."""
-        return self.estimate(drive.signals)
+        return ekf.estimate(drive.signals, self.car, self.noise)
 
     def dump(self) -> dict[str, Any]:
         """Return its document."""
@@ -424,24 +418,19 @@ class IdentifiedVehicle(Answer):
             "held_out_deg": None if self.held_out_rad is None else math.degrees(self.held_out_rad),
         }
 
-    def as_toml(self) -> str:
-        """Return the car as a vehicle file."""
-        return "\n".join(self._lines("")) + "\n"
+    def as_toml(self, prefix: str = "") -> str:
+        """Return the car as a vehicle file, or below the prefix of its tables."""
+        content = self.car.model_dump()
+        lines = [f"{name} = {json.dumps(content.pop(name))}" for name in ("name", "description")]
+        for table, values in content.items():
+            rows = (f"{name} = {value!r}" for name, value in values.items())
+            lines += ["", f"[{prefix}{table}]", *rows]
+        return "\n".join(lines) + "\n"
 
     def as_campaign(self) -> str:
         """Return a campaign with the car on the roads of the campaign `prior`."""
-        name = f"prior_{self.car.name}"
-        head = [f"name = {json.dumps(name)}", f"description = {json.dumps(IDENTIFIED)}"]
-        head += ['base = "prior"', "", "[[plan.vehicles]]"]
-        return "\n".join([*head, *self._lines("plan.vehicles.")]) + "\n"
-
-    def _lines(self, prefix: str) -> list[str]:
-        lines = [f"name = {json.dumps(self.car.name)}"]
-        lines.append(f"description = {json.dumps(self.car.description)}")
-        for table, values in self.car.model_dump(exclude={"name", "description"}).items():
-            rows = (f"{name} = {value!r}" for name, value in values.items())
-            lines += ["", f"[{prefix}{table}]", *rows]
-        return lines
+        head = f'name = "prior_{self.car.name}"\ndescription = "{IDENTIFIED}"\nbase = "prior"\n'
+        return f"{head}\n[[plan.vehicles]]\n{self.as_toml('plan.vehicles.')}"
 
 
 PRIOR_STD = {
@@ -555,15 +544,13 @@ def identify(
             blocks.append(np.copysign(size, error) / math.sqrt(max(len(error), 1)))
         return np.concatenate(blocks)
 
-    if start is not None and start.fit is not None:
-        begin = coordinates.point([value_of(start.fit, name) for name in names])
-        optimum = minimize_from(residuals, coordinates, [begin])
-    else:
-        starts = [
-            coordinates.point([values.get(name, value_of(usual, name)) for name in names])
-            for values in STARTS
-        ]
-        optimum = minimize_from(residuals, coordinates, starts)
+    fit = start and start.fit
+    starts = [{name: value_of(fit, name) for name in names}] if fit else STARTS
+    points = [
+        coordinates.point([values.get(name, value_of(usual, name)) for name in names])
+        for values in starts
+    ]
+    optimum = minimize_from(residuals, coordinates, points)
     fit = coordinates.parameters(optimum.x)
     covariance = np.linalg.inv(optimum.jacobian.T @ optimum.jacobian)
     std_ratio = np.sqrt(np.diag(covariance)) * PRIOR_WEIGHT_RAD / prior_std
@@ -597,8 +584,7 @@ def identify_held_out(
     for fold in range(min(FOLDS, len(drives))):
         training = [drive for number, drive in enumerate(drives) if number % FOLDS != fold]
         vehicle, held_out = identify(measures, training, executor), drives[fold::FOLDS]
-        estimates = executor.map(vehicle.estimate_drive, held_out)
-        errors += [e - drive.sideslip_rad for e, drive in zip(estimates, held_out, strict=True)]
+        errors.append(estimation_errors_rad(vehicle.estimate_drive, held_out, executor))
     error = np.concatenate(errors)
     error = error[np.isfinite(error)]
     rmse = float(np.sqrt(np.mean(error**2))) if len(error) else None

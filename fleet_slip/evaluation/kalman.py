@@ -1,8 +1,9 @@
-"""The paper's Kalman filter (Section IV), the filter of its yaw rate, and the updates of both.
+"""The paper's Kalman filter (Section IV), the filter of its yaw rate, and what filters share.
 
 Updates change a state in place: a filter takes millions of steps and allocates nothing in them.
 """
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +12,113 @@ from pydantic import Field, FiniteFloat
 from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import equation, kernel
 from fleet_slip.config import Config
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals, hold_last
 from fleet_slip.evaluation.evaluator import MissingSignalError
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, hold_last
-from fleet_slip.evaluation.single_track import sideslip_angle, undriven_axle
 from fleet_slip.vehicle.parameters import VehicleParameters
+
+# Dead reckoning by wheel speeds: Carlson, Gerdes and Powell, "Error sources when land vehicle dead
+# reckoning with differential wheelspeeds", Navigation 51 (2004): the axle without drive torque
+# rolls with the least slip.
+
+
+@dataclass(frozen=True)
+class AxleSpeeds:
+    """Rolling velocities of the wheels of an axle over cos δ, and their distance."""
+
+    left_mps: FloatArray
+    right_mps: FloatArray
+    track_m: FloatArray | float
+    turned_m: FloatArray | float = 0.0
+    """Mean of tan δ times the axle's distance before the centre of gravity."""
+
+    @property
+    def is_one_speed(self) -> bool:
+        """True if one speed of the car replaces both wheel speeds, which never differ."""
+        return np.array_equal(self.left_mps, self.right_mps, equal_nan=True)
+
+    @property
+    def vx_mps(self) -> FloatArray:
+        """Longitudinal velocity of the centre of gravity."""
+        return (self.left_mps + self.right_mps) / 2 - self.turned_m * self.yaw_rate_rad_s
+
+    @property
+    def yaw_rate_rad_s(self) -> FloatArray:
+        """Yaw rate of the line through the wheels."""
+        return (self.right_mps - self.left_mps) / self.track_m
+
+
+def undriven_axle(drive: DriveSignals, car: VehicleParameters) -> AxleSpeeds:
+    """Return the speeds of the axle that takes the smaller share of the drive torque.
+
+    A wheel that rolls without slip at a hub with velocity (vx ∓ t/2 r, vy + a r), steered by δ, has
+
+        R ω / cos δ = vx ∓ t/2 r + tan δ (vy + a r).
+
+    At the rear δ = 0. At the front the wheels travel with the yaw of the car, too: tan δ a r is
+    taken off their mean. tan δ vy, a thousandth of vx, is neglected. A single speed of the car is
+    no speed of front wheels: the angle of the road wheels does not change it.
+    """
+    radius, front = car.tyre.rolling_radius_m, car.body.front_axle_m
+    if car.drivetrain.front_drive_share >= 0.5:
+        return AxleSpeeds(
+            radius * drive.wheel_rl_rad_s, radius * drive.wheel_rr_rad_s, car.body.track_rear_m
+        )
+    straight = AxleSpeeds(
+        radius * drive.wheel_fl_rad_s, radius * drive.wheel_fr_rad_s, car.body.track_front_m
+    )
+    if straight.is_one_speed:
+        return straight
+    tan_left, tan_right = np.tan(drive.steer_fl_rad), np.tan(drive.steer_fr_rad)
+    return AxleSpeeds(
+        radius * drive.wheel_fl_rad_s / np.cos(drive.steer_fl_rad),
+        radius * drive.wheel_fr_rad_s / np.cos(drive.steer_fr_rad),
+        car.body.track_front_m + front * (tan_right - tan_left),
+        front * (tan_left + tan_right) / 2,
+    )
+
+
+SLOWEST_ANGLE_MPS = 1.0
+"""Longitudinal velocity that replaces a smaller one in the angle."""
+
+
+def sideslip_angle(vx_mps: FloatArray, vy_mps: FloatArray) -> FloatArray:
+    """Return β = arctan(vy / vx) in rad, equations (12) and (13).
+
+    At rest the quotient has no limit and noise would turn the angle by up to π. Below
+    `SLOWEST_MPS`, and in reverse, vx is therefore replaced by `SLOWEST_MPS`: β stays continuous and
+    goes to zero with vy. NaN stays NaN.
+    """
+    return np.arctan2(vy_mps, np.maximum(vx_mps, SLOWEST_ANGLE_MPS))
+
+
+def measured_speed_mps(drive: DriveSignals, car: VehicleParameters) -> FloatArray:
+    """Return the longitudinal velocity from wheel speeds. Raises `MissingSignalError`."""
+    return hold_last(undriven_axle(drive, car).vx_mps, "wheel speeds")
+
+
+def measured_steer_rad(drive: DriveSignals) -> FloatArray:
+    """Return the mean angle of the front wheels that are logged.
+
+    Raises `MissingSignalError` without any.
+    """
+    wheels = (drive.steer_fl_rad, drive.steer_fr_rad)
+    logged = [angle_rad for angle_rad in wheels if np.isfinite(angle_rad).any()]
+    mean: FloatArray = np.mean(logged or wheels[:1], axis=0)
+    return hold_last(mean, "steer_fl and steer_fr")
+
+
+@kernel
+def follow(values: FloatArray, gain: float) -> FloatArray:
+    """Filter values with a lag, x ← x + gain (value − x), from the first value on."""
+    lagged = np.empty(len(values))
+    x = values[0]
+    for k in range(len(values)):
+        x += gain * (values[k] - x)
+        lagged[k] = x
+    return lagged
+
+
+# Updates of a Gaussian state.
 
 Row = tuple[Any, ...]
 """A row of a matrix, of a length that the compiler sees: it unrolls the loops over it."""

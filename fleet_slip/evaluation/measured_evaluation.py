@@ -9,12 +9,13 @@ The weights of a combination of line and filter are cross-validated in inner gro
 every group the car is identified, and the line chosen and fitted, without the group.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from importlib.metadata import version as package_version
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +23,16 @@ import pyarrow as pa
 from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.columns.drive_columns import ColumnPlan
 from fleet_slip.errors import DataError, QuestionError
+from fleet_slip.evaluation.evaluated_drives import (
+    QUARTERS,
+    STEP_S,
+    LabelledDrive,
+    Segments,
+    TestDrive,
+    hold_last,
+    predict_drive,
+    read_drives,
+)
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     MissingSignalError,
@@ -40,18 +51,7 @@ from fleet_slip.evaluation.filters import (
     class_car,
 )
 from fleet_slip.evaluation.identify import IDENTIFIED, IdentifiedVehicle, identify, vehicle_with_fit
-from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate
-from fleet_slip.evaluation.labelled_drives import (
-    QUARTERS,
-    STEP_S,
-    LabelledDrive,
-    Segments,
-    hold_last,
-    predict_drive,
-    read_drives,
-)
-from fleet_slip.evaluation.single_track import follow, measured_speed_mps
-from fleet_slip.evaluation.test_drives import TestDrive
+from fleet_slip.evaluation.kalman import YawRateNoise, estimate_yaw_rate, follow, measured_speed_mps
 from fleet_slip.grams.calibrated_columns import CarCounts
 from fleet_slip.grams.cohort import Cohort, load_cohort, with_gram_rows
 from fleet_slip.grams.compute import counts_of, drive_sums, gram_rows
@@ -357,8 +357,6 @@ def inner_groups(
 
 # Estimators that compete on measured drives, fitted without held-out segments.
 
-T = TypeVar("T")
-
 FITTED = "fitted without held-out rows"
 CHOSEN = "chosen and fitted without held-out rows"
 
@@ -447,11 +445,8 @@ class Competition:
         published: dict[str, FittedEstimator] = {}
         for version in versions:
             manifest, name = version.manifest, version.reference
-            is_label_free = manifest.learned_from is not None
-            if (
-                is_label_free
-                or not find_training_overlap(warehouse, registry, manifest, predicate).trained
-            ):
+            overlap = find_training_overlap(warehouse, registry, manifest, predicate)
+            if manifest.learned_from is not None or not overlap.trained:
                 model = Predictor.from_manifest(catalog.signals, manifest)
                 cars = calibrated_cars(warehouse) if model.plan.numbers else {}
                 estimate = partial(predict_drive, model, cars)
@@ -465,58 +460,36 @@ class Competition:
         combined = frozenset(v.reference for v in versions if v.manifest.combination)
         return cls(warehouse, drives, published, learners, combined, car, measures, executor)
 
+    @contextmanager
+    def _noting_failure(self, name: str) -> Iterator[None]:
+        """Note the reason for which an estimator cannot be fitted."""
+        try:
+            yield
+        except (DataError, QuestionError) as error:
+            self.failures[name] = str(error)
+
     def fit(self, held_out: Segments) -> FittedFold:
         """Fit, tune and identify without the held-out segments."""
         drives = training_drives(self.drives, held_out)
         fitted, identified = dict(self.published), None
-        if measures := self.measures:
-            name = "ekf_identified"
-            identified = self._attempt(name, lambda: identify(measures, drives, self.executor))
-        for name in self.learners:
-            fitted |= self._learn(name, held_out, identified)
+        if self.measures:
+            with self._noting_failure("ekf_identified"):
+                identified = identify(self.measures, drives, self.executor)
+        for name, (source, learner) in self.learners.items():
+            with self._noting_failure(name):
+                prior = self._prior(learner, identified)
+                columns, line = learner.train(held_out, prior)
+                fitted[name] = FittedEstimator(source, line, columns)
+                if name not in self.combined or self.measures is None or identified is None:
+                    continue
+                choice = cross_validate_combination(
+                    learner, self.measures, identified, held_out, self.executor, prior
+                )
+                filtered = identified.estimate_drive
+                both = partial(combined_estimate, choice.combination, line, filtered)
+                fitted[f"{name} line"] = fitted[name]
+                fitted[name] = FittedEstimator(f"{source}, with a filter", both, asdict(choice))
         return {**fitted, **self._filters(drives, identified)}
-
-    def _attempt(self, name: str, fit: Callable[[], T]) -> T | None:
-        """Return what a function fits; None if it cannot, with the reason in `failures`."""
-        try:
-            return fit()
-        except (DataError, QuestionError) as error:
-            self.failures[name] = str(error)
-            return None
-
-    def _learn(
-        self, name: str, held_out: Segments, identified: IdentifiedVehicle | None
-    ) -> FittedFold:
-        """Train a learner, and combine it with a filter if its version is."""
-        source, learner = self.learners[name]
-        trained = self._attempt(
-            name, lambda: learner.train(held_out, self._prior(learner, identified))
-        )
-        if trained is None:
-            return {}
-        columns, line = trained
-        fitted = {name: FittedEstimator(source, line, columns)}
-        measures = self.measures
-        if name not in self.combined or measures is None or identified is None:
-            return fitted
-        choice = self._attempt(
-            name,
-            lambda: cross_validate_combination(
-                learner,
-                measures,
-                identified,
-                held_out,
-                self.executor,
-                self._prior(learner, identified),
-            ),
-        )
-        if choice is None:
-            return fitted
-        both = partial(combined_estimate, choice.combination, line, identified.estimate_drive)
-        return {
-            f"{name} line": fitted[name],
-            name: FittedEstimator(f"{source}, with a filter", both, asdict(choice)),
-        }
 
     def _prior(self, learner: Learner, identified: IdentifiedVehicle | None) -> Cohort | None:
         """Simulate a learner's prior, in the car of this fold if its car was identified."""
@@ -557,13 +530,13 @@ class Competition:
         for kind in FILTERS:
             for suffix, (source, car) in cars.items():
                 name = f"{kind.module_name}_{suffix}"
-                if name not in fitted and not kind.informed and (has_gps or not kind.gps):
-                    tune = partial(kind.tune, drives, car, self.executor)
-                    if tuned := self._attempt(name, tune):
-                        estimate = partial(FilterEstimate(kind, tuned.parameters).on_labelled, car)
-                        content = tuned.parameters.model_dump(mode="json")
-                        origin = f"{source}, tuned on labels"
-                        fitted[name] = FittedEstimator(origin, estimate, content)
+                if name in fitted or kind.informed or (kind.gps and not has_gps):
+                    continue
+                with self._noting_failure(name):
+                    tuned = kind.tune(drives, car, self.executor).parameters
+                    estimate = partial(FilterEstimate(kind, tuned).on_labelled, car)
+                    origin = f"{source}, tuned on labels"
+                    fitted[name] = FittedEstimator(origin, estimate, tuned.model_dump(mode="json"))
         return fitted
 
 

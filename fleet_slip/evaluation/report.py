@@ -1,6 +1,5 @@
 """The report: one static page without a request to anywhere, and its figures as files."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -9,16 +8,15 @@ from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import MEASURED
 from fleet_slip.evaluation.charts import DRAWN_SCENARIOS, draw_pictures
 from fleet_slip.evaluation.claims import CLAIMS, PAPER_TABLE_TWO, Status, evaluate_claim
+from fleet_slip.evaluation.evaluated_drives import TestDrive, simulate_drives
 from fleet_slip.evaluation.evaluation_document import DRAWN_FILTERS, ReportData, latest_evaluation
 from fleet_slip.evaluation.evaluator import Estimator, evaluate
 from fleet_slip.evaluation.filters import linear_estimate, restore_filter, train_models
-from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import (
     Cell,
     Drawn,
     ReportTable,
-    Tile,
     count,
     degrees,
     draw,
@@ -43,27 +41,18 @@ def gather(warehouse: Warehouse, version: ModelVersion) -> ReportData:
     data = ReportData(version, document, trained, {})
     names = [name for name in data.scenarios if name in DRAWN_SCENARIOS]
     scenarios = [load_scenario(name, warehouse.configs) for name in names]
-    drives = simulate_drives(warehouse.catalog.signals, scenarios)
-    data = replace(data, runs={r.name: r for r in evaluate(drives, _drawn_estimators(data))})
-    data.require_unchanged()
-    return data
-
-
-def _drawn_estimators(data: ReportData) -> dict[str, Estimator[TestDrive]]:
-    """Restore the estimators that figures show from their descriptions in the evaluation."""
     about = data.estimators
-    models = {
+    estimators: dict[str, Estimator[TestDrive]] = {
         name: partial(linear_estimate, about[name]["intercept"], about[name]["coefficients"])
         for name in data.models.values()
     }
-    filters = {name: restore_filter(name, about[name]) for name in DRAWN_FILTERS if name in about}
-    return {**models, **filters}
-
-
-def _marked(text: str, good: bool) -> Cell:
-    cell = Cell(text)
-    cell.mark = "good" if good else ""
-    return cell
+    for name in DRAWN_FILTERS:
+        if name in about:
+            estimators[name] = restore_filter(name, about[name])
+    drives = simulate_drives(warehouse.catalog.signals, scenarios)
+    data = replace(data, runs={run.name: run for run in evaluate(drives, estimators)})
+    data.require_unchanged()
+    return data
 
 
 def table_one(data: ReportData) -> ReportTable:
@@ -72,16 +61,17 @@ def table_one(data: ReportData) -> ReportTable:
     rows: list[list[str]] = []
     selection = data.trained.selection
     for row in selection.models:
-        paper = PAPER_TABLE_ONE.get(row.name)
-        ours = _marked(number(row.correlation, 4), paper is not None and row.correlation >= paper)
+        paper, ours = PAPER_TABLE_ONE.get(row.name), number(row.correlation, 4)
+        if paper is not None and row.correlation >= paper:
+            ours = Cell(ours)
         error, rmse = f"± {number(row.standard_error, 4)}", degrees(row.pooled.rmse_deg)
         rows.append([row.name, ", ".join(row.signals), number(paper, 4), ours, error, rmse])
     noise = data.version.manifest.cross_validation.label_noise_deg
-    noise_text = "unknown" if noise is None else degrees(noise, 4)
     folds = selection.compared.folds
     note = (
         f"{folds.count} folds by {folds.by}, {count(selection.cohort.rows)} "
-        f"rows. {selection.winner.reason} Every RMSE includes the label noise: {noise_text}."
+        f"rows. {selection.winner.reason} Every RMSE includes the label noise: "
+        f"{'unknown' if noise is None else degrees(noise, 4)}."
     )
     caption = "Table I. Properties of the estimation models: cross-validated correlation"
     return ReportTable("table-1", caption, head, rows, text_columns=2, note=note)
@@ -95,16 +85,11 @@ def table_two(data: ReportData) -> ReportTable:
         if errors is None or errors.error_std_deg is None:
             continue
         mean, std = PAPER_TABLE_TWO[name]
-        rows.append(
-            [
-                name,
-                number(mean, 4, sign=True),
-                number(errors.error_mean_deg, 4, sign=True),
-                number(std, 4),
-                _marked(number(errors.error_std_deg, 4), errors.error_std_deg <= std),
-                number(errors.correlation, 4),
-            ]
-        )
+        means = (number(value, 4, sign=True) for value in (mean, errors.error_mean_deg))
+        ours, correlation = number(errors.error_std_deg, 4), number(errors.correlation, 4)
+        if errors.error_std_deg <= std:
+            ours = Cell(ours)
+        rows.append([name, *means, number(std, 4), ours, correlation])
     head = ["model", "mean, paper", "mean, ours", "std, paper", "std, ours", "correlation, ours"]
     caption = "Table II. Predictive accuracy on the nominal test drive: error in degrees"
     return ReportTable("table-2", caption, head, rows)
@@ -113,41 +98,34 @@ def table_two(data: ReportData) -> ReportTable:
 def render(data: ReportData, pictures: Sequence[Drawn]) -> str:
     """Return the page."""
     claims = [evaluate_claim(claim, data) for claim in CLAIMS]
-    counted = Counter(claim.status for claim in claims)
-    cohort = data.trained.selection.cohort
+    tally = {status: sum(claim.status == status for claim in claims) for status in Status}
+    cohort, reference = data.trained.selection.cohort, data.version.reference
+    trained, reproduced = data.version.manifest.trained_on, tally[Status.REPRODUCED]
+    testable = reproduced + tally[Status.NOT_REPRODUCED]
+    untested = f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here"
+    tiles = {
+        untested: f"{reproduced} of {testable}",
+        f"training rows of {pluralize(trained.drives, 'drive')}": count(trained.rows),
+    }
+    errors = data.statistics("nominal", reference)
+    if errors and errors.error_std_deg is not None:
+        tiles[f"error std of {reference} on the nominal drive"] = degrees(errors.error_std_deg)
     shipped = data.version.catalog.configs.names("scenarios")
-    reference = data.version.reference
     return fill_in(
         "report.html.j2",
         version=data.version,
         evaluation=data.document,
         paper=pictures,
         tables=[table_one(data), table_two(data)],
-        tiles=_tiles(data, counted),
+        tiles=tiles,
         claims=claims,
         present={"table-1", "table-2", *(drawn.picture.key for drawn in pictures)},
-        tally={status: counted[status] for status in Status},
+        tally=tally,
         measured=MEASURED in cohort.drives["source"].to_pylist(),
         missing=[name for name in shipped if name not in data.scenarios],
         cohort=cohort,
         commands=[f"fleet-slip evaluate {reference}", f"fleet-slip report {reference}"],
     )
-
-
-def _tiles(data: ReportData, tally: Counter[Status]) -> list[Tile]:
-    trained, reproduced = data.version.manifest.trained_on, tally[Status.REPRODUCED]
-    tiles = [
-        Tile(
-            f"{reproduced} of {reproduced + tally[Status.NOT_REPRODUCED]}",
-            f"testable claims reproduced; {tally[Status.NOT_TESTABLE]} cannot be tested here",
-        ),
-        Tile(count(trained.rows), f"training rows of {pluralize(trained.drives, 'drive')}"),
-    ]
-    errors = data.statistics("nominal", data.version.reference)
-    if errors and errors.error_std_deg is not None:
-        label = f"error std of {data.version.reference} on the nominal drive"
-        tiles.append(Tile(degrees(errors.error_std_deg), label))
-    return tiles
 
 
 PAGE = "report.html"

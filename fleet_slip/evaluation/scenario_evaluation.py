@@ -10,6 +10,15 @@ from typing import Any
 import numpy as np
 
 from fleet_slip.catalog.catalog import Catalog
+from fleet_slip.evaluation.evaluated_drives import (
+    CRITERIA,
+    LabelledDrive,
+    TestDrive,
+    blind_scenarios,
+    find_stretches,
+    predict_drive,
+    simulate_drives,
+)
 from fleet_slip.evaluation.evaluator import (
     Estimator,
     EvaluatedDrive,
@@ -21,18 +30,11 @@ from fleet_slip.evaluation.filters import (
     EstimatorBank,
     FilterEstimate,
     TrainedModels,
-    TuningDrives,
     filter_bank,
+    read_tuning_drives,
     train_models,
 )
-from fleet_slip.evaluation.labelled_drives import predict_drive
 from fleet_slip.evaluation.measured_evaluation import combined_estimate, pair_estimates
-from fleet_slip.evaluation.test_drives import (
-    TestDrive,
-    blind_scenarios,
-    find_stretches,
-    simulate_drives,
-)
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.models.score import calibrated_cars
@@ -56,10 +58,12 @@ def train_competitors(
         bank |= models.bank()
     predictor = Predictor.from_manifest(warehouse.catalog.signals, one_car.manifest)
     with_mass = "mass_kg" in predictor.plan.facts
-    drives = TuningDrives.choose(warehouse, trained[0].selection.cohort, with_mass=with_mass)
+    drives = read_tuning_drives(warehouse, trained[0].selection.cohort, with_mass=with_mass)
     car = load_scenario("nominal", warehouse.configs).car
-    bank |= filter_bank(drives, car, executor)
-    return trained, bank | combination_bank(drives, car, one_car, predictor, bank)
+    bank |= filter_bank(warehouse, drives, car, executor, with_mass=with_mass)
+    cars = calibrated_cars(warehouse) if predictor.plan.numbers else {}
+    line = partial(predict_drive, predictor, cars)
+    return trained, bank | combination_bank(drives, line, car, one_car.reference, bank)
 
 
 # Line and filter together, where the paper has its Kalman filter: without and with satellite
@@ -70,10 +74,10 @@ COMBINATIONS = {"combination": "ekf_class_tuned", "combination_gps": "kalman_tun
 
 
 def combination_bank(
-    drives: TuningDrives,
+    drives: Sequence[LabelledDrive],
+    line: Estimator[LabelledDrive],
     default_car: VehicleParameters,
-    version: ModelVersion,
-    predictor: Predictor,
+    model: str,
     bank: EstimatorBank,
 ) -> EstimatorBank:
     """Return the combinations of a model with filters that could be tuned, anchored at the model.
@@ -82,30 +86,27 @@ def combination_bank(
     accurate than the model of a fleet; so the combination adds to the model a bounded share of the
     difference.
     """
-    cars = calibrated_cars(drives.warehouse) if predictor.plan.numbers else {}
     combined: EstimatorBank = {}
     for name, filter_name in COMBINATIONS.items():
         filtered, about = bank[filter_name]
         if not isinstance(filtered, FilterEstimate) or not about["tuned_on"]:
             continue
         in_class_car = partial(filtered.on_labelled, default_car)
-        line = partial(predict_drive, predictor, cars)
         pairs = [
             pair_estimates(drive, line, in_class_car, drive.evaluated, number)
-            for number, drive in enumerate(drives.drives)
+            for number, drive in enumerate(drives)
         ]
         if not any(map(len, pairs)):
             continue
         combination = fit_combination(PairedEstimates.concatenate(pairs), "line_by_lateral")
-        both = bank[version.reference][0], filtered
         combined[name] = (
-            partial(combined_estimate, combination, *both),
+            partial(combined_estimate, combination, bank[model][0], filtered),
             {
                 "kind": "combination",
                 "group": GROUP,
                 "gps": about["gps"],
                 "told": "class",
-                "of": [version.reference, filter_name],
+                "of": [model, filter_name],
                 "combination": asdict(combination),
                 "tuned_on": about["tuned_on"],
             },
@@ -113,24 +114,33 @@ def combination_bank(
     return combined
 
 
-def evaluate_scenarios(
+def evaluate_simulated(
     warehouse: Warehouse,
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[Scenario] | None,
     one_car: ModelVersion,
     fleets: Sequence[ModelVersion],
     executor: Executor,
 ) -> dict[str, Any]:
-    """Evaluate a model and its competitors on scenarios; return the document."""
+    """Evaluate a model and its competitors; return the document.
+
+    The drives are those of the scenarios, or if None the blind drives of the model.
+    """
     (first, *fleet_models), bank = train_competitors(warehouse, one_car, fleets, executor)
     estimators = {name: estimator for name, (estimator, _) in bank.items()}
+    document = {
+        "format": 1,
+        "package_version": package_version("fleet-slip"),
+        "estimators": {name: about for name, (_, about) in bank.items()},
+    }
+    if scenarios is None:
+        drives = evaluate_blind_drives(warehouse.catalog, one_car.sha256, estimators)
+        return {**document, "model": one_car.reference, "drives": drives}
     runs = evaluate(simulate_drives(warehouse.catalog.signals, scenarios), estimators)
     not_ranked = {
         name for name, (_, about) in bank.items() if about.get("gps") or name in COMBINATIONS
     }
     return {
-        "format": 1,
-        "package_version": package_version("fleet-slip"),
-        "estimators": {name: about for name, (_, about) in bank.items()},
+        **document,
         "scenarios": [_scenario_document(run) for run in runs],
         "logs_version": first.selection.cohort.logs_version,
         "grams_version": first.selection.cohort.grams_version,
@@ -140,82 +150,6 @@ def evaluate_scenarios(
             for row in compare_models(runs, first.table_one, fleet.table_one)
         ],
         "ranking": rank(runs, first.version.reference, not_ranked),
-    }
-
-
-def evaluate_blind(
-    warehouse: Warehouse,
-    model: ModelVersion,
-    fleets: Sequence[ModelVersion],
-    executor: Executor,
-) -> dict[str, Any]:
-    """Evaluate on drives that follow from the model's hash; return the document."""
-    _, bank = train_competitors(warehouse, model, fleets, executor)
-    estimators = {name: estimator for name, (estimator, _) in bank.items()}
-    return {
-        "format": 1,
-        "package_version": package_version("fleet-slip"),
-        "model": model.reference,
-        "estimators": {name: about for name, (_, about) in bank.items()},
-        "drives": evaluate_blind_drives(warehouse.catalog, model.sha256, estimators),
-    }
-
-
-def _scenario_document(run: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
-    drive, scenario = run.drive, run.drive.scenario
-    sides = {
-        "inside": {section.name: run.within(section.rows) for section in drive.sections},
-        "outside": {section.name: run.within(~section.rows) for section in drive.sections},
-    }
-    return {
-        "name": scenario.name,
-        "description": scenario.description,
-        "paper": scenario.paper,
-        "drive_id": scenario.drive_id,
-        "vehicle_model": scenario.vehicle.name,
-        "sprung_mass_kg": scenario.car.body.sprung_mass_kg,
-        "adhesion": scenario.adhesion,
-        "track": scenario.way.name,
-        "failures": [failure.model_dump() for failure in scenario.failures],
-        "truth": _truth_document(drive),
-        "sections": [
-            {
-                "name": section.name,
-                "criterion": section.criterion,
-                "rows": int(section.rows.sum()),
-                "stretches": list(map(asdict, find_stretches(drive, section.rows))),
-            }
-            for section in drive.sections
-        ],
-        "results": {
-            name: {
-                **asdict(run.statistics[name]),
-                **{side: _section_errors(parts, name) for side, parts in sides.items()},
-            }
-            for name in run.estimates
-        },
-    }
-
-
-def _section_errors(
-    sections: Mapping[str, EvaluatedDrive[TestDrive]], estimator: str
-) -> dict[str, Any]:
-    return {name: asdict(part.statistics[estimator]) for name, part in sections.items()}
-
-
-def _truth_document(drive: TestDrive) -> dict[str, Any]:
-    sideslip_deg = np.degrees(drive.sideslip_rad[drive.evaluated])
-    ay = drive.ay_mps2 - drive.scenario.sensors.ay_bias_mps2
-    return {
-        "rows": len(drive.time_s),
-        "duration_s": len(drive.time_s) / 100,
-        "lost_control_s": drive.lost_control_s,
-        "sideslip_std_deg": float(sideslip_deg.std()),
-        "sideslip_max_deg": float(np.abs(sideslip_deg).max()),
-        "speed_min_mps": float(drive.speed_mps.min()),
-        "speed_max_mps": float(drive.speed_mps.max()),
-        "lateral_offset_max_m": float(np.abs(drive.lateral_offset_m).max()),
-        "lateral_acceleration_p99_mps2": float(np.nanquantile(np.abs(ay), 0.99)),
     }
 
 
@@ -234,17 +168,60 @@ def evaluate_blind_drives(
         for run in runs:
             groups.setdefault(run.name.split("_")[word], []).append(run)
     groups |= {run.name: [run] for run in runs}
-    return [_group_document(name, group) for name, group in groups.items()]
+    documents = []
+    for name, group in groups.items():
+        truth = np.concatenate([run.drive.sideslip_rad[run.rows] for run in group])
+        documents.append(
+            {
+                "name": name,
+                "drives": len(group),
+                "sideslip_std_deg": float(np.degrees(truth.std())),
+                "results": {key: asdict(row) for key, row in pooled_statistics(group).items()},
+            }
+        )
+    return documents
 
 
-def _group_document(name: str, runs: Sequence[EvaluatedDrive[TestDrive]]) -> dict[str, Any]:
-    truth = np.concatenate([run.drive.sideslip_rad[run.rows] for run in runs])
-    errors = pooled_statistics(runs)
+def _scenario_document(run: EvaluatedDrive[TestDrive]) -> dict[str, Any]:
+    drive, scenario, sections = run.drive, run.drive.scenario, run.drive.sections
+    results = {name: asdict(statistics) for name, statistics in run.statistics.items()}
+    for side, sign in (("inside", True), ("outside", False)):
+        parts = {name: run.within(rows == sign) for name, rows in sections.items()}
+        for estimator, result in results.items():
+            result[side] = {n: asdict(part.statistics[estimator]) for n, part in parts.items()}
+    sideslip_deg = np.degrees(drive.sideslip_rad[drive.evaluated])
+    ay = drive.ay_mps2 - drive.scenario.sensors.ay_bias_mps2
     return {
-        "name": name,
-        "drives": len(runs),
-        "sideslip_std_deg": float(np.degrees(truth.std())),
-        "results": {estimator: asdict(statistics) for estimator, statistics in errors.items()},
+        "name": scenario.name,
+        "description": scenario.description,
+        "paper": scenario.paper,
+        "drive_id": scenario.drive_id,
+        "vehicle_model": scenario.vehicle.name,
+        "sprung_mass_kg": scenario.car.body.sprung_mass_kg,
+        "adhesion": scenario.adhesion,
+        "track": scenario.way.name,
+        "failures": [failure.model_dump() for failure in scenario.failures],
+        "truth": {
+            "rows": len(drive.time_s),
+            "duration_s": len(drive.time_s) / 100,
+            "lost_control_s": drive.lost_control_s,
+            "sideslip_std_deg": float(sideslip_deg.std()),
+            "sideslip_max_deg": float(np.abs(sideslip_deg).max()),
+            "speed_min_mps": float(drive.speed_mps.min()),
+            "speed_max_mps": float(drive.speed_mps.max()),
+            "lateral_offset_max_m": float(np.abs(drive.lateral_offset_m).max()),
+            "lateral_acceleration_p99_mps2": float(np.nanquantile(np.abs(ay), 0.99)),
+        },
+        "sections": [
+            {
+                "name": name,
+                "criterion": CRITERIA[name],
+                "rows": int(rows.sum()),
+                "stretches": find_stretches(drive, rows),
+            }
+            for name, rows in sections.items()
+        ],
+        "results": results,
     }
 
 
@@ -265,15 +242,34 @@ def rank(
 ) -> dict[str, Any]:
     """Rank an estimator on every drive against all but `excluded`; it wins a tie.
 
-    Returns the section of a document. Drives that differ in satellite navigation alone count once:
-    `same_as` names the first.
+    Returns the section of a document, where the winner is None without competitors. Drives that
+    differ in satellite navigation alone count once: `same_as` names the first.
     """
     first: dict[Any, str] = {}
-    standings = []
+    standings: list[dict[str, Any]] = []
     for run in runs:
+        errors = {
+            name: statistics.rmse_deg
+            for name, statistics in run.statistics.items()
+            if name not in excluded
+            and statistics.rmse_deg is not None
+            and statistics.coverage >= MIN_COVERAGE
+        }
+        rmse_deg = errors.get(estimator)
+        winner = min(errors, key=lambda name: (errors[name], name != estimator), default="")
+        winner_deg = errors.get(winner)
         key = _without_gps(run.drive.scenario)
-        standing = {"scenario": run.name, **_standing(run, estimator, excluded)}
-        standings.append({**standing, "same_as": first.get(key)})
+        standings.append(
+            {
+                "scenario": run.name,
+                "winner": winner or None,
+                "winner_rmse_deg": winner_deg,
+                "rmse_deg": rmse_deg,
+                "won": winner == estimator,
+                "ratio": rmse_deg / winner_deg if rmse_deg is not None and winner_deg else None,
+                "same_as": first.get(key),
+            }
+        )
         first.setdefault(key, run.name)
     counted = [standing for standing in standings if standing["same_as"] is None]
     lost = [row["ratio"] for row in counted if row["ratio"] is not None and not row["won"]]
@@ -294,29 +290,6 @@ def _without_gps(scenario: Scenario) -> tuple[str, tuple[Failure, ...]]:
     drive = scenario.model_copy(update={"drive": "any", "sensors": sensors}).batch()
     failures = tuple(f for f in scenario.failures if not set(f.signals) <= set(GPS_SIGNALS))
     return drive.digest, failures
-
-
-def _standing(
-    run: EvaluatedDrive[TestDrive], estimator: str, excluded: Collection[str]
-) -> dict[str, Any]:
-    """Return the best estimator of a drive (None without competitors), and this one's verdict."""
-    errors = {
-        name: statistics.rmse_deg
-        for name, statistics in run.statistics.items()
-        if name not in excluded
-        and statistics.rmse_deg is not None
-        and statistics.coverage >= MIN_COVERAGE
-    }
-    rmse_deg = errors.get(estimator)
-    winner = min(errors, key=lambda name: (errors[name], name != estimator), default=None)
-    winner_deg = errors[winner] if winner else None
-    return {
-        "winner": winner,
-        "winner_rmse_deg": winner_deg,
-        "rmse_deg": rmse_deg,
-        "won": winner == estimator,
-        "ratio": rmse_deg / winner_deg if rmse_deg is not None and winner_deg else None,
-    }
 
 
 def compare_models(

@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,20 +15,17 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.base import pluralize
 from fleet_slip.catalog.signals import MEASURED, SAMPLE_TIME_S
 from fleet_slip.errors import ConfigError, DataError, QuestionError, UsageError
-from fleet_slip.evaluation.test_drives import simulate_drives
+from fleet_slip.evaluation.evaluated_drives import simulate_drives
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.pages.page import fill_in
 from fleet_slip.quality.drive_signals import RADIUS_M
 from fleet_slip.resources import Configs
-from fleet_slip.simulation.roads import Track, load_track
+from fleet_slip.simulation.roads import load_track
 from fleet_slip.simulation.scenario import load_scenario
 from fleet_slip.simulation.simulate import MOTION
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.views import open_views
 from fleet_slip.warehouse.warehouse import Warehouse
-
-if TYPE_CHECKING:
-    pass
 
 FRAMES_PER_S = 25
 SPACING_M = 3.0
@@ -90,16 +88,13 @@ class DriveFrames:
         return replace(self, **series)
 
 
-def is_scenario(name: str, configs: Configs) -> bool:
-    """Return True for the name or path of a scenario, False for a drive."""
-    return name.endswith(".toml") or name in configs.names("scenarios")
-
-
 def drive_frames(warehouse: Warehouse, name: str, version: ModelVersion) -> DriveFrames:
-    """Return the frames of a drive of the logs, by its id, its name, or its file's name.
+    """Return the frames of a scenario, or of a drive by its id, its name, or its file's name.
 
     Raises `QuestionError` if there is no such drive, or several.
     """
+    if name.endswith(".toml") or name in warehouse.configs.names("scenarios"):
+        return scenario_frames(name, version)
     names = [signal.column for signal in warehouse.catalog.signals.signals.values()]
     query = f"SELECT time_s, source, track, vehicle_model, mass_kg, {', '.join(names)} FROM log"
     with open_views(warehouse, f"{query}, drives") as database:
@@ -197,8 +192,9 @@ def _places(
 ) -> tuple[FloatArray, FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
     """Return x, y and heading of the car, and the centre line of its track if it has one."""
     station, offset = columns["station_m"], columns["lateral_offset_m"]
-    empty = np.empty(0)
-    track = _find_track(facts.get("track"), configs)
+    track, name = None, facts.get("track")
+    with suppress(ConfigError):  # a road of highway-env, or a file that is not here
+        track = load_track(name, configs) if name else None
     if track and np.isfinite(station).all():
         line = track.centre_line(SPACING_M)
         # The log has stations in steps of 0.25 m, which the car would jump.
@@ -212,15 +208,7 @@ def _places(
     heading = np.cumsum(np.nan_to_num(columns["yaw_rate_rad_s"]) * step)
     x = np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * step)
     y = np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * step)
-    return x, y, heading, (empty, empty)
-
-
-def _find_track(name: str | None, configs: Configs) -> Track | None:
-    """Return a track by name; None for a road of highway-env, or a file that is not here."""
-    try:
-        return load_track(name, configs) if name else None
-    except ConfigError:
-        return None
+    return x, y, heading, (np.empty(0), np.empty(0))
 
 
 def write_page(frames: DriveFrames, file: Path) -> None:
@@ -230,29 +218,30 @@ def write_page(frames: DriveFrames, file: Path) -> None:
 
 def render_watch(frames: DriveFrames) -> str:
     """Return the page."""
-    text = json.dumps(_data(frames), separators=(",", ":"), allow_nan=False)
-    # Within a script element only this could end it.
-    data = Markup(text.replace("<", "\\u003c"))  # noqa: S704
-    return fill_in("watch.html.j2", frames=frames, data=data)
-
-
-def _data(frames: DriveFrames) -> dict[str, Any]:
     wheels = frames.wheel_rad_s
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = wheels.mean(axis=0)
         excess = 100 * np.where(mean > 1, wheels / mean - 1, np.nan)
-    return {
-        "t": _listed(frames.time_s, 2),
-        "speed": _listed(frames.speed_mps, 2),
-        "x": _listed(frames.x_m, 2),
-        "y": _listed(frames.y_m, 2),
-        "heading": _listed(frames.heading_rad, 4),
-        "beta": _listed(frames.sideslip_deg, 3),
-        "estimate": _listed(frames.estimate_deg, 3),
-        "steer": _listed(frames.steer_rad, 4),
-        "wheels": [_listed(wheel, 2) for wheel in excess],
-        "track": [_listed(axis, 1) for axis in frames.track],
+    series = {
+        "t": (frames.time_s, 2),
+        "speed": (frames.speed_mps, 2),
+        "x": (frames.x_m, 2),
+        "y": (frames.y_m, 2),
+        "heading": (frames.heading_rad, 4),
+        "beta": (frames.sideslip_deg, 3),
+        "estimate": (frames.estimate_deg, 3),
+        "steer": (frames.steer_rad, 4),
     }
+    data: dict[str, Any] = {name: _listed(*values) for name, values in series.items()}
+    data["wheels"] = [_listed(wheel, 2) for wheel in excess]
+    data["track"] = [_listed(axis, 1) for axis in frames.track]
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    # Within a script element only this could end it.
+    return fill_in(
+        "watch.html.j2",
+        frames=frames,
+        data=Markup(text.replace("<", "\\u003c")),  # noqa: S704
+    )
 
 
 def _listed(values: FloatArray, digits: int) -> list[float | None]:
@@ -267,4 +256,4 @@ def scenario_frames(name: str, version: ModelVersion) -> DriveFrames:
     motion = {column: getattr(drive, column) for column in ("sideslip_rad", *MOTION)}
     facts = {**drive.vehicle_attributes, "track": scenario.way.name, "drive_id": scenario.drive_id}
     title = f"{scenario.name}: {scenario.description}"
-    return frames_of(title, {**drive.signals, **motion}, facts, drive.time_s, version)
+    return frames_of(title, {**drive.columns, **motion}, facts, drive.time_s, version)

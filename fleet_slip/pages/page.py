@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib as mpl
 from jinja2 import Environment, FunctionLoader, StrictUndefined
@@ -242,9 +242,9 @@ def rich_text(text: str, present: Collection[str] = ()) -> Markup:
 
 
 class Cell(str):
-    """A table cell, marked as good."""
+    """A table cell that is marked as good."""
 
-    mark: Literal["", "good"] = ""
+    mark = "good"
 
 
 @dataclass(frozen=True)
@@ -257,14 +257,6 @@ class ReportTable:
     rows: Sequence[Sequence[str]]
     text_columns: int = 1
     note: str = ""
-
-
-@dataclass(frozen=True)
-class Tile:
-    """One number of a page's summary."""
-
-    value: str
-    label: str
 
 
 TEMPLATES = files("fleet_slip.pages") / "templates"

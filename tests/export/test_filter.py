@@ -14,6 +14,7 @@ from fleet_slip.columns.lowering import Lowering, largest_in, ranges_of
 from fleet_slip.columns.observer import ANGLE_RAD
 from fleet_slip.errors import RefusedError
 from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation.evaluated_drives import LabelledDrive
 from fleet_slip.evaluation.filter_column import observer_of
 from fleet_slip.evaluation.identify import (
     NOISE_NAMES,
@@ -23,7 +24,6 @@ from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
     vehicle_with_fit,
 )
-from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.export.c import count_costs
 from fleet_slip.export.files import export_files, program_content, with_states
 from fleet_slip.export.program import UNKNOWN_CAR, Program

@@ -10,8 +10,8 @@ import pytest
 import fleet_slip
 from fleet_slip.evaluation import filter_column, measured_evaluation
 from fleet_slip.evaluation.ekf import EkfNoise
+from fleet_slip.evaluation.evaluated_drives import QUARTERS, LabelledDrive, Segments
 from fleet_slip.evaluation.identify import FitParameters, IdentifiedVehicle, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import QUARTERS, LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import MAX_GROUPS, inner_groups
 from fleet_slip.ingest.mapping import load_mapping
 from fleet_slip.models.acceptance import load_thresholds, threshold_violations

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleet_slip.errors import ConfigError
-from fleet_slip.evaluation.test_drives import blind_scenarios
+from fleet_slip.evaluation.evaluated_drives import blind_scenarios
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, DriveSpec, load_campaign
 from fleet_slip.simulation.roads import SLOWEST_MPS, Manoeuvre, load_track, road_with

@@ -6,8 +6,8 @@ from datetime import date
 import numpy as np
 
 from fleet_slip.arrays import BoolArray, FloatArray
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals, LabelledDrive
-from fleet_slip.evaluation.single_track import loaded_axles
+from fleet_slip.evaluation.ekf import loaded_axles
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals, LabelledDrive
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.campaign import Batch, load_campaign
 from fleet_slip.simulation.simulate import simulate_batch

@@ -15,8 +15,8 @@ from benchmarks.rivals.inputs import Inputs, LearnedEstimate, RowSample, draw_sa
 from benchmarks.rivals.learners import FittedLearner, hold_back, one_thread
 from benchmarks.rivals.tree_filter import LeafNoise, TreeFilter, fit_tree_filter
 from fleet_slip.evaluation import ekf
+from fleet_slip.evaluation.evaluated_drives import LabelledDrive
 from fleet_slip.evaluation.filters import FILTERS, FilterEstimate
-from fleet_slip.evaluation.labelled_drives import LabelledDrive
 from fleet_slip.grams.cohort import load_cohort
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.storage.local import LocalFolder

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from fleet_slip.cli.output import print_parts
 from fleet_slip.evaluation import scenario_evaluation
+from fleet_slip.evaluation.evaluated_drives import TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.evaluation.evaluation_document import Evaluation
 from fleet_slip.evaluation.scenario_evaluation import evaluate_blind_drives
-from fleet_slip.evaluation.test_drives import TestDrive, blind_scenarios, simulate_drives
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Scenario, load_scenario
 from fleet_slip.simulation.simulate import simulate_logs
@@ -45,9 +45,9 @@ def test_signals_are_quantised_as_in_a_log_and_the_truth_is_exact() -> None:
     for name in SIGNALS.inputs:
         one = SIGNALS[name]
         np.testing.assert_array_equal(
-            np.rint(drive.signals[one.column] / float(one.scale)), log.measurement.counts[name]
+            np.rint(drive.columns[one.column] / float(one.scale)), log.measurement.counts[name]
         )
-    np.testing.assert_array_equal(np.isfinite(drive.signals["gps_vx_mps"]), log.measurement.gps_fix)
+    np.testing.assert_array_equal(np.isfinite(drive.columns["gps_vx_mps"]), log.measurement.gps_fix)
     scale = float(SIGNALS["vy"].scale)
     assert np.abs(drive.vy_mps - scale * log.measurement.counts["vy"]).max() <= scale / 2 + 1e-12
     assert len(np.unique(drive.vy_mps)) > 0.99 * len(drive.vy_mps), "no counts"

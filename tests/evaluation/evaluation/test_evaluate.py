@@ -14,6 +14,7 @@ import fleet_slip
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError, RefusedError
 from fleet_slip.evaluation import kalman
+from fleet_slip.evaluation.evaluated_drives import TestDrive, read_drive, simulate_drives
 from fleet_slip.evaluation.evaluation_document import store_evaluation
 from fleet_slip.evaluation.evaluator import EvaluatedDrive, evaluate
 from fleet_slip.evaluation.filters import (
@@ -23,15 +24,14 @@ from fleet_slip.evaluation.filters import (
     class_car,
     published_estimate,
 )
-from fleet_slip.evaluation.labelled_drives import read_drive
 from fleet_slip.evaluation.scenario_evaluation import rank
-from fleet_slip.evaluation.test_drives import TestDrive, simulate_drives, visible_signals
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import Registry
 from fleet_slip.models.score import score
 from fleet_slip.regression.combination import EstimateCombination
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Scenario, load_scenario
+from fleet_slip.simulation.sensors import GPS_SIGNALS
 from fleet_slip.storage.documents import DocumentFolder, Inventory
 from fleet_slip.storage.local import LocalFolder
 from fleet_slip.vehicle.parameters import load_vehicle
@@ -182,7 +182,7 @@ def test_a_missing_signal_lowers_the_coverage_of_models_with_it(again: Any) -> N
 
 def test_an_estimator_does_not_see_the_truth(root: Path) -> None:
     (drive,) = simulate_drives(SIGNALS, [load_scenario("nominal", SHIPPED_CONFIGS)])
-    assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.signals)
+    assert not {"vx_mps", "vy_mps", "sideslip_rad", "station_m"} & set(drive.columns)
     manifest = Registry(LocalFolder(root), CATALOG).resolve("smoke").manifest
     estimate = published_estimate(SIGNALS, Predictor.from_manifest(SIGNALS, manifest), drive)
     assert np.corrcoef(estimate, drive.sideslip_rad)[0, 1] > 0.9
@@ -238,7 +238,7 @@ ROWS = 1000
 def drive(scenario: Scenario) -> TestDrive:
     """Return a drive straight ahead: the estimate is the error."""
     zeros, speed = np.zeros(ROWS), np.full(ROWS, 20.0)
-    signals = {SIGNALS[name].column: zeros for name in visible_signals(SIGNALS)}
+    signals = {SIGNALS[name].column: zeros for name in (*SIGNALS.inputs, *GPS_SIGNALS)}
     time_s = np.arange(ROWS) / 100
     return TestDrive(scenario, time_s, signals, speed, zeros, zeros, zeros, None)
 

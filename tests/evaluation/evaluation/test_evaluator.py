@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 
 from fleet_slip.arrays import BoolArray, FloatArray
+from fleet_slip.evaluation.evaluated_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.evaluator import (
     MissingSignalError,
     evaluate,
@@ -15,7 +16,6 @@ from fleet_slip.evaluation.evaluator import (
     pooled_statistics,
     variation_between_drives,
 )
-from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import FittedEstimator, cross_fitted, folds_of
 
 ROWS = 100

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from fleet_slip.errors import QuestionError
+from fleet_slip.evaluation.evaluated_drives import TestDrive, apply_failure, join, peak_slip
 from fleet_slip.evaluation.evaluator import error_statistics
 from fleet_slip.evaluation.filters import linear_estimate
-from fleet_slip.evaluation.test_drives import TestDrive, apply_failure, join, peak_slip
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.simulation.scenario import Failure, load_scenario
 from fleet_slip.vehicle.dynamics import cornering_stiffness

@@ -11,8 +11,8 @@ import pytest
 import fleet_slip
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, filters, measured_evaluation
+from fleet_slip.evaluation.evaluated_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.identify import IdentifiedVehicle, TuningResult, vehicle_with_fit
-from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive, Segments
 from fleet_slip.evaluation.measured_evaluation import (
     Learner,
     folds_by_kind,

@@ -7,14 +7,22 @@ from hypothesis import strategies as st
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import ekf
-from fleet_slip.evaluation.ekf import EkfNoise, axles_of, variances
+from fleet_slip.evaluation.ekf import (
+    Axles,
+    EkfNoise,
+    Rates,
+    axles_of,
+    lateral_force,
+    loaded_axles,
+    rates,
+    variances,
+)
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals
 from fleet_slip.evaluation.kalman import (
     GaussianState,
     independent_state,
     measurement_update,
 )
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals
-from fleet_slip.evaluation.single_track import Axles, Rates, lateral_force, loaded_axles, rates
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import constants, load_vehicle
 from tests.support.drives import noisy, rolling_drive, steady_sideslip_rad

@@ -12,7 +12,7 @@ import pytest
 from fleet_slip.arrays import FloatArray
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
-from fleet_slip.evaluation.labelled_drives import LabelledDrive
+from fleet_slip.evaluation.evaluated_drives import LabelledDrive
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import mirrored, noisy, rolling_drive, simulated_drive, slalom

@@ -12,6 +12,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.config import Config
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import ekf, kalman
+from fleet_slip.evaluation.evaluated_drives import DriveSignals, LabelledDrive
 from fleet_slip.evaluation.filters import checksum_of_sources
 from fleet_slip.evaluation.identify import (
     IdentifiedVehicle,
@@ -22,7 +23,6 @@ from fleet_slip.evaluation.identify import (
     vehicle_with_fit,
 )
 from fleet_slip.evaluation.kalman import FilterNoise
-from fleet_slip.evaluation.labelled_drives import DriveSignals, LabelledDrive
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import VehicleMeasures, VehicleParameters, load_vehicle
 from tests.support.drives import noisy, simulated_drive, slalom

@@ -11,6 +11,7 @@ from fleet_slip.arrays import FloatArray
 from fleet_slip.compiling import kernel
 from fleet_slip.errors import DataError
 from fleet_slip.evaluation import kalman
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals
 from fleet_slip.evaluation.kalman import (
     FilterNoise,
     GaussianState,
@@ -20,7 +21,6 @@ from fleet_slip.evaluation.kalman import (
     update,
     variances,
 )
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import (

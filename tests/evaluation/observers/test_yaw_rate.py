@@ -7,9 +7,8 @@ import pytest
 
 from fleet_slip.arrays import FloatArray
 from fleet_slip.evaluation import kalman
-from fleet_slip.evaluation.kalman import YawRateNoise
-from fleet_slip.evaluation.labelled_drives import STEP_S, DriveSignals
-from fleet_slip.evaluation.single_track import measured_speed_mps, undriven_axle
+from fleet_slip.evaluation.evaluated_drives import STEP_S, DriveSignals
+from fleet_slip.evaluation.kalman import YawRateNoise, measured_speed_mps, undriven_axle
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle.parameters import load_vehicle
 from tests.support.drives import noisy, rolling_drive, slalom
