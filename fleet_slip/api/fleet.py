@@ -402,8 +402,8 @@ class Fleet:
 
         files = None
         if cohort:
-            predicate = parse_cohort(self.warehouse.catalog.signals, cohort)
-            files = cohort_files(self.warehouse, predicate)
+            signals = self.warehouse.catalog.signals
+            files = cohort_files(self.warehouse, parse_cohort(signals, cohort))
         with calls.open_workers(self.root, workers) as executor, step("gram") as figures:
             report = update_grams(
                 calls.for_workers(self.warehouse, executor),

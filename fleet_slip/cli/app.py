@@ -8,7 +8,6 @@ import sys
 from collections.abc import Mapping
 from functools import cache, partial
 from importlib import import_module
-from importlib.abc import InspectLoader
 from importlib.util import find_spec
 from types import CodeType, FunctionType
 from typing import Annotated, Any
@@ -107,15 +106,11 @@ def load_command(name: str) -> Any:
 def docstrings(module: str) -> Mapping[str, str]:
     """Return the docstrings of a module's functions by name, without importing the module."""
     name = f"fleet_slip.cli.{module}"
-    spec = find_spec(name)
-    loader = spec.loader if spec else None
-    compiled = loader.get_code(name) if isinstance(loader, InspectLoader) else None
-    codes = [code for code in compiled.co_consts if isinstance(code, CodeType)] if compiled else []
-    return {
-        code.co_name: inspect.cleandoc(FunctionType(code, {}).__doc__ or "")
-        for code in codes
-        if not code.co_freevars
-    }
+    spec: Any = find_spec(name)
+    compiled = spec.loader.get_code(name)
+    codes = [code for code in compiled.co_consts if isinstance(code, CodeType)]
+    functions = [FunctionType(code, {}) for code in codes if not code.co_freevars]
+    return {f.__name__: inspect.cleandoc(f.__doc__ or "") for f in functions}
 
 
 EXIT_CODES = {
