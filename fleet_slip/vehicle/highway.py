@@ -18,7 +18,7 @@ from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
 from fleet_slip.arrays import FloatArray, IntArray
-from fleet_slip.compiling import equation, kernel
+from fleet_slip.compiling import kernel
 from fleet_slip.errors import RefusedError
 from fleet_slip.resources import SHIPPED_CONFIGS
 from fleet_slip.vehicle import batch
@@ -47,7 +47,6 @@ from fleet_slip.vehicle.integration import (
     PoseSlopes,
     Slopes,
     advance_car,
-    extrapolate,
 )
 from fleet_slip.vehicle.parameters import (
     PERFECT,
@@ -68,14 +67,6 @@ MIN_SCALE = 1e-3
 """Lower bound of the scale of a quantity, in SI units: a yaw rate on a straight is rounding."""
 AXLES = ("MASS", "INERTIA_Z", "LENGTH_A", "LENGTH_B", "FRICTION_FRONT", "FRICTION_REAR")
 BICYCLE_STATE = ("x", "y", "heading", "speed", "lateral speed", "yaw rate")
-
-
-class PlanePose(NamedTuple):
-    """Position and heading in highway-env's plane, or their rates."""
-
-    x: float
-    y: float
-    heading: float
 
 
 AT_REST = Motion(
@@ -111,17 +102,9 @@ def _rates_on_axles(
     return body_acceleration(x, Wheels(half_front, half_front, half_rear, half_rear), c)
 
 
-@equation
-def _plane_rates(x: State, heading: float) -> PlanePose:
-    cosine, sine = math.cos(heading), math.sin(heading)
-    return PlanePose(x.vx * cosine - x.vy * sine, x.vx * sine + x.vy * cosine, x.yaw_rate)
-
-
 @kernel
 def _steps(
     motion: Motion,
-    plane: PlanePose,
-    plane_rates: PlanePose,
     u: Controls,
     path: Path,
     environment: Environment,
@@ -130,21 +113,12 @@ def _steps(
     step: float,
     count: int,
     order: float,
-) -> tuple[Motion, PlanePose, PlanePose, tuple[float, float]]:
-    """Advance a car on its road and in the plane; also return its specific force at the start."""
-    force = (0.0, 0.0)
-    for k in range(count):
-        rates = _plane_rates(motion.state, plane.heading)
-        plane = PlanePose(
-            plane.x + step * extrapolate(rates.x, plane_rates.x, order),
-            plane.y + step * extrapolate(rates.y, plane_rates.y, order),
-            plane.heading + step * extrapolate(rates.heading, plane_rates.heading, order),
-        )
-        motion, ax, ay = advance_car(motion, u, path, environment, c, t, step, order)
-        if k == 0:
-            force = (ax, ay)
-        plane_rates, order = rates, SECOND_ORDER
-    return motion, plane, plane_rates, force
+) -> tuple[Motion, tuple[float, float]]:
+    """Advance a car on its road; also return its specific force at the start."""
+    motion, ax, ay = advance_car(motion, u, path, environment, c, t, step, order)
+    for _ in range(count - 1):
+        motion, _, _ = advance_car(motion, u, path, environment, c, t, step, SECOND_ORDER)
+    return motion, (ax, ay)
 
 
 class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
@@ -211,7 +185,6 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         state = State(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, *(rolling,) * 4)
         self.last_motion = AT_REST._replace(state=state)
         self.force = (0.0, 0.0)
-        self._plane_rates = PlanePose(0.0, 0.0, 0.0)
         self._step_s = 0.0
 
     @classmethod
@@ -261,15 +234,13 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         return _rates(x, self.controls, compliance, self.environment, self.constants, imperfections)
 
     def step(self, dt: float) -> None:
-        """Advance by `dt` seconds in steps of at most `STEP_S`."""
+        """Advance by `dt` seconds in steps of at most `STEP_S`; in the plane by mean velocities."""
         self.clip_actions()
         count = max(1, math.ceil(dt / STEP_S - 1e-9))
-        step_s = dt / count
+        step_s, before = dt / count, self.motion
         order = SECOND_ORDER if step_s == self._step_s else FIRST_ORDER
-        self.last_motion, plane, self._plane_rates, self.force = _steps(
-            self.last_motion._replace(state=self.motion),
-            PlanePose(float(self.position[0]), float(self.position[1]), float(self.heading)),
-            self._plane_rates,
+        self.last_motion, self.force = _steps(
+            self.last_motion._replace(state=before),
             self.controls,
             self.path,
             self.environment,
@@ -280,8 +251,11 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
             order,
         )
         self._step_s = step_s
-        self.position, self.heading = np.array([plane.x, plane.y]), plane.heading
-        self.speed, self.lateral_speed, self.yaw_rate = self.last_motion.state[:3]
+        self.speed, self.lateral_speed, self.yaw_rate = after = self.last_motion.state[:3]
+        vx, vy, yaw_rate = np.add(before[:3], after) / 2
+        velocity = _plane_velocity(self.heading + dt * yaw_rate / 2, vx, vy)
+        self.position = self.position + dt * np.array(velocity)
+        self.heading = float(self.heading + dt * yaw_rate)
         self.on_state_update()
 
 
