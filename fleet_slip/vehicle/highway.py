@@ -29,13 +29,11 @@ from fleet_slip.vehicle.dynamics import (
     Acceleration,
     Compliance,
     ComplianceRates,
-    Derivative,
     Environment,
     WheelForce,
     Wheels,
     body_acceleration,
     cornering_stiffness,
-    imperfect_derivative,
 )
 from fleet_slip.vehicle.integration import (
     FIRST_ORDER,
@@ -78,18 +76,6 @@ AT_REST = Motion(
     PoseSlopes(*len(PoseSlopes._fields) * (0.0,)),
 )
 STRAIGHT = Path(*len(Path._fields) * (0.0,))
-
-
-@kernel
-def _rates(
-    x: State,
-    u: Controls,
-    compliance: Compliance,
-    environment: Environment,
-    c: Constants,
-    t: ImperfectionConstants,
-) -> Derivative:
-    return imperfect_derivative(x, u, compliance, environment, c, t)[0]
 
 
 @kernel
@@ -221,18 +207,6 @@ class FourWheelVehicle(BicycleVehicle):  # type: ignore[misc]
         """Velocity of the centre of gravity in highway-env's plane, shape (2,), in m/s."""
         return np.array(_plane_velocity(self.heading, self.speed, self.lateral_speed))
 
-    def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
-        """Return the rates of the state (x, y, heading, vx, vy, yaw rate), shape (6, 1)."""
-        del time
-        heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
-        rates = self._rates_of(self.last_motion.state._replace(vx=vx, vy=vy, yaw_rate=yaw_rate))
-        pose_rates = (*_plane_velocity(heading, vx, vy), yaw_rate)
-        return np.array([*pose_rates, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
-
-    def _rates_of(self, x: State) -> Derivative | Acceleration:
-        compliance, imperfections = self.last_motion.compliance, self.imperfection_constants
-        return _rates(x, self.controls, compliance, self.environment, self.constants, imperfections)
-
     def step(self, dt: float) -> None:
         """Advance by `dt` seconds in steps of at most `STEP_S`; in the plane by mean velocities."""
         self.clip_actions()
@@ -276,14 +250,19 @@ class LinearTyreVehicle(FourWheelVehicle):
 
     step = BicycleVehicle.step
 
-    def _rates_of(self, x: State) -> Acceleration:
-        """Return the motion of the body under the forces of linear axles."""
+    def derivative_func(self, time: float, state: FloatArray, **_: Any) -> Any:
+        """Return the rates of the state (x, y, heading, vx, vy, yaw rate), shape (6, 1)."""
+        del time
+        heading, vx, vy, yaw_rate = (float(value) for value in state[2:, 0])
+        x = self.last_motion.state._replace(vx=vx, vy=vy, yaw_rate=yaw_rate)
         c = self.constants._replace(drag_per_mass=0.0)
-        slip_front = self.action["steering"] - math.atan2(x.vy + c.front * x.yaw_rate, x.vx)
-        slip_rear = -math.atan2(x.vy - c.rear * x.yaw_rate, x.vx)
-        along = c.mass * (self.action["acceleration"] - x.yaw_rate * x.vy)
+        slip_front = self.action["steering"] - math.atan2(vy + c.front * yaw_rate, vx)
+        slip_rear = -math.atan2(vy - c.rear * yaw_rate, vx)
+        along = c.mass * (self.action["acceleration"] - yaw_rate * vy)
         front, rear = 2 * self.FRICTION_FRONT * slip_front, 2 * self.FRICTION_REAR * slip_rear
-        return _rates_on_axles(x, along, front, rear, c)
+        rates = _rates_on_axles(x, along, front, rear, c)
+        pose_rates = (*_plane_velocity(heading, vx, vy), yaw_rate)
+        return np.array([*pose_rates, rates.vx, rates.vy, rates.yaw_rate])[:, np.newaxis]
 
 
 class HighwayLanes:
