@@ -110,7 +110,7 @@ def assess_course_label(
     if not change_s:
         return None
     straight: list[FloatArray] = []
-    turned = square = rows = 0.0
+    turning = np.zeros(3)
     with open_grams(warehouse, feature_set, predicate) as opened:
         for batch in opened.batches(predicate):
             for names, same, _ in by_signals(batch):
@@ -118,10 +118,9 @@ def assess_course_label(
                     continue
                 table = gram_table(names, same)
                 straight.append(_straight_squares(table))
-                at = table.signals.index(TURNED)
-                turned += float(table.sums[:, at].astype(np.float64).sum())
-                square += float(table.products[:, packed_position(at, at)].astype(np.float64).sum())
-                rows += float(table.n.sum())
+                moments = table.restrict([TURNED]).moments().sum(axis=0)
+                turning += moments[[0, 0, 1], [0, 1, 1]]
+    rows, turned, square = turning.tolist()
     scale = math.degrees(catalog.input_scales[catalog.signals.label])
     noise, error = _estimate_noise(np.concatenate([*straight, np.zeros((2, 0))], axis=1), scale)
     remaining = None

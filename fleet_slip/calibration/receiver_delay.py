@@ -132,14 +132,10 @@ def receiver_delays(rows_of_delay: Iterable[pa.RecordBatch]) -> ReceiverDelays:
 
 def _about_means(table: GramTable) -> FloatArray:
     """Return products about the means of drives, (drives, 2 + STEPS, 2 + STEPS)."""
-    weights, k = _weights(), len(table.signals)
-    full = np.zeros((len(table), k, k))
-    full[:, *np.tril_indices(k)] = table.products
-    full += np.tril(full, -1).transpose(0, 2, 1)
-    sums = table.sums.astype(np.float64) @ weights.T
+    weights, moments = _weights(), table.moments()
+    sums = moments[:, 0, 1:] @ weights.T
     squares = sums[:, :, None] * sums[:, None, :] / table.n[:, None, None]
-    about: FloatArray = weights @ full @ weights.T - squares
-    return about
+    return np.asarray(weights @ moments[:, 1:, 1:] @ weights.T - squares)
 
 
 def with_pooled(delays: dict[str, ReceiverDelay]) -> dict[str, ReceiverDelay]:

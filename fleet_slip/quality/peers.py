@@ -192,18 +192,11 @@ class Peers:
         return {name: self._prediction(without=name) for name in self.reference.signals}
 
     def _prediction(self, without: str | None) -> Prediction:
-        columns = self.reference.signals
-        signals = [name for name in columns if name != without]
-
-        def position(name: str) -> int:
-            return columns.index(name) + 1
-
-        return Prediction.fit(
-            self.reference,
-            [position(name) for name in signals],
-            [position(name) for name in signals if name != self.label],
-            self.limits,
-        )
+        names = [name for name in self.reference.signals if name != without]
+        position = self.reference.position
+        predictors = [position(name) for name in names if name != self.label]
+        targets = [position(name) for name in names]
+        return Prediction.fit(self.reference, targets, predictors, self.limits)
 
     def explain(self, moments: MeanMoments) -> list[Fault]:
         """Return the fault of each drive: the repair that brings other figures within the limit.

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import date
 from itertools import islice
-from typing import Any
 
 import numpy as np
 
@@ -537,18 +536,12 @@ def inspect_drives(
                 f"LIMIT {MAX_TICKS}",
                 {"day": day, "drive": drive},
             ).fetchnumpy()
-            faults = check_plausibility(signals, _signals_of(signals, columns))
-            harmful = tuple(fault for fault in faults if fault.does_harm)
-            inspected.append(InspectedDrive(drive, vehicle, day, harmful))
+            counts = {
+                name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
+                for name in signals.signals
+                if name in columns and np.ma.count(columns[name])
+            }
+            values = to_regular_grid(signals, np.asarray(columns["tick"], np.int32), counts)
+            faults = [f for f in check_plausibility(signals, values) if f.does_harm]
+            inspected.append(InspectedDrive(drive, vehicle, day, tuple(faults)))
     return Inspection(tuple(inspected), measured)
-
-
-def _signals_of(signals: SignalCatalog, columns: Mapping[str, Any]) -> Signals:
-    """Return the signals of a drive that have values."""
-    counts = {
-        name: np.ma.filled(np.ma.asarray(columns[name], dtype=np.float64), np.nan)
-        for name in signals.signals
-        if name in columns
-    }
-    present = {name: values for name, values in counts.items() if np.isfinite(values).any()}
-    return to_regular_grid(signals, np.asarray(columns["tick"], dtype=np.int32), present)

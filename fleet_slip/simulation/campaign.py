@@ -6,12 +6,11 @@ or on their order.
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
 from functools import cached_property
-from itertools import groupby
-from operator import itemgetter
+from itertools import pairwise
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -273,16 +272,14 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
     return both
 
 
-def pack(drives: Sequence[DriveSpec], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:
+def pack(drives: tuple[DriveSpec, ...], rows_per_file: int) -> list[tuple[DriveSpec, ...]]:
     """Split drives in order into the fewest groups with about `rows_per_file` rows or fewer."""
     ends = np.cumsum([drive.expected_rows for drive in drives])
     middles = (ends + np.append(0, ends[:-1])) / 2
     files = math.ceil(ends[-1] / rows_per_file)
     file_of_drive = (middles * files / ends[-1]).astype(int)
-    return [
-        tuple(drive for _, drive in run)
-        for _, run in groupby(zip(file_of_drive, drives, strict=True), key=itemgetter(0))
-    ]
+    starts = np.flatnonzero(np.diff(file_of_drive, prepend=-1)).tolist()
+    return [drives[a:b] for a, b in pairwise([*starts, len(drives)])]
 
 
 def load_campaign(name_or_path: str, configs: Configs) -> Campaign:
