@@ -13,18 +13,6 @@ from typing import Any, Literal
 
 from fleet_slip.errors import ConfigError
 
-CONFIG_FILES = (
-    "blind.toml",
-    "signals.toml",
-    "features.toml",
-    "monitor.toml",
-    "publish.toml",
-    "retention.toml",
-)
-
-CONFIG_FOLDERS = ("campaigns", "mappings", "models", "scenarios", "tracks", "vehicles")
-
-
 ShippedFolder = Literal["configs", "jobs", "warehouse"]
 
 
@@ -39,6 +27,10 @@ def folder(name: ShippedFolder) -> Traversable:
 def read_sql(name: ShippedFolder, file: str) -> str:
     """Return the text of one SQL file, such as `read_sql("jobs", "gram.sql")`."""
     return (folder(name) / file).read_text(encoding="utf-8")
+
+
+CONFIG_FILES = sorted(e.name for e in folder("configs").iterdir() if e.name.endswith(".toml"))
+CONFIG_FOLDERS = sorted(e.name for e in folder("configs").iterdir() if e.is_dir())
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,12 @@ class Configs:
             if os.path.lexists(place) and not readable:
                 raise ConfigError(f"{place}: not a folder that can be read.")
         for file in sorted(self.folder.rglob("*.toml")):
-            _require_kind(file.relative_to(self.folder).as_posix(), file)
+            kind, _, base = file.relative_to(self.folder).as_posix().rpartition("/")
+            if kind not in CONFIG_FOLDERS if kind else base not in CONFIG_FILES:
+                raise ConfigError(
+                    f"{file}: no config of fleet-slip. A folder of configs has "
+                    f"{', '.join(CONFIG_FILES)}, and TOML files in {', '.join(CONFIG_FOLDERS)}."
+                )
 
     def file(self, name: str) -> Traversable:
         """Return a file such as `monitor.toml`: the user's, even a broken link, or the shipped."""
@@ -79,11 +76,8 @@ class Configs:
 
     def files(self) -> dict[str, Traversable]:
         """Return every configuration file in force, by its name below the folder."""
-        names = [
-            *CONFIG_FILES,
-            *(f"{kind}/{name}.toml" for kind in CONFIG_FOLDERS for name in self.names(kind)),
-        ]
-        return {name: self.file(name) for name in names}
+        of_kinds = (f"{kind}/{name}.toml" for kind in CONFIG_FOLDERS for name in self.names(kind))
+        return {name: self.file(name) for name in (*CONFIG_FILES, *of_kinds)}
 
     def names(self, kind: str) -> list[str]:
         """Return the names of the files of one kind, such as `campaigns`, sorted."""
@@ -109,15 +103,6 @@ class Configs:
 
 SHIPPED_CONFIGS = Configs()
 """The shipped configuration files alone."""
-
-
-def _require_kind(name: str, file: Path) -> None:
-    kind, _, base = name.rpartition("/")
-    if kind not in CONFIG_FOLDERS if kind else base not in CONFIG_FILES:
-        raise ConfigError(
-            f"{file}: no config of fleet-slip. A folder of configs has {', '.join(CONFIG_FILES)}, "
-            f"and TOML files in {', '.join(CONFIG_FOLDERS)}."
-        )
 
 
 def _is_file(path: Traversable) -> bool:
