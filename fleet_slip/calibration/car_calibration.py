@@ -17,7 +17,6 @@ from datetime import date
 from fractions import Fraction
 from math import hypot, sqrt
 from statistics import median, pstdev
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -84,12 +83,11 @@ def collect_sums(
     batches: Iterable[pa.RecordBatch],
     kinds: Mapping[str, tuple[str, ...]],
     *,
-    excluded: Mapping[str, str] = MappingProxyType({}),
     unnamed: bool = False,
 ) -> dict[str, DriveSums]:
     """Return the sums of the columns of each kind over the drives of named cars.
 
-    Gram rows with the `excluded` column of a kind do not count for it. `unnamed` includes drives of
+    Gram rows with the column of `EXCLUDED` do not count for a kind. `unnamed` includes drives of
     cars without a name.
     """
     tables: dict[str, list[GramTable]] = defaultdict(list)
@@ -103,7 +101,7 @@ def collect_sums(
             keys = (rows[key].to_pylist() for key in ("vehicle_id", "day", "drive_id"))
             row_drives = [(str(car), day, drive) for car, day, drive in zip(*keys, strict=True)]
             for kind, columns in kinds.items():
-                if set(columns) <= present and excluded.get(kind) not in present:
+                if set(columns) <= present and EXCLUDED.get(kind) not in present:
                     tables[kind].append(table.restrict(columns))
                     drives[kind] += row_drives
     return {kind: _merge_by_drive(tables[kind], drives[kind]) for kind in tables}
@@ -568,7 +566,7 @@ def calibration_of(opened: OpenedGrams, predicate: Predicate) -> Calibration:
 
     Uses the feature sets with satellite signals, too, if they were computed.
     """
-    sums = collect_sums(opened.batches(predicate), KINDS, excluded=EXCLUDED)
+    sums = collect_sums(opened.batches(predicate), KINDS)
     catalog = opened.catalog
     for name, kinds in kinds_by_set(catalog.signals.label).items():
         if name in catalog.sets:

@@ -316,33 +316,12 @@ def noisy_counts(
     signal: Signal,
 ) -> tuple[NDArray[np.int16], int]:
     """Quantise `(physical + bias + std * noise) / scale`, halves to even; count clipped values."""
-    counts = np.empty(len(physical), dtype=np.int16)
-    valid = (float(signal.min_count), float(signal.max_count))
-    clipped = _quantise(physical, noise, bias_and_std, float(signal.scale), valid, counts)
-    return counts, int(clipped)
-
-
-@kernel
-def _quantise(
-    physical: FloatArray,
-    noise: NDArray[np.float32],
-    bias_and_std: tuple[float, float],
-    scale: float,
-    valid: tuple[float, float],
-    counts: NDArray[np.int16],
-) -> int:
-    """Write `counts` in one pass over memory; return the number of clipped values and NaN."""
     bias, std = bias_and_std
-    lowest, highest = valid
-    clipped = 0
-    for i in range(len(physical)):
-        count = np.rint((physical[i] + (bias + std * noise[i])) / scale)
-        within = lowest <= count <= highest
-        # A comparison with NaN is false: NaN becomes the lower bound and never reaches the cast.
-        inside = min(count, highest) if count >= lowest else lowest
-        counts[i] = np.int16(inside)
-        clipped += 0 if within else 1
-    return clipped
+    count = np.rint((physical + (bias + std * noise.astype(np.float64))) / float(signal.scale))
+    # A comparison with NaN is false: NaN becomes the lower bound, and counts as clipped.
+    is_above = count >= signal.min_count
+    valid = np.where(is_above, np.minimum(count, signal.max_count), signal.min_count)
+    return valid.astype(np.int16), int((valid != count).sum())
 
 
 def gps_fixes(gps: Gps, ticks: int, generator: np.random.Generator) -> BoolArray:

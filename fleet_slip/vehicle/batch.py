@@ -609,16 +609,12 @@ def _routes(drives: Sequence[LaneDrive]) -> tuple[NDArray[np.void], FloatArray, 
     ]
     ends = np.cumsum([len(table) for table in tables])
     spans = dict(zip(roads, zip([0, *ends[:-1]], ends - 1, strict=True), strict=True))
-    routes = np.array([_route(drive, *spans[id(drive.road)]) for drive in drives], dtype=ROUTE)
+    routes = np.empty(len(drives), dtype=ROUTE)
+    for i, drive in enumerate(drives):
+        road = drive.road
+        distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
+        limit_s = MAX_TIME_FACTOR * planned_time_s(road, distance_m) + EXTRA_TIME_S
+        limits = road.length_m, road.closed, distance_m, math.ceil(limit_s / SAMPLE_S)
+        routes[i] = *spans[id(road)], 1 / road.spacing_m, *limits
     surfaces = [_surface_table(road) for road in roads.values()]
     return routes, np.concatenate(tables), np.concatenate(surfaces)
-
-
-def _route(
-    drive: LaneDrive, first: int, last: int
-) -> tuple[int, int, float, float, bool, float, int]:
-    road = drive.road
-    distance_m = (drive.laps if road.closed else min(drive.laps, 1.0)) * road.length_m
-    limit_s = MAX_TIME_FACTOR * planned_time_s(road, distance_m) + EXTRA_TIME_S
-    samples = math.ceil(limit_s / SAMPLE_S)
-    return first, last, 1 / road.spacing_m, road.length_m, road.closed, distance_m, samples

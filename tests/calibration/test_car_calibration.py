@@ -21,7 +21,6 @@ from fleet_slip.calibration.car_calibration import (
 )
 from fleet_slip.calibration.sensor_relations import (
     EVEN,
-    EXCLUDED,
     KINDS,
     NO_CAR,
     NO_COURSE,
@@ -91,7 +90,7 @@ def row_of(columns: Sequence[str], counts: Any, drive: str, car: str = "car") ->
 
 def evidence(rows: list[dict[str, Any]], size: int = 7) -> CarEvidence:
     batches = [pa.RecordBatch.from_pylist(rows[i : i + size]) for i in range(0, len(rows), size)]
-    return CarEvidence(CATALOG, collect_sums(batches, KINDS, excluded=EXCLUDED))
+    return CarEvidence(CATALOG, collect_sums(batches, KINDS))
 
 
 def calibrated(found: CarEvidence, car: str) -> dict[str, CalibratedParameter]:
