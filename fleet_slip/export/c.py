@@ -254,12 +254,15 @@ def ring_width(program: Steps, source: int) -> int:
 
 @dataclass(frozen=True)
 class StateField:
-    """A field of a struct: one word of a type such as `int16_t`, or an array."""
+    """A field of a struct: a word of a type such as `int16_t`, or an array of `length` words.
+
+    `start` is the value at the start of a drive.
+    """
 
     type: str
     name: str
-    words: int = 1
-    array: bool = False
+    start: str = "0"
+    length: int | None = None
     comment: str = ""
 
     @property
@@ -270,7 +273,7 @@ class StateField:
     @property
     def declared(self) -> str:
         """Declaration in C."""
-        size = f"[{self.words}]" if self.array else ""
+        size = f"[{self.length}]" if self.length else ""
         comment = f" /* {self.comment} */" if self.comment else ""
         return f"{self.type} {self.name}{size};{comment}"
 
@@ -280,27 +283,32 @@ def state_fields(program: Steps) -> list[StateField]:
     names, fields = field_names(program), []
     for source, ticks in program.rings.items():
         if ticks:
-            kind = f"int{ring_width(program, source)}_t"
+            width = ring_width(program, source)
+            empty = "INT16_MIN" if width == 16 else "MISSING"
             fields += [
-                StateField(kind, f"ring_{source}", ticks, array=True, comment=f"step {source}"),
-                StateField("uint32_t", f"at_{source}"),
+                StateField(f"int{width}_t", f"ring_{source}", empty, ticks, f"step {source}"),
+                StateField("uint32_t", f"at_{source}", "0U"),
             ]
     for source, ticks, limit in program.sums:
         key, kind = sum_key(source, ticks, limit), sum_type(program, source, limit)
-        fields += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}")]
+        fields += [StateField(kind, f"sum_{key}"), StateField("uint32_t", f"values_{key}", "0U")]
     fields += [
         StateField(integer_type(size_of(program.ranges[step])), f"state_{step}")
         for step in program.states
     ]
-    fields += [StateField("int32_t", name) for name in (*names["facts"], *names["numbers"])]
-    return fields or [StateField("uint8_t", "nothing", comment="this model has no state")]
+    ranges = [*program.input_ranges["fact"], *program.input_ranges["number"]]
+    for name, (low, high) in zip((*names["facts"], *names["numbers"]), ranges, strict=True):
+        start = f"within(car->{name}, {literal(low)}, {high})"
+        fields.append(StateField("int32_t", name, start))
+    nothing = StateField("uint8_t", "nothing", "0U", comment="this model has no state")
+    return fields or [nothing]
 
 
 def state_bytes(program: Steps) -> int:
     """Return the size of the state if a word of n bytes is aligned to n bytes, as on ARM."""
     fields, size = state_fields(program), 0
     for field in fields:
-        size += -size % field.word_bytes + field.words * field.word_bytes
+        size += -size % field.word_bytes + (field.length or 1) * field.word_bytes
     return size + -size % max(field.word_bytes for field in fields)
 
 
@@ -340,7 +348,7 @@ def c_header(version: ModelVersion, program: Program) -> str:
 def c_source(version: ModelVersion, program: Program) -> str:
     """Return the source of the header."""
     writer, angle = StepWriter(program), program.angle
-    start = start_lines(program, writer) or ["state->nothing = 0U;"]
+    start = start_lines(program, writer)
     terms, valid, lines = step_lines(program, writer)
     return fill_in_version(
         "templates/estimator.c",
@@ -367,24 +375,17 @@ def helper_texts(writer: StepWriter) -> list[str]:
 
 def start_lines(program: Steps, writer: StepWriter) -> list[str]:
     """Return the statements at the start of a drive."""
-    fields, lines = field_names(program), []
-    for source, ticks in program.rings.items():
-        if ticks:
-            empty = "INT16_MIN" if ring_width(program, source) == 16 else "MISSING"
+    writer.counts["within"] += len(program.facts) + len(program.numbers)
+    lines = []
+    for field in state_fields(program):
+        if field.length:
             lines += [
-                f"for (uint32_t i = 0U; i < {ticks}U; i++) {{",
-                f"{INDENT}state->ring_{source}[i] = {empty};",
+                f"for (uint32_t i = 0U; i < {field.length}U; i++) {{",
+                f"{INDENT}state->{field.name}[i] = {field.start};",
                 "}",
-                f"state->at_{source} = 0U;",
             ]
-    for window in program.sums:
-        key = sum_key(*window)
-        lines += [f"state->sum_{key} = 0;", f"state->values_{key} = 0U;"]
-    lines += [f"state->state_{step} = 0;" for step in program.states]
-    ranges = [*program.input_ranges["fact"], *program.input_ranges["number"]]
-    for field, (low, high) in zip((*fields["facts"], *fields["numbers"]), ranges, strict=True):
-        writer.counts["within"] += 1
-        lines.append(f"state->{field} = within(car->{field}, {literal(low)}, {high});")
+        else:
+            lines.append(f"state->{field.name} = {field.start};")
     return lines
 
 

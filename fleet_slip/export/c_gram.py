@@ -235,11 +235,12 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
         "set_layout": SET_LAYOUT,
     }
     if changed:
+        state = [field for field in state_fields(steps) if field.name != "nothing"]
         words["course"], words["yaw_rate"] = (writer.word(places[n]) for n in (COURSE, YAW_RATE))
         words |= {
             "keeps": keep_lines(steps, writer),
-            "state": [field for field in state_fields(steps) if field.name != "nothing"],
-            "start": start_lines(steps, writer),
+            "state": state,
+            "start": start_lines(steps, writer) if state else [],
             "units": course_units(catalog.signals),
             "half_turn": HALF_TURN,
             "coarser": TURNED_DIVISOR,
