@@ -7,7 +7,7 @@ of one row, perhaps inside CASE WHEN divisor >= number THEN ... END.
 import ast
 import operator
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -94,8 +94,12 @@ def parse(sql: str) -> Arithmetic:
     text = _CAST.sub("", sql.strip())
     guarded = _GUARDED.fullmatch(text)
     try:
-        guard = builder.add(_tree(guarded[1])) if guarded else None
-        builder.add(_tree(guarded[3] if guarded else text), last=True)
+        trees = [
+            ast.parse(part.strip(), mode="eval").body
+            for part in ((guarded[1], guarded[3]) if guarded else (text,))
+        ]
+        guard = builder.add(trees[0]) if guarded else None
+        builder.add(trees[-1], last=True)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         raise QuestionError(f"{sql[:200]!r} is not integer arithmetic on counts.") from None
     names = tuple(dict.fromkeys(step.name for step in builder.steps if step.name))
@@ -120,10 +124,6 @@ def evaluate(sql: str, counts: Mapping[str, int]) -> int | None:
     return None if missing else results[-1]
 
 
-def _tree(text: str) -> ast.expr:
-    return ast.parse(text.strip(), mode="eval").body
-
-
 class _Builder:
     """Collects steps, with the largest absolute value of each."""
 
@@ -133,33 +133,29 @@ class _Builder:
 
     def add(self, tree: ast.expr, *, last: bool = False) -> int:
         """Add the steps of a tree; return the number of its result."""
-        step, bound = self._step(tree)
+        match tree:
+            case ast.Name(id=name):
+                step, bound = Step("", name=name), LARGEST_INPUT
+            case ast.Constant(value=int(value)) if not isinstance(value, bool):
+                step, bound = Step("", value=value), abs(value)
+            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
+                return self.add(operand, last=last)
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                step, bound = self._call("negative", operand)
+            case ast.BinOp(left=a, op=operator, right=b) if type(operator) in _OPERATORS:
+                step, bound = self._call(_OPERATORS[type(operator)], a, b)
+            case ast.Call(func=ast.Name(id=("abs" | "sign") as name), args=[operand], keywords=[]):
+                step, bound = self._call(name, operand)
+            case _:
+                raise ValueError("is not integer arithmetic")
         if step in self.steps and not last:
             return self.steps.index(step)
         self.steps.append(step)
         self.bounds.append(bound)
         return len(self.steps) - 1
 
-    def _step(self, tree: ast.expr) -> tuple[Step, int]:
-        match tree:
-            case ast.Name(id=name):
-                return Step("", name=name), LARGEST_INPUT
-            case ast.Constant(value=int(value)) if not isinstance(value, bool):
-                return Step("", value=value), abs(value)
-            case ast.UnaryOp(op=ast.USub(), operand=operand):
-                return self._call("negative", [operand])
-            case ast.UnaryOp(op=ast.UAdd(), operand=operand):
-                return self._step(operand)
-            case ast.BinOp(left=a, op=operator, right=b) if type(operator) in _OPERATORS:
-                return self._call(_OPERATORS[type(operator)], [a, b])
-            case ast.Call(
-                func=ast.Name(id=("abs" | "sign") as function), args=[argument], keywords=[]
-            ):
-                return self._call(function, [argument])
-        raise ValueError("is not integer arithmetic")
-
-    def _call(self, function: str, parts: Sequence[ast.expr]) -> tuple[Step, int]:
-        operands = tuple(self.add(part) for part in parts)
+    def _call(self, function: str, *parts: ast.expr) -> tuple[Step, int]:
+        operands = tuple(map(self.add, parts))
         sizes = [self.bounds[operand] for operand in operands]
         bound = {
             "+": sum(sizes),

@@ -79,10 +79,11 @@ class Feature(Scaled):
 
     @model_validator(mode="after")
     def _is_integer_arithmetic(self, info: ValidationInfo) -> "Feature":
-        guarded = self.divided_by is not None and not self._divisor_is_number
-        if guarded != (self.at_least is not None):
+        divisor = self.divided_by or ""
+        varies = bool(divisor) and not divisor.isdecimal()
+        if varies != (self.at_least is not None):
             raise ValueError("at_least is for a divisor that varies, which must have it")
-        if self._divisor_is_number and int(self.divided_by or 0) == 0:
+        if divisor.isdecimal() and int(divisor) == 0:
             raise ValueError("divided_by is zero")
         # What a manifest takes, and every target computes: see `columns/lowering.py`.
         if not parse(integer_arithmetic(self.sql, info)).inputs:
@@ -97,13 +98,9 @@ class Feature(Scaled):
             return counts
         divisor = _widened(self.divided_by)
         quotient = nearest_sql(counts, divisor)
-        if self._divisor_is_number:
+        if self.at_least is None:
             return quotient
         return f"CASE WHEN {divisor} >= {self.at_least} THEN {quotient} END"
-
-    @property
-    def _divisor_is_number(self) -> bool:
-        return self.divided_by is not None and self.divided_by.isdecimal()
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -55,7 +55,6 @@ from fleet_slip.grams.on_board import (
     MAX_SIGNALS,
     ROWS_IN_A_SUM,
     OnboardFeatureSet,
-    Range,
     max_gram_rows,
     onboard_feature_sets,
 )
@@ -89,11 +88,6 @@ class OnBoard:
     def history_ticks(self) -> int:
         """Ticks of stored columns: those of a change, and of the delay of a fix."""
         return max(self.counted.times) + 1 + (MAX_COURSE_DELAY if self.counted.in_time else 0)
-
-    @property
-    def ranges(self) -> list[Range]:
-        """Ranges of the columns."""
-        return [self.counted.ranges[name] for name in self.columns]
 
     @property
     def places(self) -> list[int]:
@@ -157,11 +151,7 @@ def lower(catalog: Catalog, sets: Sequence[OnBoard]) -> tuple[Steps, Mapping[str
     names = dict.fromkeys(name for on_board in sets for name in on_board.computed)
     if any(on_board.counted.times for on_board in sets):
         names |= dict.fromkeys((COURSE, YAW_RATE))
-    windows = {
-        name: catalog.time_columns[name].definition
-        for name in names
-        if name in catalog.time_columns
-    }
+    windows = {n: catalog.time_columns[n].definition for n in names if n in catalog.time_columns}
     single = {name: plain_column(name) for name in names if name not in windows}
     rows = rows_of(single | catalog.rows(names), windows)
     used &= {signal for row in rows.values() for signal in row.signals}
@@ -222,7 +212,7 @@ def _words(catalog: Catalog, prefix: str, sets: Sequence[OnBoard]) -> Mapping[st
         "rows": rows,
         "max_blocks": MAX_BLOCKS,
         "max_rows": ROWS_IN_A_SUM,
-        "row_limits": [max_gram_rows(on_board.ranges) for on_board in sets],
+        "row_limits": [max_gram_rows([s.counted.ranges[c] for c in s.columns]) for s in sets],
         "blocks": blocks,
         "first_blocks": [0, *accumulate(blocks[:-1])],
         "numbers": numbers,
