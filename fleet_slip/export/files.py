@@ -6,7 +6,7 @@ import json
 import subprocess
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from platform import machine
@@ -24,7 +24,6 @@ from fleet_slip.export.c import c_header, c_source, count_costs
 from fleet_slip.export.c_gram import c_gram_header, c_gram_source, sets_on_board
 from fleet_slip.export.program import Program, Target
 from fleet_slip.export.stepping import (
-    Estimator,
     TestVector,
     checks_csv,
     compile_program,
@@ -189,26 +188,11 @@ def _subject(
     version: ModelVersion, warehouse: Warehouse | None, *, with_gram: bool = False
 ) -> Subject:
     program = compile_program(version.catalog, version.manifest)
-    checks = make_checks(version.catalog.signals, version.manifest, program)
-    if program.states:
-        checks = tuple(with_states(version, program, check) for check in checks)
+    checks = make_checks(version.catalog, version.manifest, program)
     drives = None
     if warehouse is not None:
         drives = Registry.open(warehouse).trained_drives(version.manifest).content
     return Subject(version, program, checks, drives, with_gram)
-
-
-def with_states(version: ModelVersion, program: Program, check: TestVector) -> TestVector:
-    """Return a test vector with the states of the filter after each tick."""
-    numbers = zip(program.numbers, check.numbers, strict=True)
-    car = {number.name: None if n is None else n * number.grain for number, n in numbers}
-    facts = {fact.name: check.car.get(fact.name) for fact in program.facts}
-    estimator = Estimator(version.catalog, version.manifest, {**facts, **car})
-    states = []
-    for sample in check.samples:
-        estimator.advance(sample)
-        states.append(estimator.states)
-    return replace(check, states=tuple(states))
 
 
 def log_version(version: ModelVersion, warehouse: Warehouse, uri: str) -> str:

@@ -165,7 +165,17 @@ class Angle(FixedPoint):
     places: tuple[int, ...]
     limit: int
 
-    @property
+    def count(self, values: Sequence[int | None]) -> int | None:
+        """Return the count of the angle, given the value of each step; None: no angle."""
+        total = self.intercept + (1 << (self.bits - 1))
+        for step, coefficient in self.terms:
+            value = values[step]
+            if value is None:
+                return None
+            total += coefficient * value
+        return max(-self.limit, min(self.limit, total >> self.bits))
+
+    @cached_property
     def terms(self) -> tuple[tuple[int, int], ...]:
         """Step and coefficient over 2^bits of each term of the model."""
         return tuple(zip(self.places, self.coefficients, strict=True))
@@ -248,10 +258,6 @@ class Car:
     def number_counts(self, program: Program) -> tuple[int | None, ...]:
         """Return the numbers of a program as counts; None: unknown."""
         return tuple(self.numbers.get(number.name) for number in program.numbers)
-
-
-UNKNOWN_CAR = Car({}, {})
-"""A car with unknown properties."""
 
 
 def write_program(catalog: Catalog, manifest: Manifest) -> Program:

@@ -9,18 +9,14 @@ from io import StringIO
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
-from fleet_slip.arrays import BoolArray, FloatArray
 from fleet_slip.catalog.arithmetic import COMPUTED, nearest
 from fleet_slip.catalog.catalog import Catalog
 from fleet_slip.catalog.definitions import round_number
-from fleet_slip.catalog.signals import COUNT_MAX, SignalCatalog
-from fleet_slip.columns.drive_columns import DriveCounts, compute_columns
+from fleet_slip.catalog.signals import COUNT_MAX
 from fleet_slip.columns.lowering import power
 from fleet_slip.errors import InputError
-from fleet_slip.export.program import UNKNOWN_CAR, Car, Input, Program, write_program
-from fleet_slip.grams.compute import counts_of
+from fleet_slip.export.program import Car, Input, Program, write_program
 from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.predict import Predictor
 
@@ -62,6 +58,8 @@ class Estimator:
     ----------
     columns
         Columns in SI units that a sample must have.
+    car
+        Counts of the car's facts and numbers, in the order of the program.
 
     Raises
     ------
@@ -75,7 +73,7 @@ class Estimator:
         self._manifest = manifest = manifest.estimate
         self._program = program = compile_program(catalog, manifest)
         properties = _parse_car(manifest, program, car or {})
-        self._car = {
+        self.car = {
             "fact": properties.fact_counts(program),
             "number": properties.number_counts(program),
         }
@@ -120,7 +118,7 @@ class Estimator:
 
     def advance(self, counts: Sample) -> list[int | None]:
         """Advance by a tick with these counts of the signals; return the value of each step."""
-        inputs = {**self._car, "signal": _valid(counts, self._program.signals)}
+        inputs = {**self.car, "signal": valid_counts(counts, self._program.signals)}
         now: list[int | None] = []
         for name, operands, plain in self._program.steps:
             values = [now[operand] for operand in operands]
@@ -248,7 +246,6 @@ def compile_program(catalog: Catalog, manifest: Manifest) -> Program:
 
 
 # Checks are ticks of synthetic drives, with the angle at each. An export contains no logged data.
-# The angles come from the kernel of the warehouse, which does not use programs, in exact integers.
 
 SMOOTH_TICKS = 300
 HOSTILE_TICKS = 200
@@ -273,67 +270,38 @@ class TestVector:
     """Values of the steps `state` after each tick, if there are any."""
 
 
-def make_checks(
-    signals: SignalCatalog, manifest: Manifest, program: Program
-) -> tuple[TestVector, ...]:
+def make_checks(catalog: Catalog, manifest: Manifest, program: Program) -> tuple[TestVector, ...]:
     """Return a smooth drive and adversarial ones, with the angle at every tick."""
     facts = {a.name: 2**16 if a.equals is None else a.equals for a in program.facts}
-    ends = ((number.name, (-1) ** (i + 1) * COUNT_MAX) for i, number in enumerate(program.numbers))
-    hostile = Car(facts, dict(ends))
-    drives: dict[str, tuple[Car, Iterable[Sample]]] = {
-        "smooth": (UNKNOWN_CAR, _smooth(program)),
-        "extremes": (hostile, _extremes(program, np.random.default_rng(1))),
-        "holes": (UNKNOWN_CAR, _holes(program, np.random.default_rng(2))),
-        "standstill": (hostile, _standstill(program, np.random.default_rng(3))),
+    ends = ((number, (-1) ** (i + 1) * COUNT_MAX) for i, number in enumerate(program.numbers))
+    hostile = facts | {number.name: count * number.grain for number, count in ends}
+    unaware, extreme = (Estimator(catalog, manifest, car) for car in ({}, hostile))
+    drives = {
+        "smooth": (unaware, {}, _smooth(program)),
+        "extremes": (extreme, facts, _extremes(program, np.random.default_rng(1))),
+        "holes": (unaware, {}, _holes(program, np.random.default_rng(2))),
+        "standstill": (extreme, facts, _standstill(program, np.random.default_rng(3))),
     }
     checks = []
-    for name, (car, samples) in drives.items():
-        ticks, counts = tuple(samples), (car.fact_counts(program), car.number_counts(program))
-        angles = tuple(angles_by_kernel(signals, manifest, program, car, ticks))
-        checks.append(TestVector(name, car.facts, *counts, ticks, angles))
+    for name, (estimator, car, samples) in drives.items():
+        estimator.restart()
+        ticks, angles, states = tuple(samples), list[int | None](), []
+        for sample in ticks:
+            angles.append(program.angle.count(estimator.advance(sample)))
+            states.append(estimator.states)
+        check = TestVector(
+            name,
+            car,
+            *(estimator.car["fact"], estimator.car["number"]),
+            ticks,
+            tuple(angles),
+            tuple(states) if program.states else (),
+        )
+        checks.append(check)
     return tuple(checks)
 
 
-def angles_by_kernel(
-    signals: SignalCatalog,
-    manifest: Manifest,
-    program: Program,
-    car: Car,
-    samples: Sequence[Sample],
-) -> list[int | None]:
-    """Compute the angle of each tick from the columns of the kernel, in exact integers."""
-    predictor = Predictor.from_manifest(signals, manifest)
-    drive = drive_counts(program, predictor, car, samples)
-    return angles_of_columns(program, compute_columns(predictor.plan, drive))
-
-
-def drive_counts(
-    program: Program, predictor: Predictor, car: Car, samples: Sequence[Sample]
-) -> DriveCounts:
-    """Convert samples of consecutive ticks to a drive of the warehouse."""
-    valid = zip(*(_valid(sample, program.signals) for sample in samples), strict=True)
-    counts = {
-        signal.name: pa.array(values, pa.int16())
-        for signal, values in zip(program.signals, valid, strict=True)
-    }
-    rows = pa.table({"tick": np.arange(len(samples), dtype=np.int64), **counts})
-    facts = {name: car.facts.get(name) for name in predictor.plan.facts}
-    return counts_of(rows, predictor.plan, facts, car.numbers)
-
-
-def angles_of_columns(program: Program, columns: FloatArray) -> list[int | None]:
-    """Compute the angle of each row from the columns of the terms, shape (terms, rows)."""
-    angle = program.angle
-    missing: BoolArray = np.any(np.isnan(columns), axis=0)
-    counts = np.where(missing, 0.0, columns).astype(np.int64).astype(object)
-    total = np.full(columns.shape[1], angle.intercept + (1 << (angle.bits - 1)), dtype=object)
-    for (_, coefficient), column in zip(angle.terms, counts, strict=True):
-        total += coefficient * column
-    rounded = [max(-angle.limit, min(angle.limit, int(value >> angle.bits))) for value in total]
-    return [None if lacks else value for value, lacks in zip(rounded, missing, strict=True)]
-
-
-def _valid(sample: Sample, signals: Sequence[Input]) -> Sample:
+def valid_counts(sample: Sample, signals: Sequence[Input]) -> Sample:
     """Replace counts outside the valid range by None."""
     return tuple(
         count if count is not None and signal.min_count <= count <= signal.max_count else None

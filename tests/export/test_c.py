@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleet_slip
-from fleet_slip.export.stepping import Estimator, angles_by_kernel, compile_program
+from fleet_slip.export.stepping import Estimator, compile_program
 from fleet_slip.models.registry import ModelVersion
 from tests.export.compiled import (
     DEADLINE_S,
@@ -22,6 +22,7 @@ from tests.export.compiled import (
     needs_cc,
     run_compiled,
 )
+from tests.export.kernel import angles_by_kernel
 from tests.export.models import (
     BLENDS,
     CARS,

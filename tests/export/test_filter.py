@@ -25,12 +25,11 @@ from fleet_slip.evaluation.identify import (
     vehicle_with_fit,
 )
 from fleet_slip.export.c import count_costs
-from fleet_slip.export.files import export_files, program_content, with_states
-from fleet_slip.export.program import UNKNOWN_CAR, Program
+from fleet_slip.export.files import export_files, program_content
+from fleet_slip.export.program import Car, Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
-    angles_by_kernel,
     compile_program,
     make_checks,
 )
@@ -38,6 +37,7 @@ from fleet_slip.models.manifest import Manifest
 from fleet_slip.models.registry import ModelVersion
 from fleet_slip.vehicle.parameters import VehicleMeasures
 from tests.export import plain
+from tests.export.kernel import angles_by_kernel
 from tests.export.models import (
     BLENDS,
     CAR,
@@ -95,7 +95,7 @@ def test_kernel_estimator_and_document_agree_on_hostile_drives(name: str) -> Non
     manifest = model_with(BLENDS[name])
     program = compile_program(CATALOG, manifest)
     samples = hostile_drive(program, 250, 1)
-    angles = angles_by_kernel(SIGNALS, manifest, program, UNKNOWN_CAR, samples)
+    angles = angles_by_kernel(SIGNALS, manifest, program, Car({}, {}), samples)
     assert plain.angles(program_content(program), [], [], samples) == angles
     stepped = by_stepping(manifest, program, samples)
     scale = float(program.angle.scale)
@@ -120,9 +120,7 @@ def test_costs_stay_within_a_small_controller() -> None:
 def test_vectors_contain_the_states() -> None:
     manifest = model_with(BLENDS["constant"])
     program = compile_program(CATALOG, manifest)
-    check = make_checks(SIGNALS, manifest, program)[0]
-    version = ModelVersion(1, manifest, "0" * 64, CATALOG)
-    states = with_states(version, program, check).states
+    states = make_checks(CATALOG, manifest, program)[0].states
     assert {len(row) for row in states} == {len(program.states)}
     assert any(states[-1])
 

@@ -36,8 +36,6 @@ from fleet_slip.export.program import Car, Program
 from fleet_slip.export.stepping import (
     Estimator,
     Sample,
-    angles_by_kernel,
-    angles_of_columns,
     compile_program,
 )
 from fleet_slip.models.manifest import Manifest, ModelTerm
@@ -45,6 +43,7 @@ from fleet_slip.models.registry import ModelVersion
 from tests.export import plain
 from tests.export.compiled import build_driver, drive, needs_cc
 from tests.export.engines import by_duckdb, by_sqlite, open_session, run_drives
+from tests.export.kernel import angles_by_kernel, angles_of_columns
 from tests.export.models import cars, export_texts
 from tests.support.catalog import CATALOG
 from tests.support.manifests import manifest

@@ -12,10 +12,11 @@ from fleet_slip.catalog.definitions import Definition
 from fleet_slip.errors import ConfigError
 from fleet_slip.export.files import export_files
 from fleet_slip.export.onnx import FloatName, error_bound
-from fleet_slip.export.stepping import compile_program, drive_counts
+from fleet_slip.export.stepping import compile_program
 from fleet_slip.models.predict import Predictor
 from fleet_slip.models.registry import ModelVersion
 from tests.export.engines import in_si, open_session, run_drives
+from tests.export.kernel import drive_counts
 from tests.export.models import CARS, DEFINITIONS, MODELS, hostile_drive, model_of, version_of
 from tests.support.catalog import CATALOG, SIGNALS
 

@@ -30,7 +30,7 @@ from tests.export.models import (
     hostile_version,
     model_of,
 )
-from tests.support.catalog import CATALOG, SIGNALS
+from tests.support.catalog import CATALOG
 
 
 def test_what_divides_by_a_constant_below_zero_has_no_program(
@@ -46,7 +46,7 @@ def test_every_kind_of_column_has_an_angle_in_the_checks() -> None:
     for name in (*DEFINITIONS, *LEARNING):
         manifest = model_of({name: Fraction(1, 3)})
         program = compile_program(CATALOG, manifest)
-        checks = make_checks(SIGNALS, manifest, program)
+        checks = make_checks(CATALOG, manifest, program)
         angles = {angle for check in checks for angle in check.angles}
         assert (None in angles) == (name not in ("slope", "one_below")), name  # always there
         assert len(angles) > (2 if name == "tyres" else 5), name
@@ -71,7 +71,7 @@ def test_what_needs_more_than_63_bits_has_no_program(
                 compile_program(CATALOG, manifest)
             continue
         program = compile_program(CATALOG, manifest)
-        for check in make_checks(SIGNALS, manifest, program):
+        for check in make_checks(CATALOG, manifest, program):
             samples = list(check.samples)
             assert plain.angles(program_content(program), [], [], samples) == list(check.angles)
 

@@ -127,7 +127,7 @@ def test_a_version_is_the_same_on_board(fleet: Fleet) -> None:
     assert (estimate.terms, estimate.line) == (line.fitted.terms, line.digest)
     assert manifest.line == line.digest
     program = compile_program(fleet.warehouse.catalog, manifest)
-    for check in make_checks(SIGNALS, manifest, program):
+    for check in make_checks(fleet.warehouse.catalog, manifest, program):
         content, samples = program_content(program), list(check.samples)
         angles = plain.angles(content, list(check.facts), list(check.numbers), samples)
         assert angles == list(check.angles)
