@@ -375,8 +375,8 @@ class SlopeColumn(ScaledFamily):
         equations, ratios = [], set()
         for number, equation in enumerate(self.equations, 1):
             parts = [(sign, sources.over_time(column)) for column, sign in equation.y.items()]
-            of = sources.over_time(equation.of)
-            ratios |= {part.exact_scale / of.exact_scale for _, part in parts}
+            base = sources.over_time(equation.of)
+            ratios |= {part.exact_scale / base.exact_scale for _, part in parts}
             y = Definition(
                 of=f"{name}_{number}",
                 made=Combination(terms=tuple((sign, part.definition) for sign, part in parts)),
@@ -387,7 +387,7 @@ class SlopeColumn(ScaledFamily):
                 sources.over_time(column).definition if isinstance(column, str) else column
                 for column in equation.beside
             ]
-            x = (of.definition, *beside)
+            x = (base.definition, *beside)
             equations.append(Equation(y=y, x=x, weight=Fraction(equation.weight)))
         if len(ratios) > 1:
             raise ValueError("the scales of y and of differ in ratio between its equations")
