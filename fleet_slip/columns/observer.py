@@ -253,8 +253,8 @@ class ObserverLowering:
             entry: ObserverInput | None = getattr(self.observer, name)
             if entry is None:
                 continue
-            first, *following = (Number(self.low, self.low.column(column), 0) for column in entry.of)
-            total = reduce(Number.__add__ if entry.adds else Number.__sub__, following, first)
+            columns = (Number(self.low, self.low.column(column), 0) for column in entry.of)
+            total = reduce(Number.__add__ if entry.adds else Number.__sub__, columns)
             value = total.times(entry.scale, STATE)
             inputs[name] = (value - entry.offset if entry.offset else value).within(limit)
         return inputs
