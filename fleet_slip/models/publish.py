@@ -99,13 +99,11 @@ def recipe_for(
     else:
         old_request, old_cohort = recipe_of(version)
         request, verb = replace(old_request, **options), "trained as"
-    explanation = (
-        f"{verb} {version.reference}, chosen from {version.manifest.selected_by.model_list}, on "
-        f"drives where {cohort or old_cohort}"
-    )
-    if cohort not in (None, old_cohort):
-        explanation += f" instead of {old_cohort}"
-    return Recipe(request, cohort or old_cohort, explanation)
+    cohort = cohort or old_cohort
+    models = version.manifest.selected_by.model_list
+    instead = "" if cohort == old_cohort else f" instead of {old_cohort}"
+    start = f"{verb} {version.reference}, chosen from {models}"
+    return Recipe(request, cohort, f"{start}, on drives where {cohort}{instead}")
 
 
 def _options(request: SelectionRequest) -> dict[str, Any]:

@@ -368,36 +368,36 @@ class SelectionPlan:
         """Validate a request. Raises `UsageError`, `QuestionError` and `ConfigError`."""
         original.check()
         models = original.models or _default_list(original)
-        base = load_model_list(catalog, models) if models else None
-        label = original.label or (base.label if base else None)
+        if models:
+            base = load_model_list(catalog, models)
+        else:
+            description = "One model" if original.model else "Models of a selection"
+            default = COURSE_FEATURES if original.label else PLAIN
+            base = ModelList.model_construct(description=description, features=default)
+        label = original.label or base.label
         request = replace(original, models=models, label=label)
         request.check()
-        default = base.features if base else COURSE_FEATURES if label else PLAIN
-        feature_set = request.features or default
+        feature_set = request.features or base.features
         _require_columns(catalog, request, feature_set, base)
-        folds = base.folds if base else Folding()
-        folds = make_folding(request.group_by or folds.by, request.folds, folds.count)
+        folds = make_folding(request.group_by or base.folds.by, request.folds, base.folds.count)
         if request.is_ordered:
             return cls(original, request, None, feature_set, folds)
-        candidates, searches = (base.model, base.search) if base else ((), ())
+        candidates, searches = base.model, base.search
         if request.model:
             signals = require_inputs(catalog, request.model.split(","), feature_set)
             candidates = (CandidateModel(name=GIVEN, signals=signals),)
         if request.search:
             searches = (_search_of(catalog, request, feature_set),)
-        description = "One model" if request.model else "Models of a selection"
-        compared = ModelList(
-            description=base.description if base else description,
-            label=label,
-            features=base.features if base and base.line else feature_set,
-            line=base.line if base else None,
-            folds=folds,
-            tolerance=request.tolerance or (base.tolerance if base else None),
-            intercept=request.intercept and (base is None or base.intercept),
-            model=candidates,
-            search=searches,
-        )
-        return cls(original, request, compared, feature_set, folds)
+        changes = {
+            "label": label,
+            "features": base.features if base.line else feature_set,
+            "folds": folds,
+            "tolerance": request.tolerance or base.tolerance,
+            "intercept": request.intercept and base.intercept,
+            "model": candidates,
+            "search": searches,
+        }
+        return cls(original, request, base.model_copy(update=changes), feature_set, folds)
 
 
 def _default_list(request: SelectionRequest) -> str | None:
@@ -410,7 +410,7 @@ def _default_list(request: SelectionRequest) -> str | None:
 
 
 def _require_columns(
-    catalog: Catalog, request: SelectionRequest, name: str, model_list: ModelList | None
+    catalog: Catalog, request: SelectionRequest, name: str, model_list: ModelList
 ) -> None:
     """Raise `QuestionError` for a feature set without the columns of a request."""
     if request.label and not catalog.feature_set(name).change_ticks:
@@ -419,7 +419,7 @@ def _require_columns(
             f"the feature set {name} has no changes of the course. Feature sets that have: {names}."
         )
     inputs = catalog.feature_set(name).inputs
-    if model_list and (absent := model_list.absent_from(inputs)):
+    if absent := model_list.absent_from(inputs):
         raise QuestionError(
             f"the feature set {name} lacks columns of {request.models}: "
             f"{name_inputs(catalog, absent)}. Choose another feature set or model list."
