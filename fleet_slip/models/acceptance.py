@@ -6,6 +6,7 @@ published coefficients on the same rows, so the standard error is that of a pair
 clustered by car, or by drive where there are few cars.
 """
 
+import contextlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -53,7 +54,6 @@ from fleet_slip.regression.folds import (
 )
 from fleet_slip.regression.least_squares import LinearModel
 from fleet_slip.resources import Configs
-from fleet_slip.storage.runs import LOGGER
 from fleet_slip.warehouse.gram_reader import GramReader, open_grams
 from fleet_slip.warehouse.predicate import parse_cohort, parse_predicate
 from fleet_slip.warehouse.warehouse import Warehouse
@@ -225,15 +225,16 @@ MAX_REVIEWED_DRIVES = 20_000
 _HEX = 4
 
 
-def _split_drives(
-    registry: Registry, selection: Selection, champion: ModelVersion
-) -> tuple[Cohort, BoolArray]:
-    """Return the drives of a selection, and the mask of those that a version was trained on.
+def _compare_unseen(
+    evaluation: ChallengerEvaluation, registry: Registry, champion: ModelVersion
+) -> Comparison | None:
+    """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
 
-    Raises `StorageError` if its training set cannot be read.
+    Returns None if these are all drives, or of fewer than `MIN_VEHICLES` groups. Raises
+    `StorageError` if its training set cannot be read.
     """
     trained_drives = registry.trained_drives(champion.manifest)
-    cohort = selection.cohort
+    cohort = evaluation.selection.cohort
     if cohort.source is not None and cohort.sums is not None:
         predicate, drives = cohort.predicate, cohort.drive_count
         if drives > MAX_REVIEWED_DRIVES:
@@ -241,46 +242,17 @@ def _split_drives(
             sample = f"left(sha256('vouched ' || drive_id), {_HEX}) < '{below:0{_HEX}x}'"
             predicate &= parse_predicate(cohort.catalog.signals, sample)
         cohort = load_cohort(cohort.source, predicate, cohort.feature_set)
-    return cohort, trained_drives.among(hash_names(cohort.drives["drive_id"]))
-
-
-def _compare_unseen(
-    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray
-) -> Comparison | None:
-    """Compare on drives that the champion was not trained on: elsewhere it has an advantage.
-
-    Returns None if they are of fewer than `MIN_VEHICLES` groups. Raises `DataError`.
-    """
-    unseen = evaluation.groups(cohort, ~is_trained)
-    if len(unseen.names) < MIN_VEHICLES:
-        return None
-    groups = evaluation.groups(cohort, np.ones_like(is_trained))
-    return replace(evaluation.compare(groups, unseen), unseen=True)
+    is_trained = trained_drives.among(hash_names(cohort.drives["drive_id"]))
+    with contextlib.suppress(DataError):  # fewer than two groups
+        unseen = evaluation.groups(cohort, ~is_trained)
+        if is_trained.any() and len(unseen.names) >= MIN_VEHICLES:
+            groups = evaluation.groups(cohort, np.ones_like(is_trained))
+            return replace(evaluation.compare(groups, unseen), unseen=True)
+    return None
 
 
 OUTLIER_RATIO = 2.0
 """Drives are unusual if the champion's RMSE on them exceeds this multiple of its usual RMSE."""
-
-
-def _unusual_drives(
-    evaluation: ChallengerEvaluation, cohort: Cohort, is_trained: BoolArray
-) -> list[str]:
-    """Return a reason to refuse if the challenger is better on unusual new drives alone.
-
-    Such drives make it better on them, held out or not. If the champion's error on new drives is
-    much larger than on its training set, both are compared on that training set.
-    """
-    old, new = (evaluation.groups(cohort, mask) for mask in (is_trained, ~is_trained))
-    on_old, on_new = (evaluation.as_published(tested).pooled.rmse_deg for tested in (old, new))
-    if on_new <= OUTLIER_RATIO * on_old:
-        return []
-    comparison = evaluation.compare(evaluation.groups(cohort, np.ones_like(is_trained)), old)
-    if comparison.gap.negligible:
-        return []
-    return [
-        "the improvement comes only from unusual new drives, on which the champion has "
-        f"{on_new:.4f} deg: on its training set, {comparison}. Check them before training"
-    ]
 
 
 def threshold_violations(
@@ -374,8 +346,13 @@ def review_challenger(
         return Review(tuple(problems), compared)
     try:
         evaluation = ChallengerEvaluation.prepare(selection, champion)
-        groups = evaluation.groups(selection.cohort)
-        comparison = evaluation.compare(groups, groups)
+        comparison = _compare_unseen(evaluation, registry, champion)
+        if comparison is None:
+            groups = evaluation.groups(selection.cohort)
+            comparison = evaluation.compare(groups, groups)
+    except StorageError as error:
+        problems.append(f"no comparison without the champion's training set: {error}")
+        return Review(tuple(problems), "")
     except (DataError, QuestionError) as error:
         feature_set, _, _ = champion.manifest.trained_on.feature_set.partition("-")
         problems.append(
@@ -383,19 +360,7 @@ def review_challenger(
             f"feature set is {feature_set}; choose a model list that has this set: --models LIST)"
         )
         return Review(tuple(problems), "")
-    try:
-        cohort, is_trained = _split_drives(registry, selection, champion)
-        has_both = is_trained.any() and not is_trained.all()
-        if has_both and not comparison.gap.negligible:
-            comparison = _compare_unseen(evaluation, cohort, is_trained) or comparison
-        problems += _comparison_problems(comparison, champion, manifest)
-        if has_both and not problems:
-            problems += _unusual_drives(evaluation, cohort, is_trained)
-    except StorageError as error:
-        problems.append(f"no comparison on the champion's training set: {error}")
-    except DataError as error:
-        problems += _comparison_problems(comparison, champion, manifest)
-        LOGGER.warning("new drives were not compared with those of the champion: %s", error)
+    problems += _comparison_problems(comparison, champion, manifest)
     return Review(tuple(problems), str(comparison), comparison.is_significantly_worse)
 
 

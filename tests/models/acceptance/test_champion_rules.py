@@ -92,7 +92,7 @@ def test_what_the_floor_lets_pass_must_still_be_as_good_as_the_champions_own_coe
 def test_what_is_better_on_odd_new_drives_alone_waits(champion: Warehouse) -> None:
     write(champion, "odd", 8, label=1.25)
     with pytest.raises(
-        RefusedError, match=r"only from unusual new drives, .*: on its training set, on the same"
+        RefusedError, match=r"differ from its training set\. .* of 8 drives that are new to both"
     ):
         publish_from(champion)
     waiting = publish_from(champion, candidate=True)
@@ -107,7 +107,7 @@ def test_no_champion_falls_while_the_drives_that_made_it_cannot_be_read(
     (kept,) = Path(str(registry_of(champion).versions_of("beta").folder)).glob("drives-*.bin")
     kept.write_bytes(kept.read_bytes()[:-1] + b"x")
     with pytest.raises(
-        RefusedError, match=r"no comparison on the champion's training set: .*checksum"
+        RefusedError, match=r"no comparison without the champion's training set: .*checksum"
     ):
         publish_from(champion)
     with pytest.raises(StorageError, match="checksum"):
@@ -129,7 +129,7 @@ def test_more_data_of_the_same_replaces_the_champion_and_says_what_was_compared(
 ) -> None:
     done = publish_from(more)
     assert done.version.version == 2
-    assert "On the same 19,200 rows of 96 drives, held out in 8 groups by vehicle" in done.reason
+    assert "rows of 48 drives that are new to both, held out in 8 groups by vehicle" in done.reason
     assert "beta@1 as published has" in done.reason
 
 
